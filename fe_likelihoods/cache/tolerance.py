@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.comparison import Comparison, measured_values
-from ..simulation.label import is_of_user
 from ..simulation.model import Model
 from ..simulation.residual_statistics import Statistic, needs_response
+from ..simulation.user_code import is_of_user
 
 __all__ = ["DEFAULT_TOLERANCE", "VerifyingRun", "agree", "difference_of", "largest_difference", "response_tolerance"]
 

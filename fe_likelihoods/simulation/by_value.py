@@ -24,30 +24,30 @@ import re
 import sys
 import threading
 import types
+from collections import OrderedDict
 from collections.abc import Mapping
 from hashlib import blake2b
-from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import cloudpickle
 
 from .faults import ChangedModel
+from .user_code import SCRIPTS, is_of_user, sources_digest
 
-__all__ = ["Arrived", "NotSent", "Pickled", "dumps", "is_arriving", "is_of_user", "is_worker", "without_addresses"]
+__all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "without_addresses"]
 
-_SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of a script in a worker that imports it
-_LIBRARIES = {"fe_likelihoods", "samplers"}
-_INSTALLED = {"site-packages", "dist-packages"}
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
 _CACHED = type(functools.cache(len))
-_OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
+_OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__", "_abc_impl"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
+_OF_A_CLASS = (types.GetSetDescriptorType, types.MemberDescriptorType)
+_BY_IDENTITY = (types.FunctionType, type, types.ModuleType, types.CodeType, *_LOCKS)
+_IDENTICAL = set(_BY_IDENTITY)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
+_COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
-_is_worker = False
-_of_user: dict[str, bool] = {}  # by name of a module
 
 
 def without_addresses(message: str) -> str:
@@ -55,45 +55,30 @@ def without_addresses(message: str) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
 
 
-def is_of_user(module: Any) -> bool:
-    """Whether a module is Python code that belongs neither to this library, nor to a package, nor to Python."""
-    if not isinstance(module, types.ModuleType):
-        return False
-    values = object.__getattribute__(module, "__dict__")  # asking a lazy module for an attribute would import it
-    return isinstance(values.get("__name__"), str) and _is_of_user(values["__name__"], values.get("__file__"))
-
-
-@functools.cache
-def _is_of_user(name: str, file: str | None) -> bool:
-    top = name.partition(".")[0]
-    if top in _SCRIPTS:
-        return True
-    if top in _LIBRARIES or top in sys.stdlib_module_names or top in sys.builtin_module_names:
-        return False
-    if file is not None and file.endswith(tuple(importlib.machinery.EXTENSION_SUFFIXES)):
-        return False
-    root = sys.modules.get(top)
-    places = [file or getattr(root, "__file__", None) or ""] + [str(place) for place in getattr(root, "__path__", ())]
-    return not any(_INSTALLED & set(PurePath(place).parts) for place in places)
-
-
-def is_worker() -> bool:
-    """Whether this process has loaded a function of another process."""
-    return _is_worker
-
-
 def is_arriving() -> bool:
     """Whether an object is being loaded that another process has sent."""
     return _arriving is not None
 
 
-@functools.cache
-def library_digest() -> bytes:
-    """Digest of the source code of this library."""
-    root, digest = Path(__file__).parents[1], blake2b(digest_size=16)
-    for file in sorted(root.rglob("*.py")):
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.digest()
+class Recent(OrderedDict):
+    """The values that were used last, by key: at most 8, and of 256 MiB if there are several."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._sizes: dict[Any, int] = {}
+
+    def use(self, key: Any) -> Any:
+        """The value of a key, which is then the one that was used last; None if it is not kept."""
+        if key in self:
+            self.move_to_end(key)
+        return self.get(key)
+
+    def keep(self, key: Any, value: Any, size: int) -> None:
+        """Keep a value of a size [bytes]."""
+        self[key], self._sizes[key] = value, size
+        self.move_to_end(key)
+        while len(self) > 8 or (len(self) > 1 and sum(self._sizes[key] for key in self) > 2**28):
+            del self._sizes[self.popitem(last=False)[0]]
 
 
 class Pickled(NamedTuple):
@@ -112,16 +97,19 @@ class Pickled(NamedTuple):
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
-        """Pickle a function with everything that it uses, as it is now; ValueError if that is impossible."""
+        """Pickle a function with everything that it uses, as it is now; ValueError if that is impossible.
+
+        The pickle of an earlier call is returned if nothing that it depends on has changed.
+        """
         try:
-            payload = library_digest() + _this_process(os.getpid()) + dumps(function)
+            with _lock:
+                return _pickled(function)
         except Exception as error:
             name = getattr(function, "__qualname__", type(function).__qualname__)
             raise ValueError(
                 f"{name} cannot be sent to another process ({type(error).__name__}: {without_addresses(str(error))}). "
                 "Objects that it uses must not contain open files, locks and connections"
             ) from error
-        return cls(payload, _digest(payload))
 
     def is_whole(self) -> bool:
         """Whether the payload matches the digest."""
@@ -137,10 +125,10 @@ class Pickled(NamedTuple):
         ChangedModel
             If this process has imported another version of this library, or a file that the model depends on differs.
         """
-        global _arriving, _is_worker
+        global _arriving
         if not self.is_whole():
             raise ValueError("the pickled function has been changed after it was sent: its digest differs")
-        if self.payload[:16] != library_digest():
+        if self.payload[:16] != sources_digest():
             raise ChangedModel(
                 "the worker process has another version of fe_likelihoods than the process that sends simulations: "
                 "install the same version everywhere, and start a new pool"
@@ -148,7 +136,6 @@ class Pickled(NamedTuple):
         with _lock:
             # a pool may run it in the process that has sent it, whose modules stay as they are
             _arriving = None if self.payload[16:32] == _this_process(os.getpid()) else {}
-            _is_worker |= _arriving is not None
             try:
                 return Arrived(pickle.loads(memoryview(self.payload)[32:]), _arriving or {})
             except ChangedModel:
@@ -188,77 +175,216 @@ class Arrived:
         return self._function(item)
 
 
-def dumps(thing: Any) -> bytes:
-    """Pickle an object, with code and values of the user by value."""
+def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
+    """Pickle an object, with code and values of the user by value; `uses` receives what these are."""
     with _lock:
-        loaded = list(sys.modules.copy().items())  # other threads may import while the items are read
-        for name, module in loaded:
-            if name not in _of_user:
-                _of_user[name] = is_of_user(module) and module.__name__ == name
-        modules = {name: module for name, module in loaded if _of_user[name]}
-        known = cloudpickle.list_registry_pickle_by_value()
-        added = [module for name, module in modules.items() if name not in known]
-        for module in added:
-            cloudpickle.register_pickle_by_value(module)
+        pickler = _Pickler(file := io.BytesIO(), _Uses() if uses is None else uses)
         try:
-            file = io.BytesIO()
-            _Pickler(file, modules).dump(thing)
-            return file.getvalue()
+            pickler.dump(thing)
         finally:
-            for module in added:
+            for module in pickler.registered:
                 cloudpickle.unregister_pickle_by_value(module)
+        return file.getvalue()
+
+
+def _pickled(function: Any) -> Pickled:
+    """Pickle a function, or find the pickle of an earlier call that has used the same; the lock is held."""
+    seen = _snapshot(function)
+    sent = next((sent for sent in reversed(_sent.values()) if sent.seen[0] == seen[0] and sent.is_unchanged()), None)
+    if sent is not None and sent.is_confirmed:
+        return _sent.use(sent.pickled.key).pickled
+    uses = _Uses()
+    payload = sources_digest() + _this_process(os.getpid()) + dumps(function, uses)
+    pickled = Pickled(payload, _digest(payload))
+    # another thread may have changed a value meanwhile, so the first pickle counts when a second one equals it
+    _sent.keep(pickled.key, _Sent(pickled, seen, uses, sent is not None and sent.pickled == pickled), 3 * len(payload))
+    return pickled
+
+
+class _Sent:
+    """A pickled function and what it depends on."""
+
+    def __init__(self, pickled: Pickled, seen: tuple, uses: "_Uses", is_confirmed: bool) -> None:
+        self.pickled, self.seen, self.uses, self.is_confirmed = pickled, seen, uses, is_confirmed
+        self._state = uses.state()  # kept, so that no other object has the identities of these
+        self._seen = self._snapshot(self._state)
+
+    def _snapshot(self, state: list) -> tuple[bytes | None, list]:
+        unsent = self.uses.unsent
+        return _snapshot([id(x) if type(x) in _IDENTICAL or id(x) in unsent else x for x in state])
+
+    def is_unchanged(self) -> bool:
+        """Whether the code and values that the function uses are those that were pickled."""
+        return self._seen[0] is not None and self._snapshot(self.uses.state())[0] == self._seen[0]
+
+
+_sent: "Recent" = Recent()  # by key
+
+
+class _Uses:
+    """Code and values of the user that the pickle of an object contains: to notice that they have changed."""
+
+    def __init__(self) -> None:
+        self.modules: set[str] = set()  # names that were looked up
+        self.namespaces: dict[int, tuple[dict, set[str] | None]] = {}  # of which all values were used, or those named
+        self.functions: dict[int, types.FunctionType] = {}
+        self.classes: dict[int, type] = {}
+        self.unsent: dict[int, Any] = {}  # values that cannot be sent
+
+    def add_names(self, namespace: dict, names: Any) -> None:
+        """Note that a function uses values of a namespace."""
+        known = self.namespaces.setdefault(id(namespace), (namespace, set()))[1]
+        if known is not None:
+            known.update(names)
+
+    def state(self) -> list:
+        """All of this as it is now: names, code and values."""
+        state = [sys.modules.get(name) for name in sorted(self.modules)]
+        namespaces = [
+            namespace.copy() if names is None else {n: namespace[n] for n in names if n in namespace}
+            for namespace, names in self.namespaces.values()
+        ]
+        for function in self.functions.values():
+            state += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
+            state += function.__closure__ or ()
+        for cls in self.classes.values():
+            state.append(cls.__bases__)
+            namespaces.append({n: value for n, value in vars(cls).items() if type(value) not in _OF_A_CLASS})
+        for values in namespaces:
+            for name in _OF_THE_IMPORT & values.keys():
+                del values[name]
+            state.append(list(values))
+            state += values.values()
+        return state
+
+
+def _snapshot(thing: Any) -> tuple[bytes | None, list]:
+    """Bytes that differ when an object has changed; functions, classes and modules count by identity.
+
+    Much faster than a pickle by value. The objects whose identities are in the bytes are returned as well: as long as
+    they are kept, no other object has these identities. None for an object that cannot be pickled.
+    """
+    pickler = _Snapshot(file := io.BytesIO(), protocol=5)
+    try:
+        pickler.dump(thing)
+    except Exception:
+        return None, []
+    return file.getvalue(), pickler.kept
+
+
+class _Snapshot(cloudpickle.Pickler):
+    def __init__(self, file: io.BytesIO, protocol: int) -> None:
+        super().__init__(file, protocol)
+        self.kept: list[Any] = []
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, _BY_IDENTITY):
+            self.kept.append(obj)
+            return abs, (id(obj),)
+        if isinstance(obj, _CACHED):
+            return abs, (), obj.__wrapped__
+        return NotImplemented
 
 
 class _Pickler(cloudpickle.Pickler):
     """Pickler whose functions keep their module: its values and its functions are those of one namespace."""
 
-    def __init__(self, file: io.BytesIO, modules: dict[str, types.ModuleType]) -> None:
+    def __init__(self, file: io.BytesIO, uses: _Uses) -> None:
         super().__init__(file, protocol=5)
-        self._modules = modules
+        self.uses = uses
+        self.registered: list[types.ModuleType] = []
         self._namespaces: dict[str, _Namespace] = {}
+        self._of_user: dict[Any, types.ModuleType | None] = {}
+
+    def _module(self, name: Any) -> types.ModuleType | None:
+        """A module that is sent, by its name; None if it is imported by the worker."""
+        if name not in self._of_user:
+            module = sys.modules.get(name) if isinstance(name, str) else None
+            is_sent = is_of_user(module) and module.__name__ == name
+            self._of_user[name] = (
+                module if is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED) else None
+            )
+            if self._of_user[name] is not None:
+                self.uses.modules.add(name)
+                if name not in cloudpickle.list_registry_pickle_by_value():
+                    cloudpickle.register_pickle_by_value(module)
+                    self.registered.append(module)
+        return self._of_user[name]
 
     def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, types.FunctionType):
+            return self._function(obj)
         if isinstance(obj, types.ModuleType):
-            if self._modules.get(obj.__name__) is not obj:
-                return NotImplemented
-            values = {name: value for name, value in vars(obj).items() if name not in _OF_THE_IMPORT}
-            for name in [name for name in values if f"{obj.__name__}.{name}" in self._modules]:
-                del values[name]  # modules of a package are sent where a function names them
-            if obj.__name__ in _SCRIPTS:
-                values = {name: values[name] for name in ("__file__", "__package__") if name in values}
-            parent = self._modules.get(obj.__name__.rpartition(".")[0])
-            state = parent, {name: _sendable(name, value) for name, value in values.items()}
-            return _new_module, (obj.__name__,), state, None, None, _fill_module
-        if isinstance(obj, _CACHED) and self._modules.get(obj.__module__) is not None:  # pickled by its name otherwise
+            return self._reduce_module(obj) if self._module(obj.__name__) is obj else NotImplemented
+        if isinstance(obj, _CACHED) and self._module(obj.__module__) is not None:  # pickled by its name otherwise
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
-        reduced = super().reducer_override(obj) if not isinstance(obj, types.FunctionType) else self._function(obj)
-        if reduced is NotImplemented or len(reduced) != 6 or isinstance(obj, types.FunctionType):
+        if not isinstance(obj, type):
+            return NotImplemented
+        self._module(obj.__module__)
+        reduced = super().reducer_override(obj)
+        if reduced is NotImplemented or len(reduced) != 6:
             return reduced
-        # a class: a new one for each function, since the methods of another one may belong to other values
+        # a new class for each function, since the methods of another one may belong to other values
+        self.uses.classes[id(obj)] = obj
         make, (*arguments, _, extra), (state, slots), *tail = reduced
-        state = {name: _sendable(name, value) for name, value in state.items()}
+        state = {name: self._sendable(name, value) for name, value in state.items()}
         return make, (*arguments, None, extra), (state, slots), *tail
+
+    def _reduce_module(self, module: types.ModuleType) -> tuple:
+        name, values = module.__name__, vars(module)
+        if name in SCRIPTS:
+            values = {name: values[name] for name in ("__file__", "__package__") if name in values}
+        else:
+            self.uses.namespaces[id(values)] = values, None
+            # modules of a package are sent where a function names them
+            values = {key: value for key, value in values.items() if self._module(f"{name}.{key}") is None}
+        parent = self._module(name.rpartition(".")[0])
+        sent = {key: self._sendable(key, value) for key, value in values.items() if key not in _OF_THE_IMPORT}
+        return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; one of a module of the user gets the namespace of that module."""
-        module = self._modules.get(function.__globals__.get("__name__"))
+        module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
         if module is None or vars(module) is not function.__globals__:
-            return super().reducer_override(function)
+            self._module(function.__module__)
+            reduced = super().reducer_override(function)
+            if reduced is not NotImplemented:
+                self.uses.functions[id(function)] = function
+                self.uses.add_names(function.__globals__, names.all)
+            return reduced
+        self.uses.functions[id(function)] = function
         namespace = self._namespaces.setdefault(module.__name__, _Namespace(module))
-        names, code = _names_in(function.__code__), function.__code__
         used = {}
-        if module.__name__ in _SCRIPTS:
+        if module.__name__ in SCRIPTS:
+            self.uses.add_names(vars(module), names.all)
             used = {name: _new_lock(value) for name, value in vars(module).items() if name in names.all}
-        package = module.__dict__.get("__package__") or ""
-        imported = [self._modules[name] for name in _resolved(names.imported, package) if name in self._modules]
+        imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
+        self.uses.modules |= imported
         state = (
             used,
-            [*imported, *_named_modules(vars(module), names.all)],
+            [*filter(None, map(self._module, imported)), *_named_modules(vars(module), names.all)],
             {name: getattr(function, name) for name in _OF_A_FUNCTION},
             [cell for cell in function.__closure__ or ()],
             vars(function),
         )
+        code = function.__code__
         return _new_function, (code, namespace, len(code.co_freevars)), state, None, None, _fill_function
+
+    def _sendable(self, name: str, value: Any) -> Any:
+        """A value of a module or class, or what is sent instead if it cannot be pickled."""
+        if isinstance(value, types.FunctionType):
+            plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
+        else:
+            plain = isinstance(value, _PLAIN) or not getattr(getattr(value, "dtype", None), "hasobject", True)
+        if plain or isinstance(value, _LOCKS):
+            return _new_lock(value)
+        try:
+            _Probe(io.BytesIO(), protocol=5).dump(value)
+            _refuse_a_name(value)
+        except Exception as error:
+            self.uses.unsent[id(value)] = value
+            return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
+        return value
 
 
 class _Names(NamedTuple):
@@ -354,24 +480,6 @@ def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
 
 def _new_lock(value: Any) -> Any:
     return _Lock(isinstance(value, _LOCKS[1])) if isinstance(value, _LOCKS) else value
-
-
-def _sendable(name: str, value: Any) -> Any:
-    """A value of a module or class, or what is sent instead if it cannot be pickled."""
-    if isinstance(value, types.FunctionType):
-        plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
-    else:
-        plain = isinstance(value, _PLAIN) or not getattr(getattr(value, "dtype", None), "hasobject", True)
-    if plain:
-        return value
-    if isinstance(value, _LOCKS):
-        return _new_lock(value)
-    try:
-        _Probe(io.BytesIO(), protocol=5).dump(value)
-        _refuse_a_name(value)
-    except Exception as error:
-        return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
-    return value
 
 
 def _refuse_a_name(value: Any) -> None:

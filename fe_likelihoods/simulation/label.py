@@ -18,13 +18,11 @@ of classes, the order of sets, and the file names of notebook cells.
 
 import ast
 import functools
-import importlib.metadata
 import logging
 import os
 import platform
 import re
 import sys
-import sysconfig
 import types
 import weakref
 from collections.abc import Iterable, Mapping
@@ -35,20 +33,17 @@ from typing import Any
 import numpy as np
 
 from .opened import Opened, file_digest
+from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = [
-    "LIBRARY",
     "ModelLabel",
     "cpu_name",
-    "is_of_user",
     "items_of",
     "note_own_changes",
     "steady_digest",
     "value_digest",
 ]
 
-LIBRARY = __name__.split(".")[0]
-ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (
     *("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "simulation/residual_statistics.py"),
     *("noise/*.py", "units.py"),
@@ -78,7 +73,6 @@ _OF_CLASSES = {
     "__static_attributes__",
 }
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # of a class, which it may change when it runs
-_SCRIPTS = ("__main__", "__mp_main__")
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
 _first: dict[str, str] = {}  # digests of values that code changes when it runs, at the time of the first label
@@ -175,7 +169,7 @@ class ModelLabel:
             parts = parts | _parts_of(model)
         if self._statistic is not None and _defined_by_user(self._statistic):
             parts = parts | {"statistic": self._statistic}
-        return (items_of(parts) if parts else {}) | {"library": _library_digest()}
+        return (items_of(parts) if parts else {}) | {"library": sources_digest(*SOURCES).hex()}
 
 
 def _parts_of(model: Any) -> dict[str, Any]:
@@ -261,13 +255,13 @@ class _Walk:
                 if isinstance(value, str):  # a command or an input file of a program
                     self._words |= set(re.findall(r"\w+", value))
         for module in self._all_modules():
-            if module.__name__ not in _SCRIPTS:  # a script is represented by what the model uses
+            if module.__name__ not in SCRIPTS:  # a script is represented by what the model uses
                 items[f"source of {module.__name__}"], words = _source(module)
                 self._words |= words
         for module in self._library:
             items[f"source of {module}"] = _source(sys.modules[module])[0]
         for package in self._packages:
-            items[f"package {package}"] = _version(package)
+            items[f"package {package}"] = package_version(package)
         for name in self._words & os.environ.keys() - _OF_SHELLS:
             items[f"environment {name}"] = os.environ[name]
         return items
@@ -277,7 +271,7 @@ class _Walk:
         waiting = list(self._modules)
         while waiting:
             module = self._modules[waiting.pop()]
-            for value in [] if module.__name__ in _SCRIPTS else list(vars(module).values()):
+            for value in [] if module.__name__ in SCRIPTS else list(vars(module).values()):
                 name = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
                 if isinstance(name, str) and name not in self._modules and name in sys.modules:
                     if is_of_user(name):
@@ -450,7 +444,7 @@ class _Walk:
 
 def _name_of(module: str) -> str:
     """Name of a module; a script has another one in worker processes."""
-    return "__main__" if module in _SCRIPTS else module
+    return "__main__" if module in SCRIPTS else module
 
 
 def _parts(reduced: Any) -> list[Any]:
@@ -496,53 +490,6 @@ def _has_weakref(model: Any) -> bool:
     return True
 
 
-def is_of_user(module: str) -> bool:
-    """Whether a module is neither installed nor in the standard library, so that it changes without a version."""
-    if not isinstance(module, str):
-        return False
-    if module in _SCRIPTS:
-        return True
-    found = sys.modules.get(module)
-    return _is_of_user(module, getattr(found, "__file__", None), found is not None)
-
-
-@functools.cache
-def _is_of_user(module: str, file: str | None, is_loaded: bool) -> bool:
-    top = module.partition(".")[0]
-    if not module or top == LIBRARY or top in sys.builtin_module_names:
-        return False
-    if file is None:  # frozen, a folder of modules, or made by code
-        if top in sys.stdlib_module_names:
-            return False
-        return not is_loaded or not getattr(sys.modules[module], "__path__", None)
-    path = Path(file).resolve()
-    if {"site-packages", "dist-packages"} & set(path.parts):
-        return not _version(top)
-    return not any(path.is_relative_to(folder) for folder in _standard_folders())
-
-
-@functools.cache
-def _standard_folders() -> tuple[Path, ...]:
-    return tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    return importlib.metadata.packages_distributions()
-
-
-def _version(top: str) -> str:
-    """Version of an installed package; empty for others."""
-    try:
-        return importlib.metadata.version(top)
-    except (importlib.metadata.PackageNotFoundError, ValueError):
-        pass
-    try:
-        return " ".join(map(importlib.metadata.version, _distributions().get(top, ())))
-    except importlib.metadata.PackageNotFoundError:
-        return ""
-
-
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
     """Digest of the source file of a module, as it was when it was first read, and the words in it."""
     file = getattr(module, "__file__", None)
@@ -566,15 +513,6 @@ def _read_source(file: str) -> tuple[str, frozenset[str]]:
         text = content.decode("utf-8", "replace")
     words = frozenset(re.findall(r"\w+", content.decode("utf-8", "replace")))
     return blake2b(text.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest(), words
-
-
-@functools.cache
-def _library_digest() -> str:
-    """Digest of the source files of this library that a simulation may depend on."""
-    digest = blake2b(digest_size=16)
-    for file in sorted(file for pattern in SOURCES for file in ROOT.glob(pattern)):
-        digest.update(f"{file.relative_to(ROOT).as_posix()}\0".encode() + file.read_bytes())
-    return digest.hexdigest()
 
 
 @functools.cache

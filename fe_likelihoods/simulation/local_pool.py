@@ -258,7 +258,7 @@ class LocalPool:
     def _take(self, function: Pickled) -> Worker | None:
         """A process that is free, preferably one that has loaded a function."""
         with self._changed:
-            self._free.sort(key=lambda worker: worker.key == function.key)
+            self._free.sort(key=lambda worker: function.key in worker.keys)
             while self._free:
                 worker = self._free.pop()
                 if worker.alive:

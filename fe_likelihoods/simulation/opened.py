@@ -13,7 +13,6 @@ import sys
 import sysconfig
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from hashlib import blake2b
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 
 __all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
 
+_MOST_REPEATED = 100  # files that each result names
 _CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV", "/run/")
@@ -28,7 +28,6 @@ _SYSTEM = ("/proc/", "/sys/", "/dev/", "/usr/", "/lib", "/etc/", "/bin/", "/opt/
 _observers: "list[_Observer]" = []
 _lock = threading.Lock()
 _has_hook = False
-_known: "dict[str, Opened]" = {}  # what functions have opened in this process, by their tokens
 _digests: dict[str, tuple[tuple, float, str]] = {}
 
 
@@ -89,38 +88,35 @@ class Observed:
 
     Notes
     -----
-    A call returns the result, and an `Opened` of files that no earlier call in this process has opened, or None.
+    A call returns the result, and an `Opened` of all files that calls in this process have opened, or of the new ones
+    if they are more than 100, or None.
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
-        self.function, self._token = function, uuid.uuid4().hex
+        self.function = function
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
+        self._known: Opened | None = None
 
     def __repr__(self) -> str:
         return repr(self.function)
 
     def __reduce__(self) -> tuple:
-        return _observed, (self.function, self._token)
+        return Observed, (self.function,)
 
     def __call__(self, item: Any) -> tuple[Any, Opened | None]:
-        """The result for an item, and what the call opened."""
+        """The result for an item, and what was opened."""
         with observing() as observer:
             result = self.function(item)
-        opened = observer.result(_known.get(self._token))
-        if opened is not None:
-            _known[self._token] = opened | _known.get(self._token, Opened({}))
-        return result, opened
+        new = observer.result(self._known)
+        if new is not None:
+            self._known = new if self._known is None else new | self._known
+        # all of it each time, since earlier results may have been lost
+        return result, self._known if len(self._known.files) <= _MOST_REPEATED else new
 
 
 def unpack(outcome: tuple) -> tuple[Any, Opened | None]:
     """Result of a simulation in a worker and what it opened; the pool reports a lost worker by a result alone."""
     return (outcome, None) if isinstance(outcome[1], str) else outcome
-
-
-def _observed(function: Callable[[Any], Any], token: str) -> Observed:
-    observed = Observed(function)
-    observed._token = token
-    return observed
 
 
 @contextlib.contextmanager

@@ -7,16 +7,13 @@ import os
 import sys
 import tempfile
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .by_value import Arrived, Pickled
+from .by_value import Pickled, Recent
 
-__all__ = ["MAX_LOADED_FUNCTIONS", "FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
-
-MAX_LOADED_FUNCTIONS = 8
+__all__ = ["FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
 
 
 class Missing(NamedTuple):
@@ -27,22 +24,19 @@ class PrivateFiles:
     """The most recent functions of one pool, in files that only this user can read, and that end with this process."""
 
     def __init__(self) -> None:
-        self._files: OrderedDict[bytes, Any] = OrderedDict()
+        self._files = Recent()
         self._lock = threading.Lock()
 
     def path(self, function: Pickled) -> str:
         """Path of the file with a function."""
         with self._lock:
-            if function.key not in self._files:
+            file = self._files.use(function.key)
+            if file is None:
                 linux = sys.platform == "linux"
                 file = tempfile.TemporaryFile() if linux else tempfile.NamedTemporaryFile(prefix="fe_likelihoods_")
                 file.write(function.payload)
                 file.flush()
-                self._files[function.key] = file
-            self._files.move_to_end(function.key)
-            while len(self._files) > MAX_LOADED_FUNCTIONS:
-                self._files.popitem(last=False)
-            file = self._files[function.key]
+                self._files.keep(function.key, file, len(function.payload))
             return f"/proc/{os.getpid()}/fd/{file.fileno()}" if sys.platform == "linux" else file.name
 
 
@@ -81,7 +75,7 @@ class FunctionReference:
         return _LoadedFunction(*self.pickle()[::-1])
 
 
-loaded_functions: OrderedDict[bytes, Arrived] = OrderedDict()
+loaded_functions = Recent()  # `Arrived` by key
 _loading = threading.Lock()
 
 
@@ -97,7 +91,7 @@ class _LoadedFunction:
     def __call__(self, item: Any) -> Any:
         key, source = self._parts
         with _loading:
-            function = loaded_functions.get(key)
+            function = loaded_functions.use(key)
             if function is None:
                 try:
                     payload = source if isinstance(source, bytes) else Path(source).read_bytes()
@@ -106,8 +100,6 @@ class _LoadedFunction:
                 pickled = Pickled(payload, key)
                 if not pickled.is_whole() and not isinstance(source, bytes):  # a file of another machine
                     return Missing()
-                function = loaded_functions[key] = pickled.load()
-            loaded_functions.move_to_end(key)
-            while len(loaded_functions) > MAX_LOADED_FUNCTIONS:
-                loaded_functions.popitem(last=False)
+                function = pickled.load()
+                loaded_functions.keep(key, function, len(payload))
         return function(item)

@@ -29,7 +29,7 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
-from .by_value import Pickled, without_addresses
+from .by_value import Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
 
 __all__ = ["Answer", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
@@ -38,6 +38,7 @@ _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
+_LOAD = bytes(16)  # in place of the key of a function
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between two looks at the process while its answer is waited for
 
@@ -98,8 +99,8 @@ class Worker:
 
     Attributes
     ----------
-    key : bytes
-        Of the function that was loaded last (`Pickled`).
+    keys : Recent
+        Keys of the functions that are loaded (`Pickled`).
     calls : int
         Number of items that were sent.
     """
@@ -121,7 +122,7 @@ class Worker:
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
-        self.key, self.calls, self._owner = b"", 0, os.getpid()
+        self.keys, self._key, self.calls, self._owner = Recent(), b"", 0, os.getpid()
         self._end = weakref.finalize(self, _kill, self._process, os.getpid())
 
     @property
@@ -139,19 +140,21 @@ class Worker:
         ValueError
             If the process cannot load it.
         """
-        if function.key == self.key:
+        self._key = function.key
+        if function.key in self.keys:
             return
-        self._send(b"l" + pickle.dumps(function, protocol=5))
+        self._send(_LOAD + pickle.dumps(function, protocol=5))
         answer = self.receive(seconds)
         if answer is None:
             raise WorkerDied(TransientReason(f"the worker process did not start within {seconds:g} s"))
         if answer.error is not None:
             raise answer.error
-        self.key = function.key
+        self.keys.keep(function.key, True, len(function.payload))
 
     def send(self, item: Any) -> None:
-        """Send an item; its answer is then received."""
-        self._send(b"c" + pickle.dumps(item, protocol=5))
+        """Send an item for the function that was loaded last; its answer is then received."""
+        self.keys.use(self._key)
+        self._send(self._key + pickle.dumps(item, protocol=5))
         self.calls += 1
 
     def receive(self, seconds: float | None = None) -> "Answer | None":
@@ -243,7 +246,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
-    function, me = None, os.getpid()
+    functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
         while True:
             try:
@@ -251,13 +254,14 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
             except (EOFError, OSError):
                 return
             try:
-                if message[:1] == b"l":
-                    function = None
-                    function = pickle.loads(message[1:]).load()
+                if message[:16] == _LOAD:
+                    pickled = pickle.loads(message[16:])
+                    functions.keep(pickled.key, pickled.load(), len(pickled.payload))
                     answer = _packed(None)
                 else:
+                    function = functions.use(bytes(message[:16]))
                     function.prepare()
-                    answer = _packed(function(pickle.loads(message[1:])))
+                    answer = _packed(function(pickle.loads(message[16:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well

@@ -368,7 +368,7 @@ def test_files_that_a_simulation_writes_do_not_count(tmp_path):
     observed = Observed(simulate)
     result, opened = observed(3)
     assert result == "123" and list(opened.files) == [str(tmp_path / "read.txt")]
-    assert observed(4) == ("124", None)
+    assert observed(4) == ("124", opened)
 
 
 # files of earlier releases --------------------------------------------------------------------------------------------

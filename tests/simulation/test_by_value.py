@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import FunctionModel
-from fe_likelihoods.simulation import by_value
+from fe_likelihoods.simulation import by_value, user_code
 from fe_likelihoods.simulation.by_value import NotSent, Pickled
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import ChangedModel
@@ -110,7 +110,6 @@ def user(tmp_path, monkeypatch):
     yield module
     for name in names:
         sys.modules.pop(name, None)
-        by_value._of_user.pop(name, None)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +198,7 @@ def test_an_unchanged_function_has_the_same_key(user):
 
 def test_another_version_of_the_library_is_refused(monkeypatch):
     pickled = Pickled.of(line)
-    monkeypatch.setattr(by_value, "library_digest", lambda: bytes(16))
+    monkeypatch.setattr(by_value, "sources_digest", lambda: bytes(16))
     with pytest.raises(ChangedModel, match="another version of fe_likelihoods"):
         pickled.load()
 
@@ -225,9 +224,9 @@ def test_modules_of_this_process_stay_when_a_function_is_loaded_in_it(user):
 
 def test_what_belongs_to_the_user():
     for module in (sys.modules[__name__], sys.modules["__main__"], types.ModuleType("made_by_hand")):
-        assert by_value.is_of_user(module)
+        assert user_code.is_of_user(module)
     for module in (np, pytest, threading, by_value, sys, np.random.mtrand):
-        assert not by_value.is_of_user(module)
+        assert not user_code.is_of_user(module)
 
 
 def test_the_script_is_not_run_again(tmp_path):

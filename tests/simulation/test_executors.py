@@ -225,7 +225,7 @@ def test_a_worker_keeps_a_bounded_number_of_functions():
         model = Treacherous()
         model.ballast = ballast
         simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(sent_functions.loaded_functions) == sent_functions.MAX_LOADED_FUNCTIONS
+    assert len(sent_functions.loaded_functions) == 8
 
 
 def test_files_are_closed_with_the_executor():

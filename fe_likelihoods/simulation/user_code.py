@@ -1,0 +1,88 @@
+"""Which code belongs to the user, and the digest of the source files of this library.
+
+Code of the user changes without a version: it travels to workers by value, and labels contain its source. This library
+is represented by a digest of its files, and installed packages by their versions.
+"""
+
+import functools
+import importlib.metadata
+import sys
+import sysconfig
+import types
+from collections.abc import Mapping
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+__all__ = ["LIBRARY", "SCRIPTS", "is_of_user", "package_version", "sources_digest"]
+
+LIBRARY = __name__.split(".")[0]
+SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of a script in a worker that imports it
+
+
+def is_of_user(module: Any) -> bool:
+    """Whether a module, given by itself or by its name, belongs neither to this library, to Python nor to a package."""
+    if isinstance(module, str):
+        name, module = module, sys.modules.get(module)
+    else:
+        name = _values(module).get("__name__")
+    if not isinstance(name, str):
+        return False
+    return _is_of_user(name, _places(module) or _places(sys.modules.get(name.partition(".")[0])))
+
+
+def _values(module: Any) -> dict[str, Any]:
+    # asking a lazy module for an attribute would import it
+    return object.__getattribute__(module, "__dict__") if isinstance(module, types.ModuleType) else {}
+
+
+def _places(module: Any) -> tuple[str, ...]:
+    """The file of a module, or the folders of a package without a file."""
+    file = _values(module).get("__file__")
+    return (file,) if isinstance(file, str) else tuple(map(str, _values(module).get("__path__", ())))
+
+
+@functools.cache
+def _is_of_user(name: str, places: tuple[str, ...]) -> bool:
+    top = name.partition(".")[0]
+    if top in SCRIPTS:
+        return True
+    if not top or top in (LIBRARY, "samplers") or top in sys.builtin_module_names:
+        return False
+    for path in map(Path, places):
+        if {"site-packages", "dist-packages"} & set(path.resolve().parts):
+            return not package_version(top)
+        if any(path.resolve().is_relative_to(folder) for folder in _standard_folders()):
+            return False
+    return bool(places) or top not in sys.stdlib_module_names  # a module that is made by code has no place
+
+
+@functools.cache
+def _standard_folders() -> tuple[Path, ...]:
+    return tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
+
+
+def package_version(top: str) -> str:
+    """Version of an installed package by the name of its top module; empty for others."""
+    try:
+        return importlib.metadata.version(top)
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        pass
+    try:
+        return " ".join(map(importlib.metadata.version, _distributions().get(top, ())))
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+@functools.cache
+def sources_digest(*patterns: str) -> bytes:
+    """Digest of the source files of this library that match patterns, such as ``"kernels/*.py"``; of all without."""
+    root, digest = Path(__file__).resolve().parents[1], blake2b(digest_size=16)
+    for file in sorted({file for pattern in patterns or ("**/*.py",) for file in root.glob(pattern)}):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.digest()
