@@ -39,11 +39,12 @@ __all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "w
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
 _CACHED = type(functools.cache(len))
-_OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__", "_abc_impl"}
+_OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
-_OF_A_CLASS = (types.GetSetDescriptorType, types.MemberDescriptorType)
-_BY_IDENTITY = (types.FunctionType, type, types.ModuleType, types.CodeType, *_LOCKS)
-_IDENTICAL = set(_BY_IDENTITY)
+_OF_A_CLASS = {"__dict__", "__weakref__", "_abc_impl", "__abstractmethods__"}
+_IDENTICAL = (types.FunctionType, type, types.ModuleType, types.CodeType, *_LOCKS)  # their contents are seen apart
+_DESCRIPTORS = (property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType)
+_CONSTANT = {int, float, complex, str, bytes, bool, type(None), *_IDENTICAL, *_DESCRIPTORS}
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
@@ -206,16 +207,16 @@ class _Sent:
 
     def __init__(self, pickled: Pickled, seen: tuple, uses: "_Uses", is_confirmed: bool) -> None:
         self.pickled, self.seen, self.uses, self.is_confirmed = pickled, seen, uses, is_confirmed
-        self._state = uses.state()  # kept, so that no other object has the identities of these
-        self._seen = self._snapshot(self._state)
-
-    def _snapshot(self, state: list) -> tuple[bytes | None, list]:
-        unsent = self.uses.unsent
-        return _snapshot([id(x) if type(x) in _IDENTICAL or id(x) in unsent else x for x in state])
+        self._objects = uses.objects()  # kept, so that no other object has the identities of these
+        self._identities = list(map(id, self._objects))
+        self._mutable = [x for x in self._objects if type(x) not in _CONSTANT and id(x) not in uses.unsent]
+        self._content = _snapshot(self._mutable)
 
     def is_unchanged(self) -> bool:
         """Whether the code and values that the function uses are those that were pickled."""
-        return self._seen[0] is not None and self._snapshot(self.uses.state())[0] == self._seen[0]
+        if self._content[0] is None or list(map(id, self.uses.objects())) != self._identities:
+            return False
+        return _snapshot(self._mutable)[0] == self._content[0]
 
 
 _sent: "Recent" = Recent()  # by key
@@ -229,7 +230,7 @@ class _Uses:
         self.namespaces: dict[int, tuple[dict, set[str] | None]] = {}  # of which all values were used, or those named
         self.functions: dict[int, types.FunctionType] = {}
         self.classes: dict[int, type] = {}
-        self.unsent: dict[int, Any] = {}  # values that cannot be sent
+        self.unsent: dict[int, Any] = {}  # values that are not, or cannot be, sent
 
     def add_names(self, namespace: dict, names: Any) -> None:
         """Note that a function uses values of a namespace."""
@@ -237,25 +238,20 @@ class _Uses:
         if known is not None:
             known.update(names)
 
-    def state(self) -> list:
-        """All of this as it is now: names, code and values."""
-        state = [sys.modules.get(name) for name in sorted(self.modules)]
-        namespaces = [
-            namespace.copy() if names is None else {n: namespace[n] for n in names if n in namespace}
-            for namespace, names in self.namespaces.values()
-        ]
+    def objects(self) -> list:
+        """All names, code and values at present."""
+        objects = [sys.modules.get(name) for name in self.modules]
         for function in self.functions.values():
-            state += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
-            state += function.__closure__ or ()
+            objects += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
+            objects += function.__closure__ or ()
+        for namespace, names in self.namespaces.values():
+            objects += map(namespace.get, names) if names is not None else (*namespace, *namespace.values())
         for cls in self.classes.values():
-            state.append(cls.__bases__)
-            namespaces.append({n: value for n, value in vars(cls).items() if type(value) not in _OF_A_CLASS})
-        for values in namespaces:
-            for name in _OF_THE_IMPORT & values.keys():
-                del values[name]
-            state.append(list(values))
-            state += values.values()
-        return state
+            objects += cls.__bases__
+            for name, value in vars(cls).items():
+                if name not in _OF_A_CLASS:
+                    objects += name, value
+        return objects
 
 
 def _snapshot(thing: Any) -> tuple[bytes | None, list]:
@@ -278,7 +274,7 @@ class _Snapshot(cloudpickle.Pickler):
         self.kept: list[Any] = []
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, _BY_IDENTITY):
+        if isinstance(obj, _IDENTICAL):
             self.kept.append(obj)
             return abs, (id(obj),)
         if isinstance(obj, _CACHED):
@@ -336,6 +332,7 @@ class _Pickler(cloudpickle.Pickler):
             values = {name: values[name] for name in ("__file__", "__package__") if name in values}
         else:
             self.uses.namespaces[id(values)] = values, None
+            self.uses.unsent |= {id(values[key]): values[key] for key in _OF_THE_IMPORT & values.keys()}
             # modules of a package are sent where a function names them
             values = {key: value for key, value in values.items() if self._module(f"{name}.{key}") is None}
         parent = self._module(name.rpartition(".")[0])

@@ -20,6 +20,7 @@ from .worker import Worker, WorkerDied
 __all__ = ["LocalPool", "Outcome"]
 
 MAX_ATTEMPTS = 3
+_LINGER = 0.1  # [s] for which a thread waits for another item before it ends; its start takes as long as a short item
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
@@ -104,6 +105,7 @@ class LocalPool:
         self._busy: dict[Worker, _Job | None] = {}  # each worker's job, None while it loads a function
         self._free: list[Worker] = []
         self._threads: set[threading.Thread] = set()
+        self._idle = 0  # threads that wait for an item
         self._closed = 0  # how often
 
     def __enter__(self) -> "LocalPool":
@@ -125,6 +127,7 @@ class LocalPool:
         self._notice_fork()
         with self._changed:
             self._closed += 1
+            self._changed.notify_all()
             loading = [worker for worker, job in self._busy.items() if job is None]
             left = [*self._waiting, *filter(None, self._busy.values())]
         for worker in loading:
@@ -197,7 +200,8 @@ class LocalPool:
                 self._waiting.extendleft(reversed(jobs))
             else:
                 self._waiting.extend(jobs)
-            for _ in range(min(self.workers - len(self._threads), len(jobs))):
+            self._changed.notify_all()
+            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._idle)):
                 thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
                 self._threads.add(thread)
                 thread.start()
@@ -207,31 +211,37 @@ class LocalPool:
 
     def _work(self) -> None:
         """Run items, one after the other, in one process until none waits."""
-        worker = None
-        while (function := self._next_function(worker)) is not None:
+        worker, job = self._first_job(None)
+        while job is not None:
             try:
-                worker = self._loaded(worker, function)
-                job = self._next_job(worker, function)
+                worker = self._loaded(worker, job.function)
+                job = self._next_job(worker, job.function)
+                worker = worker if job is None else self._run(worker, job)
             except BaseException as error:
                 worker = None
-                self._drop(function, error)
-                continue
-            if job is not None:
-                worker = self._run(worker, job)
+                self._drop(job.function, error)
+            worker, job = self._first_job(worker)
 
-    def _next_function(self, worker: Worker | None) -> Pickled | None:
-        """The function of the next item, None if the thread ends, and with it the work of a process."""
+    def _first_job(self, worker: Worker | None) -> tuple[Worker | None, _Job | None]:
+        """The item that waits first; None if the thread ends. The process is free while there is no item."""
+        closed = self._closed
         with self._changed:
-            while self._waiting and (self._waiting[0].cancelled() or self._waiting[0].given_up):
-                self._waiting.popleft().start()
-            if self._waiting:
-                return self._waiting[0].function
-            if worker is not None:
-                self._busy.pop(worker, None)
-                self._free.append(worker)
-            self._threads.discard(threading.current_thread())
-            self._changed.notify_all()
-            return None
+            while True:
+                while self._waiting and (self._waiting[0].cancelled() or self._waiting[0].given_up):
+                    self._waiting.popleft().start()
+                if self._waiting:
+                    return worker, self._waiting[0]
+                if worker is not None:
+                    del self._busy[worker]
+                    self._free.append(worker)
+                    worker = None
+                self._idle += 1
+                has_items = self._changed.wait_for(lambda: self._waiting or self._closed != closed, _LINGER)
+                self._idle -= 1
+                if not has_items or not self._waiting:
+                    self._threads.discard(threading.current_thread())
+                    self._changed.notify_all()
+                    return None, None
 
     def _loaded(self, worker: Worker | None, function: Pickled) -> Worker | None:
         """A process that has loaded a function; None if the pool is closed meanwhile."""
