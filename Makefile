@@ -39,7 +39,7 @@ clients:         ## run every client on one posterior and compare with quadratur
 tutorials: $(READY) ## run every tutorial that needs no other data than the bundled ones
 	for t in tutorials/0[1-5]*.py tutorials/1[01]*.py; do $(BIN)/python $$t || exit 1; done
 
-bench: $(READY)  ## measure speed against OpenSees, scipy and other samplers; prints one table
+bench: $(READY)  ## run all benchmarks: accuracy and speed, many hours; `python -m benchmarks NAME` runs one
 	$(BIN)/python -m benchmarks
 
 size: $(READY)   ## print the size of the project: lines, names, settings, frames, prose

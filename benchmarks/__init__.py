@@ -1,5 +1,6 @@
-"""Benchmarks: ``python -m benchmarks`` prints one table and stores it in ``results/benchmarks.json``.
+"""Studies and measurements of speed: ``python -m benchmarks [NAME]``; README.md lists them.
 
-A benchmark is a function of the number of repeats that returns a list of `Row`; `__main__` lists all of them. No time
-is asserted, because machines differ and are shared.
+A benchmark is a function of the number of repeats, with options as keyword arguments, that returns or yields rows:
+NamedTuples of one type, whose fields are the columns of its table. `__main__` lists all of them. No time is asserted,
+because machines differ and are shared.
 """

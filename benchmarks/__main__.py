@@ -1,17 +1,19 @@
-"""``python -m benchmarks [names] [--repeats 3] [--out FILE]``, or ``--compare BEFORE AFTER``: see --help.
+"""Run benchmarks, print a table of each and store all rows.
 
-``python -m benchmarks truth`` has options of its own (`benchmarks.truth`).
+``python -m benchmarks [NAME ...] [OPTION=VALUE ...]``; the options of a benchmark are the keyword arguments of its
+function, several values are separated by commas. README.md lists what each measures, how long it takes and what it
+needs.
 """
 
 import argparse
-import sys
-from functools import partial
+import inspect
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from . import (
     bridge,
     bridge_steps,
-    busy_workers,
     cache,
     carried_state,
     column,
@@ -19,10 +21,9 @@ from . import (
     decisions,
     executors,
     expected,
-    few_hundred_peers,
+    few_simulations,
     growth,
     hierarchy,
-    hierarchy_cases,
     hierarchy_warnings,
     job,
     measured_columns,
@@ -42,11 +43,12 @@ from . import (
     transfer,
     transfer_twins,
     truth,
+    utilisation,
 )
 from .comparison import compare
 from .rows import as_table, machine, write_json
 
-BENCHMARKS = {
+BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "simulation": column.simulation,
     "batch": column.batch,
     "sensors": column.sensors,
@@ -54,79 +56,135 @@ BENCHMARKS = {
     "bridge_steps": bridge_steps.steps,
     "imports": startup.imports,
     "compilation": startup.compilation,
-    "cost": cost.cost,
-    "growth": growth.growth,
-    "hierarchy": hierarchy.hierarchy,
-    "hierarchy_ranks": hierarchy.ranks,
-    "hierarchy_cases": hierarchy_cases.cases,
-    "busy_workers": busy_workers.busy_workers,
-    "hierarchy_warnings": hierarchy_warnings.alarms,
-    "transfer": transfer.transfer,
-    "transfer_median": transfer.transfer_median,
-    "transfer_twins": transfer_twins.transfer_twins,
-    "noises": noises.noises,
-    "transfer_columns": measured_columns.columns,
-    "strain_penetration": strain_penetration.evidence,
-    "transfer_frame": measured_tests.frame,
-    "transfer_meloland": measured_tests.meloland,
-    "transfer_coupon": measured_tests.coupon,
-    "new_event": new_event.new_event,
-    "level_ratios": decisions.level_ratios,
-    "fragility_bands": decisions.fragility_bands,
-    "measured_peaks": measured_peaks.measured_peaks,
+    "memory": job.memory,
     "cache": cache.cache,
     "storage": storage.storage,
     "executors": executors.executors,
-    "expected": expected.expected,
-    "samplers": samplers.rows,
-    "starts": starts.starts,
-    "carried_state": carried_state.carried_state,
-    "sequential": sequential.sequential,
-    "peers": peers.rows,
-    "overhead": overhead.overhead,
-    "few_hundred_peers": few_hundred_peers.rows,
-    "memory": job.memory,
     "opensees_memory": opensees_memory.memory,
+    "carried_state": carried_state.carried_state,
+    "cost": cost.cost,
+    "growth": growth.growth,
     "job": job.job,
+    "utilisation": utilisation.utilisation,
+    "overhead": overhead.overhead,
+    "truth": truth.truth,
+    "samplers": samplers.rows,
+    "peers": peers.rows,
+    "few_simulations": few_simulations.few_simulations,
+    "few_simulations_coverage": few_simulations.coverage,
+    "few_simulations_references": few_simulations.references,
+    "expected": expected.expected,
+    "starts": starts.starts,
+    "sequential": sequential.sequential,
+    "hierarchy": hierarchy.hierarchy,
+    "hierarchy_ranks": hierarchy.ranks,
+    "hierarchy_warnings": hierarchy_warnings.alarms,
+    "new_event": new_event.new_event,
+    "level_ratios": decisions.level_ratios,
+    "fragility_bands": decisions.fragility_bands,
+    "transfer_twins": transfer_twins.transfer_twins,
+    "noises": noises.noises,
+    "transfer": transfer.transfer,
+    "transfer_median": transfer.transfer_median,
+    "measured_peaks": measured_peaks.measured_peaks,
+    "transfer_coupon": measured_tests.coupon,
+    "transfer_frame": measured_tests.frame,
+    "transfer_meloland": measured_tests.meloland,
+    "transfer_columns": measured_columns.columns,
+    "strain_penetration": strain_penetration.evidence,
 }
+QUICK: dict[str, dict[str, Any]] = {
+    "cache": {"stored": 10_000},
+    "opensees_memory": {"runs": 20},
+    "job": {"limit": 20.0},
+    "utilisation": {"workers": (16,), "lengths": ("uniform",), "walkers": 100},
+    "overhead": {"dimensions": (5,), "budget": 200},
+    "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
+    "samplers": {"targets": ("T3",)},
+    "peers": {"targets": ("T3",), "limit": 20.0},
+    "few_simulations": {"problems": ("few_samples", "oscillator"), "budgets": (200,)},
+    "few_simulations_coverage": {"problems": ("oscillator",), "budgets": (200,), "runs": 2},
+    "expected": {"walkers": (100,)},
+    "sequential": {"walkers": 100},
+    "hierarchy_ranks": {"data_sets": 3},
+    "hierarchy_warnings": {"problems": 3},
+    "new_event": {"data_sets": 2},
+    "level_ratios": {"data_sets": 2},
+    "fragility_bands": {"data_sets": 2},
+    "transfer_twins": {"data_sets": 2},
+}
+"""Options of the shortest run of each benchmark, which only shows that it runs."""
 
 
-def main() -> None:
-    """Run the selected benchmarks, print their table and store it."""
-    if sys.argv[1:2] == ["truth"]:
-        truth.main(sys.argv[2:])
-        return
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", help=f"some of {', '.join(BENCHMARKS)} (all by default); truth")
-    parser.add_argument("--repeats", type=int, default=3, help="number of repeats; the median is reported (default 3)")
-    parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json")
+def converted(text: str, default: Any) -> Any:
+    """A value of the type of a default; the values of a tuple are separated by commas."""
+    if isinstance(default, tuple):
+        return tuple(converted(part, default[0]) for part in text.split(","))
+    return type(default)(text)
+
+
+def options_of(function: Callable) -> dict[str, Any]:
+    """The options of a benchmark and their defaults."""
+    parameters = inspect.signature(function).parameters
+    return {name: each.default for name, each in parameters.items() if name != "repeats"}
+
+
+def parsed(words: list[str]) -> tuple[list[str], dict[str, dict[str, Any]]]:
+    """Names of the benchmarks (all of them if none is given), and the given options of each.
+
+    Raises
+    ------
+    ValueError
+        If a benchmark or an option does not exist, or a value has another type.
+    """
+    names = [word for word in words if "=" not in word] or list(BENCHMARKS)
+    if unknown := set(names) - set(BENCHMARKS):
+        raise ValueError(f"expected names among {', '.join(BENCHMARKS)}; got {', '.join(sorted(unknown))}")
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    found = {}
+    for name in names:
+        known = options_of(BENCHMARKS[name])
+        found[name] = {key: converted(text, known[key]) for key, text in given.items() if key in known}
+    if unknown := set(given) - {key for options in found.values() for key in options}:
+        some = "; ".join(f"{name}: {', '.join(options_of(BENCHMARKS[name])) or 'none'}" for name in names)
+        raise ValueError(f"no such option: {', '.join(sorted(unknown))}. Options of {some}")
+    return names, found
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the selected benchmarks, print their tables and store the rows."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, formatter_class=form)
+    parser.add_argument("words", nargs="*", metavar="NAME or OPTION=VALUE", help=f"some of {', '.join(BENCHMARKS)}")
+    parser.add_argument("--repeats", type=int, default=3, help="repeats or seeds (default 3)")
+    parser.add_argument("--quick", action="store_true", help="one repeat of the shortest setting: does it run?")
+    parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json", help="file for the rows")
     parser.add_argument(
         "--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"), help="compare two stored files; runs no benchmark"
     )
-    parser.add_argument("--every", type=int, default=job.EVERY, help="job: use one sample in EVERY; 1: full record")
-    parser.add_argument("--limit", type=float, default=job.LIMIT, help="job: time limit of each run [s]; 0: none")
-    arguments = parser.parse_args()
-    if arguments.compare:
-        try:
-            print(compare(*arguments.compare))
-        except ValueError as error:
-            parser.error(str(error))
-        return
-    if unknown := set(arguments.names) - set(BENCHMARKS):
-        parser.error(f"expected names among {', '.join(BENCHMARKS)}; got {', '.join(unknown)}")
-    if arguments.repeats < 1:
-        parser.error(f"expected at least one repeat; got {arguments.repeats}")
-    if arguments.every < 1 or arguments.limit < 0:
-        parser.error(f"expected --every of 1 or more, --limit not below 0; got {arguments.every}, {arguments.limit:g}")
-    benchmarks = BENCHMARKS | {"job": partial(job.job, every=arguments.every, limit=arguments.limit)}
-    machines = [machine()]
-    groups = [benchmarks[name](arguments.repeats) for name in arguments.names or benchmarks]
-    machines.append(machine())
-    print(f"{machines[0]['cpu']}, {machines[0]['cores']} cores; load average of the last minute", end=" ")
-    print(" before and ".join(str(m["load_average"][:1]) for m in machines), "after")
-    print(as_table(*groups))
-    write_json(arguments.out, [row for rows in groups for row in rows], machines)
-    print(f"stored in {arguments.out}")
+    given = parser.parse_intermixed_args(arguments)
+    try:
+        if given.compare:
+            print(compare(*given.compare))
+            return
+        names, options = parsed(given.words)
+    except ValueError as error:
+        parser.error(str(error))
+    if given.repeats < 1:
+        parser.error(f"expected at least one repeat; got {given.repeats}")
+    before, stored = machine(), []
+    print(f"{before['cpu']}, {before['cores']} cores, load average {before['load_average'][:1]}")
+    for name in names:
+        print(f"\n{name}", flush=True)
+        chosen = QUICK.get(name, {}) | options[name] if given.quick else options[name]
+        rows = []
+        for row in BENCHMARKS[name](1 if given.quick else given.repeats, **chosen):
+            rows.append(row)
+            write_json(given.out, [*stored, *rows], [before, machine()])  # hours are not lost with the last one
+        stored += rows
+        if rows:
+            print(as_table(rows), flush=True)
+    print(f"\nstored in {given.out}")
 
 
 if __name__ == "__main__":

@@ -20,16 +20,17 @@ def _read(path: Path) -> tuple[dict, dict[tuple[str, str], dict]]:
     """
     try:
         kept = json.loads(path.read_text())
-        return kept["machine"], {(row["what"], row["case"]): row for row in kept["rows"]}
+        return kept["machine"], {(row["what"], row["case"]): row for row in kept["rows"] if "what" in row}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a file that `python -m benchmarks --out` wrote; {error!r}") from None
+        raise ValueError(f"{path}: expected a file that `python -m benchmarks` wrote; {error!r}") from None
 
 
 def compare(before: Path, after: Path) -> str:
     """One table of two files: both values and their ratio, with a star where it differs from 1 by more than 10 %.
 
     Rows that only one file has show a dash for the other. Figures of different machines, or measured under other load,
-    cannot be compared: processor and load average of both files are printed above the table.
+    cannot be compared: processor and load average of both files are printed above the table. Tables without a column
+    "what" are left out.
     """
     (machine_before, old), (machine_after, new) = _read(before), _read(after)
     lines = [

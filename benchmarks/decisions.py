@@ -25,16 +25,14 @@ from .rows import Row
 
 __all__ = ["fragility_bands", "level_ratios"]
 
-_SETS = 200
 
-
-def level_ratios(repeats: int = 1) -> list[Row]:
+def level_ratios(repeats: int = 1, data_sets: int = 200) -> list[Row]:
     """Coverage near and far, and interval scores, of constant and level-dependent ratios."""
     rows = []
     for truth in TRUTHS:
         for events in (5, 10, 20):
             for form in ("constant", None):
-                found = [ratio_twin(truth, events, form, seed) for seed in range(repeats * _SETS)]
+                found = [ratio_twin(truth, events, form, seed) for seed in range(repeats * data_sets)]
                 case = f"{'averaged forms' if form is None else form}, {truth}, {events} events"
                 inside, far, score = (np.array(each) for each in zip(*found, strict=True))
                 for k, level in enumerate((0.5, 0.9)):
@@ -46,12 +44,12 @@ def level_ratios(repeats: int = 1) -> list[Row]:
     return rows
 
 
-def fragility_bands(repeats: int = 1) -> list[Row]:
+def fragility_bands(repeats: int = 1, data_sets: int = 200) -> list[Row]:
     """Shares of the data sets whose band, and whose intervals, hold the true fragility; with the control."""
     logging.getLogger("fe_likelihoods.prediction.fragility").setLevel(logging.ERROR)  # the control has no curve
     rows = []
     for events in (3, 5, 10):
-        found = [fragility_twin(events, seed) for seed in range(repeats * _SETS)]
+        found = [fragility_twin(events, seed) for seed in range(repeats * data_sets)]
         whole, points, control, scores = (np.array(each) for each in zip(*found, strict=True))
         case = f"{events} events"
         for what, inside in (

@@ -62,11 +62,13 @@ def _rows(case: str, found: list[tuple[bool, bool, float]]) -> Iterator[Row]:
             yield Row(f"predictions that held, {what}", case, 100.0 * float(np.mean([h for h, _ in some])), "%", note)
 
 
-def expected(repeats: int) -> list[Row]:
+def expected(repeats: int, walkers: tuple[int, ...] = (1000, 500, 250, 100)) -> list[Row]:
     """Share of the predictions that held, by posterior and sampler."""
     rows: list[Row] = []
     for group, makers in GROUPS.items():
         for sampler_type, nwalkers in RUNS:
+            if nwalkers not in walkers:
+                continue
             found = [
                 each
                 for seed in range(repeats)

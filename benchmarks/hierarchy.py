@@ -35,7 +35,7 @@ from .rows import Row
 
 __all__ = ["hierarchy", "ranks"]
 
-_DATA_SETS, _HYPER_SAMPLES = 200, 400
+_HYPER_SAMPLES = 400
 _ERRORS = np.array([0.3, 0.5, 0.2, 0.4, 0.3, 0.6])  # standard errors of six tests
 _CENTER, _SPREAD, _STORED = 0.5, 0.3, 1.0  # standard deviations of the priors of mean, spread and stored samples
 
@@ -77,9 +77,9 @@ def hierarchy(repeats: int = 1) -> list[Row]:
     return rows + oscillator(repeats)
 
 
-def ranks(repeats: int = 1) -> list[Row]:
-    """P-values of the uniformity of ranks (Kolmogorov and Smirnov), for 200 data sets times `repeats`."""
-    found = [_rank(seed) for seed in range(_DATA_SETS * repeats)]
+def ranks(repeats: int = 1, data_sets: int = 200) -> list[Row]:
+    """P-values of the uniformity of ranks (Kolmogorov and Smirnov), for `data_sets` times `repeats`."""
+    found = [_rank(seed) for seed in range(data_sets * repeats)]
     rows = []
     for i, label in enumerate(("", "closed form: ", "wrong formula: ")):
         part = [each[i] for each in found]

@@ -12,12 +12,12 @@ from .rows import Row
 
 __all__ = ["alarms"]
 
-_FIRST, _PROBLEMS = 500, 120  # seeds
+_FIRST = 500  # seed
 
 
-def alarms(repeats: int = 1) -> list[Row]:
-    """Warnings on right and on wrong results, 120 problems times `repeats`."""
-    found = [solve(problem(seed), seed) for seed in range(_FIRST, _FIRST + _PROBLEMS * repeats)]
+def alarms(repeats: int = 1, problems: int = 120) -> list[Row]:
+    """Warnings on right and on wrong results, `problems` times `repeats`."""
+    found = [solve(problem(seed), seed) for seed in range(_FIRST, _FIRST + problems * repeats)]
     rows = []
     for name, inside in (
         ("right", lambda error: error <= RIGHT),

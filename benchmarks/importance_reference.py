@@ -191,7 +191,6 @@ def by_importance(
     rounds: int = 8,
     seed: int = 1,
     labels: Callable[[np.ndarray], np.ndarray] | None = None,
-    inform: Callable[[str], None] = print,
 ) -> Reference:
     """Reference of a posterior whose modes are near known points.
 
@@ -206,8 +205,6 @@ def by_importance(
         Seed of the draws.
     labels : callable, optional
         Function of points (n, ndim) that returns the number of the mode (n,).
-    inform : callable
-        Receives one line per round.
 
     Returns
     -------
@@ -232,13 +229,12 @@ def by_importance(
         points, values = np.concatenate([points, new]), np.concatenate([values, posterior(new)])
         density = np.logaddexp.reduce([one.logpdf(points) for one in proposals], axis=0) - np.log(len(proposals))
         log_weights = values - density
-        weights = np.exp(log_weights - log_weights.max())
-        ess = weights.sum() ** 2 / (weights**2).sum()
-        log_evidence = float(log_weights.max() + np.log(weights.mean()))
-        inform(f"  round {number + 1}: {len(points)} draws, effective {ess:.0f}, log Z {log_evidence:.3f}")
         if number < adapting - 1:
             softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
             components = _refit(points, softened, label(points), rng) or components
+    weights = np.exp(log_weights - log_weights.max())
+    ess = weights.sum() ** 2 / (weights**2).sum()
+    log_evidence = float(log_weights.max() + np.log(weights.mean()))
     w = weights / weights.sum()
     mean = w @ points
     variance = w @ (points - mean) ** 2

@@ -37,7 +37,7 @@ from .rows import Row
 
 __all__ = ["new_event"]
 
-_SETS, _NEW, _DRAWS, _RATIO = 200, 20, 400, 0.1
+_NEW, _DRAWS, _RATIO = 20, 400, 0.1
 _CASES = {  # number of events, median and spread of the gains; None: drawn from the priors
     "5 events, truth from the priors": (5, None),
     "1 event, truth from the priors": (1, None),
@@ -60,11 +60,11 @@ def _respond(theta: np.ndarray) -> list[np.ndarray]:
     return [theta[0] * np.array([0.0, 1.0])]
 
 
-def new_event(repeats: int = 1) -> list[Row]:
+def new_event(repeats: int = 1, data_sets: int = 200) -> list[Row]:
     """Rows of coverage and of the interval score per case and for the control, and one of sharpness."""
     rows = []
     for case, (events, truth) in _CASES.items():
-        results = [_data_set(events, truth, seed) for seed in range(repeats * _SETS)]
+        results = [_data_set(events, truth, seed) for seed in range(repeats * data_sets)]
         pit, single, scores, ends = (np.array(each) for each in zip(*results, strict=True))
         for k, (what, values) in enumerate((("coverage", pit), ("control: one posterior", single))):
             for level in (0.5, 0.9):

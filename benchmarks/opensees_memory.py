@@ -1,8 +1,7 @@
 """Memory of the process of OpenSees over 10 000 runs, and the cost of replacing it.
 
 A model of 30 beams computes two eigenvalues, as for Rayleigh damping, which leaks memory in OpenSees. The response of
-each run is the resident memory of its process, so nothing else has to be observed. ``python -m benchmarks
-opensees_memory``; it takes some minutes.
+each run is the resident memory of its process, so nothing else has to be observed.
 """
 
 import inspect
@@ -17,7 +16,6 @@ from .rows import Row
 
 __all__ = ["chain", "memory"]
 
-RUNS = 10_000
 CHANNELS = (Channel("memory", "displacement", "m"),)  # there is no quantity for bytes
 
 
@@ -36,21 +34,21 @@ def chain(ops, theta: np.ndarray) -> np.ndarray:
     return np.array([[1024.0 * int(status.split("VmRSS:")[1].split()[0])]])
 
 
-def memory(repeats: int) -> list[Row]:
-    """Memory at the first and the last of 10 000 runs, the largest one, and the mean duration of a run."""
+def memory(repeats: int, runs: int = 10_000) -> list[Row]:
+    """Memory at the first and the last of the runs, the largest one, and the mean duration of a run."""
     del repeats
     default = inspect.signature(OpenSeesModel).parameters["runs_per_process"].default
     rows = []
     for runs_per_process in (None, default):
         model = OpenSeesModel(chain, ("E",), CHANNELS, 1.0, 1, runs_per_process=runs_per_process)
         start = time.perf_counter()
-        used = np.array([model.simulate(np.ones(1))[0, 0] for _ in range(RUNS)]) / 2**20
+        used = np.array([model.simulate(np.ones(1))[0, 0] for _ in range(runs)]) / 2**20
         seconds = time.perf_counter() - start
-        what = f"OpenSees, {RUNS} runs, runs_per_process={runs_per_process}"
+        what = f"OpenSees, {runs} runs, runs_per_process={runs_per_process}"
         rows += [
             Row(what, "memory at the first run", used[0], "MiB"),
             Row(what, "memory at the last run", used[-1], "MiB"),
             Row(what, "largest memory", used.max(), "MiB"),
-            Row(what, "time of a run", 1e3 * seconds / RUNS, "ms"),
+            Row(what, "time of a run", 1e3 * seconds / runs, "ms"),
         ]
     return rows

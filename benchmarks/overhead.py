@@ -16,9 +16,6 @@ from .rows import Row
 
 __all__ = ["overhead"]
 
-DIMENSIONS = (5, 10, 20)
-BUDGET = 1000
-
 
 def _features(x: np.ndarray) -> np.ndarray:
     """Every feature depends on two neighbouring parameters."""
@@ -31,16 +28,16 @@ def _case(d: int) -> HardPosterior:
     return HardPosterior("mildly nonlinear", prior, _features, _features(truth)[0], n_steps=1000, n_channels=2)
 
 
-def overhead(repeats: int) -> list[Row]:
+def overhead(repeats: int, dimensions: tuple[int, ...] = (5, 10, 20), budget: int = 1000) -> list[Row]:
     """One row per number of dimensions: the median over repeats, seconds of CPU per 100 simulations."""
     table = []
-    for d in DIMENSIONS:
+    for d in dimensions:
         seconds, notes = [], []
         for seed in range(1, repeats + 1):
             posterior = _case(d).posterior(seed, f"overhead {d}")
             posterior.likelihood.model.simulate(np.ones(d))
             start = time.process_time()
-            outcome = run(posterior, seed, BUDGET)
+            outcome = run(posterior, seed, budget)
             if outcome.failed:
                 notes.append(outcome.failed)
                 continue

@@ -1,6 +1,6 @@
 """Other samplers on the same targets, counted and scored in the same way. The library itself never imports them.
 
-Every run has its own process and ``LIMIT`` seconds of wall time, which include imports and compilation (on a busy
+Every run has its own process and ``limit`` seconds of wall time, which include imports and compilation (on a busy
 machine more runs are stopped). A row says so if a run was stopped, failed or warned, or if the sampler is not
 installed. All runs take about twenty minutes for each of the ``--repeats``. Settings are the defaults of the other
 sampler, except:
@@ -21,22 +21,22 @@ https://pytorch.org/get-started) and then ``pip install pocomc``.
 
 import importlib.util
 import logging
-import multiprocessing
 import random
 import time
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from multiprocessing.sharedctypes import RawValue
+from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
 
+from .processes import in_process
 from .rows import Row
-from .targets import Target, as_row, errors, target_named, target_names
+from .targets import Target, as_row, errors, target_named
 
 __all__ = ["PEERS", "Peer", "rows", "run_emcee", "run_peer"]
 
-LIMIT = 150.0  # s of wall time for one run
 WALKERS, STEPS = 100, 1000
 DRAWS = 2000  # of PyMC
 LIVE_POINTS = 500  # of dynesty
@@ -173,53 +173,38 @@ PEERS = {
 }
 
 
-def _work(peer: str, name: str, seed: int, count, answer) -> None:
-    """Run a sampler in its own process and send cost and errors, or the reason for a failure, through `answer`."""
+def _work(peer: str, name: str, seed: int, count: Any) -> dict:
+    """Run a sampler, and return its cost and errors."""
     target = target_named(name)
     target.count = count
-    try:
-        start = time.process_time()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
-            outcome = PEERS[peer].run(target, seed)
-        seconds = time.process_time() - start
-        run = {"microseconds": 1e6 * seconds / target.evaluations}
-        run |= errors(target, outcome.samples, outcome.weights)
-        if outcome.log_evidence is not None:
-            run["evidence"] = outcome.log_evidence - target.log_evidence
-        if outcome.log_evidence_error is not None:
-            run["error"] = outcome.log_evidence_error
-        run["warned"] = any(issubclass(warning.category, UserWarning) for warning in caught)
-    except Exception as error:  # any exception of the other sampler is reported in its row
-        run = {"reason": f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"}
-    answer.send(run)
+    start = time.process_time()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        outcome = PEERS[peer].run(target, seed)
+    seconds = time.process_time() - start
+    run = {"microseconds": 1e6 * seconds / target.evaluations}
+    run |= errors(target, outcome.samples, outcome.weights)
+    if outcome.log_evidence is not None:
+        run["evidence"] = outcome.log_evidence - target.log_evidence
+    if outcome.log_evidence_error is not None:
+        run["error"] = outcome.log_evidence_error
+    return run | {"warned": any(issubclass(warning.category, UserWarning) for warning in caught)}
 
 
-def run_peer(peer: str, name: str, seed: int) -> dict:
-    """One run in its own process, stopped after the time limit."""
-    context = multiprocessing.get_context("spawn")  # a fork would inherit numba's threads
-    count = context.RawValue("q", 0)
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(peer, name, seed, count, sender), daemon=True)
-    process.start()
-    sender.close()  # only the child holds this end: the wait ends when the child dies
-    try:
-        run = receiver.recv() if receiver.poll(LIMIT) else {"reason": f"stopped at {LIMIT:.0f} s"}
-    except EOFError:
-        process.join()
-        run = {"reason": f"ended without a result, exit code {process.exitcode}"}
-    process.kill()
-    process.join()
+def run_peer(peer: str, name: str, seed: int, limit: float) -> dict:
+    """One run in its own process, stopped after the time limit [s]."""
+    count = RawValue("q", 0)
+    run = in_process(_work, peer, name, seed, count, limit=limit)
     return {"evaluations": count.value} | run
 
 
-def rows(repeats: int) -> list[Row]:
+def rows(repeats: int, targets: tuple[str, ...] = ("T1", "T2", "T3", "T4"), limit: float = 150.0) -> list[Row]:
     """One row for each sampler and target, in the form of `samplers.rows`; one row for a sampler not installed."""
     table = []
     for peer, (module, _, install) in PEERS.items():
         if importlib.util.find_spec(module) is None:
             table.append(Row(f"{peer}: evaluations", "", None, "", f"not installed: {install}"))
             continue
-        for name in target_names():
-            table.append(as_row(peer, name, [run_peer(peer, name, seed) for seed in range(1, repeats + 1)]))
+        for name in targets:
+            table.append(as_row(peer, name, [run_peer(peer, name, seed, limit) for seed in range(1, repeats + 1)]))
     return table

@@ -59,6 +59,8 @@ def number(value: float | None) -> str:
     """Format a number with three significant digits, large ones in full, and a dash for None."""
     if value is None:
         return "-"
+    if isinstance(value, int):
+        return str(value)
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e9 else f"{value:.3g}"
 
 
@@ -76,17 +78,17 @@ def aligned(lines: Sequence[Sequence[str]], right: Sequence[int]) -> str:
     return "\n".join(out)
 
 
-def as_table(*groups: Sequence[Row]) -> str:
-    """Rows as aligned text, with an empty line between groups."""
-    cells = [("what", "case", "value", "unit", "note")]
-    for i, rows in enumerate(groups):
-        cells += [("",) * 5] * (i > 0)
-        cells += [(row.what, row.case, number(row.value), row.unit, row.note) for row in rows]
-    return aligned(cells, right=(2,))
+def as_table(rows: Sequence[tuple]) -> str:
+    """NamedTuples of one type as aligned text: their fields are the columns, numbers are aligned to the right."""
+    fields = rows[0]._fields
+    numeric = [all(not isinstance(value, str) for value in column) for column in zip(*rows, strict=True)]
+    cells = [[value if isinstance(value, str) else number(value) for value in row] for row in rows]
+    lines = [[name.replace("_", " ") for name in fields], *cells]
+    return aligned(lines, right=[i for i, is_number in enumerate(numeric) if is_number])
 
 
-def write_json(path: Path, rows: Sequence[Row], machines: Sequence[dict]) -> None:
+def write_json(path: Path, rows: Sequence[tuple], machines: Sequence[dict]) -> None:
     """Store the rows, and the machine before and after, in a JSON file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = {"machine": machines[0], "load_average_after": machines[-1]["load_average"]}
-    path.write_text(json.dumps(kept | {"rows": [row._asdict() for row in rows]}, indent=1) + "\n")
+    path.write_text(json.dumps(kept | {"rows": [row._asdict() for row in rows]}, indent=1, default=float) + "\n")

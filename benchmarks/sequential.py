@@ -27,10 +27,9 @@ from .rows import Row
 __all__ = ["sequential"]
 
 _TRUTH = np.array([0.8, 1.2, 1.3])
-_WALKERS = 500
 
 
-def sequential(repeats: int = 3) -> list[Row]:
+def sequential(repeats: int = 3, walkers: int = 500) -> list[Row]:
     """Differences between the two ways, one row per quantity, for `repeats` seeds of the samplers."""
     record = bridge_column_data().record.trim(8.0, 11.0).resample(2.0 / 256)
     events = Events([record, record.scale(0.8)], rest=1.0, names=["EQ1", "EQ2"])
@@ -53,7 +52,7 @@ def sequential(repeats: int = 3) -> list[Row]:
         likelihood = FELikelihood(column, data, noise="per event")
         levels = {name: sigmas[name] for name in likelihood.parameter_names[len(names) :]}
         posterior = Posterior(likelihood, Prior(prior | levels))
-        sampler = SMCSampler(_WALKERS, posterior.ndim, posterior, vectorize=True, seed=seed)
+        sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed)
         sampler.run_mcmc(None, 4, progress=False)
         return sampler
 
@@ -63,7 +62,7 @@ def sequential(repeats: int = 3) -> list[Row]:
         # EQ1 alone is a part of the same simulation; the pause and EQ2 are not compared
         first = run({"EQ1": measured["EQ1"]}, structural.distributions, 100 + seed)
         own = Prior(structural.distributions | {name: sigmas[name] for name in sigmas if name.endswith("EQ1")})
-        mixture = fit_mixture(first.get_chain(flat=True), own, names, effective_sample_size=_WALKERS)
+        mixture = fit_mixture(first.get_chain(flat=True), own, names, effective_sample_size=walkers)
         second = run({"EQ2": measured["EQ2"]}, {mixture.names: mixture}, 200 + seed)
         error = float(np.sqrt(sum(s.log_evidence_error**2 for s in (both, first, second)) + mixture.fit_error**2))
         difference = first.log_evidence + second.log_evidence - both.log_evidence

@@ -15,7 +15,7 @@ import numpy as np
 
 from .rows import Row
 
-__all__ = ["Target", "as_row", "errors", "target_named", "target_names"]
+__all__ = ["Target", "as_row", "errors", "target_named"]
 
 SHARED = Path(os.environ.get("FE_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
@@ -69,11 +69,6 @@ def _module():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def target_names() -> list[str]:
-    """Names of the targets, T1 to T4."""
-    return list(_module().TARGETS)
 
 
 def target_named(name: str) -> Target:

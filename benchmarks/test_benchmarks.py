@@ -1,13 +1,16 @@
 """Tables of the benchmarks: runs without a result have a row, and weighted samples are scored correctly."""
 
 import json
+import re
 import zipfile
+from pathlib import Path
 
 import emcee
 import numpy as np
 import pytest
 
 from benchmarks import job, noises, peers, transfer, transfer_twins, truth
+from benchmarks.__main__ import BENCHMARKS, QUICK, main, options_of, parsed
 from benchmarks.comparison import compare
 from benchmarks.growth import exponent
 from benchmarks.rows import Row, as_table, machine, write_json
@@ -26,6 +29,7 @@ from fe_likelihoods import (
 from fe_likelihoods.models.linear_system import respond_structure
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian
+from tests.statistics import analytic_runs
 
 ANSWER = {
     "evaluations": 100,
@@ -61,9 +65,9 @@ def test_peer_that_is_not_installed_has_a_row(monkeypatch, tmp_path):
     assert json.loads((tmp_path / "rows.json").read_text())["rows"][0]["value"] is None
 
 
-def test_run_is_stopped_at_the_limit(monkeypatch):
-    monkeypatch.setattr(peers, "LIMIT", 0.1)  # less than the imports of a new process take
-    assert peers.run_peer("emcee, stretch move", "T3", 1) == {"evaluations": 0, "reason": "stopped at 0 s"}
+def test_run_is_stopped_at_the_limit():
+    limit = 0.1  # less than the imports of a new process take
+    assert peers.run_peer("emcee, stretch move", "T3", 1, limit) == {"evaluations": 0, "reason": "stopped at 0 s"}
 
 
 def test_errors_of_weighted_samples_are_those_of_repeated_ones(shared, rng):
@@ -82,9 +86,42 @@ def test_target_counts_every_point_of_the_likelihood_and_none_outside_the_prior(
     assert target.evaluations == 6
 
 
-def test_table_separates_its_groups_and_shows_whole_numbers_in_full():
-    table = as_table([Row("runs", "a", 234567.0, "", "x")], [Row("time", "b", 0.0012345, "s")]).splitlines()
-    assert [line.split() for line in table[2:]] == [["runs", "a", "234567", "x"], [], ["time", "b", "0.00123", "s"]]
+def test_table_has_the_fields_as_columns_and_large_numbers_in_full():
+    table = as_table([Row("runs", "a", 234567.0, "", "x"), Row("time", "b", 0.0012345, "s")]).splitlines()
+    assert table[0].split() == ["what", "case", "value", "unit", "note"]
+    assert [line.split() for line in table[2:]] == [["runs", "a", "234567", "x"], ["time", "b", "0.00123", "s"]]
+    assert table[0].index("value") + len("value") == table[3].index("0.00123") + len("0.00123")
+
+
+def test_options_are_those_of_the_functions():
+    names, options = parsed(["truth", "job", "walkers=250,500", "limit=5"])
+    assert names == ["truth", "job"]
+    assert options == {"truth": {"walkers": (250, 500)}, "job": {"limit": 5.0}}
+    assert parsed([])[0] == list(BENCHMARKS)
+    for words, message in (
+        (["no_such"], "expected names among"),
+        (["job", "walkers=5"], "no such option: walkers. Options of job: every, limit"),
+        (["job", "every=many"], "many"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            parsed(words)
+    for name, options in QUICK.items():
+        known = options_of(BENCHMARKS[name])
+        assert {key: type(value) for key, value in options.items()} == {key: type(known[key]) for key in options}
+
+
+def test_the_readme_lists_every_benchmark():
+    table = (Path(__file__).parent / "README.md").read_text()
+    assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == list(BENCHMARKS)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_every_benchmark_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    main([name, "--quick"])
+    assert json.loads((tmp_path / "results" / "benchmarks.json").read_text())["rows"] or name.endswith("references")
 
 
 def test_two_files_side_by_side(tmp_path):
@@ -134,14 +171,14 @@ def test_two_settings_are_compared_in_cost_and_result():
 
 
 def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
-    (cell,) = truth.cells(["sharp"], ["SMC"], [300], everything=False)
-    right = truth.run(cell, 1, steps=2)
-    assert not truth.is_lost(right)
-    assert not truth.is_doubted(right)
+    cell = analytic_runs.Cell("sharp", 0.0, "SMC", 300)
+    right = analytic_runs.run(cell, 1, steps=2)
+    assert not analytic_runs.is_lost(right)
+    assert not analytic_runs.is_doubted(right)
     wrong = right | {"log_evidence_error": 20.0 * right["stated_error"] + 1.0}
     lost = right | {"shares": [0.3, 0.7], "true_shares": [0.5, 0.5], "status": "usable"}
-    line = truth.table([right, wrong, lost]).splitlines()[-1].split()
-    assert line[:8] == ["sharp", "SMC", "300", "3", "2", "1", "1", "0"]  # runs, lost, silent, doubted, false
+    found = truth.line(cell, [right, wrong, lost])
+    assert found[:8] == ("sharp", "SMC", 300, 3, 2, 1, 1, 0)  # runs, lost, silent, doubted, false
 
 
 def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, monkeypatch):

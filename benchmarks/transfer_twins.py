@@ -21,20 +21,19 @@ from .rows import Row
 
 __all__ = ["leave_one_out_t", "transfer_twins"]
 
-_SETS = 300
 _CENTER = np.array([np.log(5.1), np.log(0.12), special.logit(0.84)])  # of frequency [Hz], damping and share
 _SD = np.array([0.09, 0.54, 0.85])
 _CORRELATION = np.array([[1.0, -0.58, 0.5], [-0.58, 1.0, 0.3], [0.5, 0.3, 1.0]])
 _RATIO_SD = 0.09
 
 
-def transfer_twins(repeats: int = 1) -> list[Row]:
+def transfer_twins(repeats: int = 1, data_sets: int = 300) -> list[Row]:
     """Shares of the peaks of twins within their intervals, for two correlations of ratio and parameters."""
     records, rows = transfer.read_events()
     if len(records) < 4:
         return [*rows, Row("transfer_twins", "SKIPPED", None, "", f"no files *ce89324p.zip in {transfer._FOLDER}")]
     models = [transfer._model_and_measurements(each)[0] for each in records.values()]
-    rng, sets = np.random.default_rng(3), repeats * _SETS
+    rng, sets = np.random.default_rng(3), repeats * data_sets
     for correlation in (0.0, -0.8):
         errors = np.array([_log_errors(models, correlation, rng) for _ in range(sets)])
         rows += _rows(f"{len(models)} events, correlation {correlation:g}", errors)

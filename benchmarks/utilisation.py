@@ -1,4 +1,4 @@
-"""How busy the workers of a cluster are, on a simulated clock: ``python -m benchmarks.utilisation [--help]``.
+"""How busy the workers of a cluster are, on a simulated clock.
 
 One row per sampler, number of workers and distribution of run lengths: constant, uniform from 0.2 to 2 (over 1.1),
 log-normal with a coefficient of variation of 1, and the same as a function of a parameter. If short runs were
@@ -10,7 +10,7 @@ Runs with a guide are of a vibrating mass (two parameters), whose truth is known
 from eight starts is part of the time and of the evaluations.
 """
 
-import argparse
+import itertools
 import logging
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,16 +24,16 @@ from tests.contract.targets import Gaussian
 from tests.emulation.problems import vibration
 from tests.simulated_cluster import SimulatedCluster, SimulatedPool
 
-__all__ = ["LENGTHS", "PATHS", "Busy", "measure"]
+__all__ = ["LENGTHS", "PATHS", "Busy", "measure", "utilisation"]
 
 # the logarithm of a log-normal variable with a coefficient of variation of 1 has this standard deviation
 SPREAD = np.sqrt(np.log(2.0))
 FARTHEST = 3.0
 LENGTHS = ("constant", "uniform", "log-normal", "correlated")
-GUIDED = {"guide": False, "guide, asynchronous": True}
+GUIDED = {"guide": False, "guide asynchronous": True}
 PATHS = {
     "recycling": (SMCSampler, {"asynchronous": False}),
-    "recycling, asynchronous": (SMCSampler, {"asynchronous": True}),
+    "recycling asynchronous": (SMCSampler, {"asynchronous": True}),
     "moves": (SMCSampler, {"recycle": False}),
     "TMCMC": (TMCMCSampler, {}),
 }
@@ -52,21 +52,28 @@ class Busy(NamedTuple):
 
     Attributes
     ----------
-    utilisation : float
+    sampler, lengths : str
+        One of `PATHS` or `GUIDED`, and one of `LENGTHS`.
+    workers : int
+    busy : float
         Share of the time of all workers in which they were busy.
     duration : float
         Time of the annealing, in mean run lengths.
     evaluations : float
-        Their number.
-    deviations : (3,) float
+    log_Z, mean, variance : float
         Mean deviations of log-evidence, mean and variance of the first parameter, in standard errors of the mean over
-        the seeds.
+        the seeds; None with one seed.
     """
 
-    utilisation: float
+    sampler: str
+    lengths: str
+    workers: int
+    busy: float
     duration: float
     evaluations: float
-    deviations: np.ndarray
+    log_Z: float | None
+    mean: float | None
+    variance: float | None
 
 
 def lengths_of(name: str, target: Gaussian | Truth, random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
@@ -133,36 +140,22 @@ def measure(path: str, lengths: str, workers: int, nwalkers: int, ndim: int, see
         numbers.append((cluster.utilisation, cluster.now, sampler.simulations, evidence, z.mean(), z.var() - 1.0))
     numbers = np.array(numbers)
     means = numbers.mean(axis=0)
-    errors = numbers[:, 3:].std(axis=0, ddof=1) / np.sqrt(seeds) if seeds > 1 else np.full(3, np.nan)
-    return Busy(*means[:3], means[3:] / errors)
+    deviations = [None] * 3
+    if seeds > 1:
+        deviations = means[3:] / (numbers[:, 3:].std(axis=0, ddof=1) / np.sqrt(seeds))
+    return Busy(path, lengths, workers, *means[:3], *deviations)
 
 
-def table(arguments: argparse.Namespace) -> Iterator[str]:
-    """Lines of the table, each as soon as it is known."""
-    yield f"{arguments.walkers} walkers, {arguments.ndim} parameters, {arguments.seeds} seeds"
-    yield f"{'sampler':26}{'lengths':12}{'workers':>8}{'busy':>8}{'time':>8}{'evaluations':>12}   log Z, mean, var [se]"
-    for path in arguments.paths:
-        for lengths in LENGTHS:
-            for workers in arguments.workers:
-                busy = measure(path, lengths, workers, arguments.walkers, arguments.ndim, arguments.seeds)
-                deviations = ", ".join(f"{deviation:+.1f}" for deviation in busy.deviations)
-                numbers = f"{busy.utilisation:8.3f}{busy.duration:8.1f}{busy.evaluations:12.0f}"
-                yield f"{path:26}{lengths:12}{workers:8d}{numbers}   {deviations}"
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.utilisation", description=__doc__)
-    parser.add_argument("--paths", nargs="+", choices=[*PATHS, *GUIDED], default=[*PATHS, *GUIDED])
-    parser.add_argument("--workers", nargs="+", type=int, default=[16, 64, 256])
-    parser.add_argument("--walkers", type=int, default=500)
-    parser.add_argument("--ndim", type=int, default=5)
-    parser.add_argument("--seeds", type=int, default=10)
+def utilisation(
+    repeats: int,
+    paths: tuple[str, ...] = (*PATHS, *GUIDED),
+    lengths: tuple[str, ...] = LENGTHS,
+    workers: tuple[int, ...] = (16, 64, 256),
+    walkers: int = 500,
+    ndim: int = 5,
+) -> Iterator[Busy]:
+    """One row per sampler, distribution of run lengths and number of workers; a run with each of `repeats` seeds."""
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)
-    for line in table(parser.parse_args()):
-        print(line, flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    for path, name, n in itertools.product(paths, lengths, workers):
+        yield measure(path, name, n, walkers, ndim, repeats)

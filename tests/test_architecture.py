@@ -109,11 +109,11 @@ def test_no_modules_import_each_other_in_a_circle():
     assert not module_cycles()
 
 
-def test_the_readme_maps_every_folder():
-    text = (ROOT / "README.md").read_text()
+def test_contributing_maps_every_folder():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
     for package in PACKAGES:
         missing = [entry for entry in package_graph(package).nodes if f"{entry}" not in text]
-        assert not missing, f"not in README.md: {missing} of {package}"
+        assert not missing, f"not in CONTRIBUTING.md: {missing} of {package}"
 
 
 def test_plots_are_made_in_plots_and_reporting_with_libraries_imported_where_used():

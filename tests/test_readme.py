@@ -117,4 +117,4 @@ def test_files_named_in_the_text_exist():
 
 
 def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 130
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks import few_hundred
-from benchmarks.few_hundred_problems import PROBLEMS
+from benchmarks import few_simulations
+from benchmarks.few_simulations_problems import PROBLEMS
 from benchmarks.importance_reference import by_importance, find_mode
 from tests.statistics.brute_force import reference
 from tests.statistics.hard_posteriors import CASES
@@ -18,7 +18,7 @@ def test_importance_sampling_from_a_known_mode_agrees_with_brute_force(name):
     d = len(case.prior)
     assert np.all(np.abs(mode - known.mean[:d]) < 0.6 * known.sd[:d])
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), known.sd[:d], rtol=0.4)
-    found = by_importance(posterior, np.ones((1, d)), draws=300, rounds=5, inform=lambda text: None)
+    found = by_importance(posterior, np.ones((1, d)), draws=300, rounds=5)
     error = np.hypot(found.log_evidence_error, known.log_evidence_error)
     assert abs(found.log_evidence - known.log_evidence) < 3.5 * error
     assert np.all(np.abs(found.mean - known.mean) < 4.0 * np.hypot(found.mean_error, known.mean_error))
@@ -26,20 +26,17 @@ def test_importance_sampling_from_a_known_mode_agrees_with_brute_force(name):
 
 
 def test_stored_references_are_complete_and_precise():
-    stored = few_hundred.load()
-    for kind in ("references", "default SMC"):
-        for key, entry in stored.get(kind, {}).items():
-            name, seed = key.split()
-            assert name in PROBLEMS and int(seed) > 0
-            assert len(entry["mean"]) == len(entry["sd"])
-    for key, entry in stored["references"].items():
+    for key, entry in few_simulations.load().items():
+        name, seed = key.split()
+        assert name in PROBLEMS and int(seed) > 0
+        assert len(entry["mean"]) == len(entry["sd"])
         assert entry["log_evidence_error"] < 0.15, key
 
 
 def test_a_stored_reference_belongs_to_its_data():
     posterior = PROBLEMS["oscillator"].posterior(2)
-    found = few_hundred.reference_named("oscillator", 2, posterior)
+    found = few_simulations.reference_of("oscillator", 2, posterior)
     assert found.mean.shape == (2,)
     with pytest.raises(ValueError, match="was made with other data"):
-        few_hundred.reference_named("oscillator", 2, PROBLEMS["oscillator"].posterior(3))
-    assert few_hundred.reference_named("oscillator", 99, posterior) is None
+        few_simulations.reference_of("oscillator", 2, PROBLEMS["oscillator"].posterior(3))
+    assert few_simulations.reference_of("oscillator", 99, posterior) is None
