@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.faults import ChangedModel, TransientReason
+from ..simulation.faults import ChangedModel
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model, misfit_batch
-from .tolerance import VerifyingRun, agree, response_tolerance
+from ..simulation.model import Model
+from .comparison import VerifyingRun, difference_of, is_transient, response_tolerance, simulate_again
 
 __all__ = ["EarlierPoint", "ModelGuard"]
 
@@ -170,14 +170,15 @@ class ModelGuard:
         start = time.perf_counter()
         thetas = np.array([point.theta for point in self.points])
 
+        tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
+
         def same(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
-            misfit, reasons = misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic)
+            new, _ = simulate_again(run, thetas)
             self.compared += len(thetas)
-            tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
             return all(
-                isinstance(reason, TransientReason) or (not reason and agree(one, other, run, tolerance))
-                for one, other, reason in zip(earlier, misfit, reasons, strict=True)
-            ), list(misfit)
+                is_transient(other.reason) or (not other.reason and not difference_of(one, other, run, tolerance))
+                for one, other in zip(earlier, new, strict=True)
+            ), [other.misfit for other in new]
 
         agrees, new = same([point.misfit for point in self.points])
         agrees = agrees or not same(new)[0]

@@ -1,11 +1,12 @@
-"""Rows of the simulation cache: their keys, checksums and SQL statements, and what a cache returns of them."""
+"""Rows of the simulation cache: what they contain, their keys and checksums, and how they are read and written."""
 
+import contextlib
 import hashlib
 import json
 import sqlite3
 import struct
 import zlib
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,13 +18,11 @@ __all__ = [
     "LABEL_COLUMNS",
     "MIN_STOPS",
     "OF_EARLIER_RELEASES",
-    "REMOVE",
     "RESPONSE_COLUMNS",
     "STORE",
     "STORE_FAILURE",
     "STORE_LABEL",
     "STORE_RESPONSE",
-    "CacheInfo",
     "CachedRows",
     "StoredLabel",
     "StoredSimulation",
@@ -34,13 +33,16 @@ __all__ = [
     "is_undamaged_response",
     "pack_failure",
     "pack_label",
+    "pack_response",
     "pack_row",
     "regenerated",
     "select_rows",
     "simulation_keys",
     "source_number",
-    "unpack_label",
+    "transaction",
     "unpack_failure",
+    "unpack_label",
+    "unpack_row",
 ]
 
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc, generation, label"
@@ -53,7 +55,6 @@ MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qqd")
 LABEL_NUMBERS = struct.Struct("<qq")
 
-
 STORE = (
     f"INSERT INTO simulations ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) "
     "ON CONFLICT (key) DO UPDATE SET misfit = excluded.misfit, n_steps = excluded.n_steps, reason = excluded.reason, "
@@ -63,9 +64,6 @@ STORE = (
 # replaces a response that an earlier version stored in single precision
 STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
-REMOVE = {
-    table: f"DELETE FROM {table} WHERE source = ?" for table in ("simulations", "responses", "failures", "remarks")
-}
 # counts how often a simulation was stopped at the same time limit
 STORE_FAILURE = (
     "INSERT INTO failures (key, source, reason, time_limit, crc, stops) VALUES (?, ?, ?, ?, ?, 1) "
@@ -129,7 +127,7 @@ class StoredLabel(NamedTuple):
     cpu : str
         Name of the processor.
     generation : int
-        The rows that belong together: all labels of a generation gave equal results where they were compared.
+        The rows that belong together.
     compared : int
         Number of rows that were compared before those of other labels were adopted.
     files : tuple of str
@@ -145,38 +143,7 @@ class StoredLabel(NamedTuple):
     files: tuple[str, ...] = ()
 
 
-class CacheInfo(NamedTuple):
-    """State of a cache.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    simulations, failures : int
-        Number of stored simulations, and of failed ones among them.
-    responses, response_bytes : int
-        Number of stored responses, and their size [bytes].
-    seconds : float
-        Wall time of the stored simulations [s].
-    file_bytes : int
-        Size of the file without its write-ahead log [bytes].
-    hits, misses, evictions, damaged, verified : int
-        Rows found, not found, evicted, found damaged, and simulated again without a difference, by this object in this
-        process.
-    """
-
-    path: Path
-    simulations: int
-    failures: int
-    responses: int
-    response_bytes: int
-    seconds: float
-    file_bytes: int
-    hits: int
-    misses: int
-    evictions: int
-    damaged: int
-    verified: int
+# keys and checksums ---------------------------------------------------------------------------------------------------
 
 
 def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
@@ -241,53 +208,11 @@ def is_undamaged_response(*row: Any) -> bool:
     return isinstance(data, bytes) and len(data) == size and isinstance(key, bytes) and crc == zlib.crc32(key + data)
 
 
-def pack_label(label: StoredLabel) -> tuple:
-    """A label as it is stored: the values of `LABEL_COLUMNS`, with texts as bytes and the checksum last."""
-    texts = label.label.encode(), label.cpu.encode()
-    files = json.dumps(label.files).encode()
-    values = (label.id, label.source, *texts, label.generation, label.compared, files)
-    return (*values, zlib.crc32(repr(values).encode()))
-
-
-def unpack_label(*row: Any) -> StoredLabel:
-    """An undamaged label, given by the values of `LABEL_COLUMNS`."""
-    return StoredLabel(*row[:2], row[2].decode(), row[3].decode(), *row[4:6], tuple(json.loads(row[6])))
-
-
-def is_undamaged_label(*row: Any) -> bool:
-    """Whether a stored label, given by the values of `LABEL_COLUMNS`, matches its checksum."""
-    return row[-1] == zlib.crc32(repr(row[:-1]).encode())
-
-
-def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:
-    """A failure as it is stored: key, source, reason, time limit [s], checksum; None if it is not stored.
-
-    Failures that depend on the measurements are not stored, nor are faults of the infrastructure except time limits.
-    """
-    time_limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
-    if not reason or isinstance(reason, MisfitReason) or (isinstance(reason, TransientReason) and not time_limit):
-        return None
-    text = _encoded(reason)
-    return key, source, text, time_limit, _checksum_of_failure(key, source, text, time_limit)
-
-
-def unpack_failure(key: bytes, source: int, text: bytes, time_limit: float, crc: int) -> str | None:
-    """Reason of a stored failure; None if it is damaged."""
-    try:
-        if crc != _checksum_of_failure(key, source, text, time_limit):
-            return None
-    except (TypeError, struct.error):
-        return None
-    reason = text.decode("utf-8", "replace")
-    return TransientReason(reason, time_limit) if time_limit else reason
-
-
-def _checksum_of_failure(key: bytes, source: int, text: bytes, time_limit: float) -> int:
+def _failure_checksum(key: bytes, source: int, text: bytes, time_limit: float) -> int:
     return zlib.crc32(b"".join((key, NUMBERS.pack(source, len(text), time_limit), text)))
 
 
-def _encoded(reason: str) -> bytes:
-    return reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+# values of the columns ------------------------------------------------------------------------------------------------
 
 
 def pack_row(
@@ -302,20 +227,74 @@ def pack_row(
     label: int = 0,
 ) -> tuple:
     """A simulation as it is stored: the values of `COLUMNS`, with arrays and reason as bytes."""
-    point, sums = (np.asarray(values, dtype="<f8").tobytes() for values in (theta, misfit))
-    values = key, source, point, sums, int(n_steps), _encoded(reason), float(seconds)
+    values = key, source, _packed(theta), _packed(misfit), int(n_steps), _encoded(reason), float(seconds)
     return (*values, checksum(*values, generation, label), generation, label)
 
 
+def unpack_row(row: tuple) -> StoredSimulation:
+    """An undamaged simulation, given by the values of `COLUMNS`."""
+    theta, misfit = (np.frombuffer(data, dtype="<f8") for data in row[2:4])
+    return StoredSimulation(theta, misfit, row[5].decode("utf-8", "replace"), row[9])
+
+
+def pack_response(
+    key: bytes, source: int, theta: np.ndarray, response: np.ndarray, generation: int, label: int
+) -> tuple:
+    """A response as it is stored: the values of `RESPONSE_COLUMNS`."""
+    data = _packed(response)
+    crc = zlib.crc32(key + data)
+    return key, source, _packed(theta), len(response), len(data), crc, data, generation, label
+
+
+def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:
+    """A failure as it is stored: key, source, reason, time limit [s], checksum; None if it is not stored.
+
+    Failures that depend on the measurements are not stored, nor are faults of the infrastructure except time limits.
+    """
+    time_limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
+    if not reason or isinstance(reason, MisfitReason) or (isinstance(reason, TransientReason) and not time_limit):
+        return None
+    text = _encoded(reason)
+    return key, source, text, time_limit, _failure_checksum(key, source, text, time_limit)
+
+
+def unpack_failure(key: bytes, source: int, text: bytes, time_limit: float, crc: int) -> str | None:
+    """Reason of a stored failure; None if it is damaged."""
+    try:
+        if crc != _failure_checksum(key, source, text, time_limit):
+            return None
+    except (TypeError, struct.error):
+        return None
+    reason = text.decode("utf-8", "replace")
+    return TransientReason(reason, time_limit) if time_limit else reason
+
+
+def is_undamaged_label(*row: Any) -> bool:
+    """Whether a stored label, given by the values of `LABEL_COLUMNS`, matches its checksum."""
+    return row[-1] == zlib.crc32(repr(row[:-1]).encode())
+
+
+def pack_label(label: StoredLabel) -> tuple:
+    """A label as it is stored, the values of `LABEL_COLUMNS`: texts as bytes, the checksum last."""
+    texts = label.label.encode(), label.cpu.encode()
+    values = (label.id, label.source, *texts, label.generation, label.compared, json.dumps(label.files).encode())
+    return (*values, zlib.crc32(repr(values).encode()))
+
+
+def unpack_label(*row: Any) -> StoredLabel:
+    """An undamaged label, given by the values of `LABEL_COLUMNS`."""
+    return StoredLabel(*row[:2], row[2].decode(), row[3].decode(), *row[4:6], tuple(json.loads(row[6])))
+
+
 def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tuple:
-    """A stored simulation or response as one of another identity and generation: the new values, without arrays.
+    """A stored simulation as one of another identity and generation.
 
     Parameters
     ----------
     fingerprint, generation, label
         Of the new row.
     row : tuple
-        The values of `COLUMNS` or of `RESPONSE_COLUMNS`.
+        The values of `COLUMNS`.
 
     Returns
     -------
@@ -324,11 +303,31 @@ def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tu
     """
     (key,) = simulation_keys(fingerprint, np.frombuffer(row[2], dtype="<f8")[None], generation)
     source = source_number(fingerprint)
-    if len(row) == len(COLUMNS.split(",")):
-        crc = checksum(key, source, *row[2:7], generation, label)
-    else:
-        crc = zlib.crc32(key + row[6])
-    return key, source, crc, generation, label, row[0]
+    return key, source, checksum(key, source, *row[2:7], generation, label), generation, label, row[0]
+
+
+def _packed(values: np.ndarray) -> bytes:
+    return np.asarray(values, dtype="<f8").tobytes()
+
+
+def _encoded(reason: str) -> bytes:
+    return reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+
+
+# reading and writing --------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """One transaction that writes; an error inside rolls it back."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield connection
+        connection.execute("COMMIT")
+    except BaseException:
+        with contextlib.suppress(sqlite3.Error):  # SQLite itself may have ended it
+            connection.execute("ROLLBACK")
+        raise
 
 
 def select_rows(
@@ -363,20 +362,18 @@ def insert_rows(
     simulations, responses : int
         Numbers of evicted rows.
     """
-    connection.execute("BEGIN IMMEDIATE")
-    connection.executemany(statement, rows)
-    table = "failures" if statement is STORE_FAILURE else "simulations"
-    evicted = connection.execute(
-        f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (max_rows,)
-    ).rowcount
-    responses = 0
-    if statement is STORE_RESPONSE:
-        ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (max_response_bytes,))
-        for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
-            if excess <= 0:
-                break
-            connection.execute("DELETE FROM responses WHERE id = ?", (age,))
-            excess -= size
-            responses += 1
-    connection.execute("COMMIT")
+    with transaction(connection):
+        connection.executemany(statement, rows)
+        table = "failures" if statement is STORE_FAILURE else "simulations"
+        evict = f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?"
+        evicted = connection.execute(evict, (max_rows,)).rowcount
+        responses = 0
+        if statement is STORE_RESPONSE:
+            ((excess,),) = connection.execute("SELECT total(size) - ? FROM responses", (max_response_bytes,))
+            for age, size in connection.execute("SELECT id, size FROM responses ORDER BY id").fetchall():
+                if excess <= 0:
+                    break
+                connection.execute("DELETE FROM responses WHERE id = ?", (age,))
+                excess -= size
+                responses += 1
     return evicted, responses

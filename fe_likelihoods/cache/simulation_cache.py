@@ -33,44 +33,84 @@ import math
 import os
 import sqlite3
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..simulation.faults import TransientReason
 from ..simulation.model import Model
-from .generations import Generations
+from .file import CacheFile
 from .rows import (
     COLUMNS,
     LABEL_COLUMNS,
     MIN_STOPS,
-    REMOVE,
     RESPONSE_COLUMNS,
     STORE,
     STORE_FAILURE,
     STORE_RESPONSE,
     CachedRows,
-    CacheInfo,
+    StoredSimulation,
     insert_rows,
     is_undamaged,
     pack_failure,
+    pack_response,
     pack_row,
     select_rows,
     simulation_keys,
     source_number,
+    transaction,
     unpack_failure,
+    unpack_row,
 )
-from .sqlite_file import CacheFile
 
-__all__ = ["SimulationCache", "rows_to_compare"]
+__all__ = ["MAX_CANDIDATES", "CacheInfo", "SimulationCache", "rows_to_compare"]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
+MAX_CANDIDATES = 5000  # rows among which those to be compared are chosen
 CONFIDENCE = 0.95
 STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
-_KEYED = ("simulations", "responses", "failures", "remarks")
+TABLES = ("simulations", "responses", "failures", "remarks")
+SETTINGS = ("path", "max_rows", "retry_failures", "responses", "max_response_bytes", "timeout", "verify", "tolerance")
+
+_repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
+
+
+class CacheInfo(NamedTuple):
+    """State of a cache.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    simulations, failures : int
+        Number of stored simulations, and of failed ones among them.
+    responses, response_bytes : int
+        Number of stored responses, and their size [bytes].
+    seconds : float
+        Wall time of the stored simulations [s].
+    file_bytes : int
+        Size of the file without its write-ahead log [bytes].
+    hits, misses, evictions, damaged, verified : int
+        Rows found, not found, evicted, found damaged, and simulated again without a difference, by this object in this
+        process.
+    """
+
+    path: Path
+    simulations: int
+    failures: int
+    responses: int
+    response_bytes: int
+    seconds: float
+    file_bytes: int
+    hits: int
+    misses: int
+    evictions: int
+    damaged: int
+    verified: int
 
 
 def rows_to_compare(verify: bool | int | str) -> int:
@@ -102,7 +142,7 @@ def rows_to_compare(verify: bool | int | str) -> int:
     )
 
 
-class SimulationCache(Generations):
+class SimulationCache:
     """Cache of the sums of squared residuals of simulations, in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
@@ -150,8 +190,6 @@ class SimulationCache(Generations):
         Rows that were simulated again by likelihoods in this process and did not differ.
     file : CacheFile
         The SQLite file and its connection.
-    retry_times : dict of str to float
-        Actions on the file that failed, and the monotonic time [s] before which they are not tried again.
 
     Raises
     ------
@@ -192,37 +230,28 @@ class SimulationCache(Generations):
         if not self.file.writable:
             self._warn_read_only()
 
-    def _set_up(
-        self, path, max_rows, retry_failures, responses, max_response_bytes, timeout, verify, tolerance
-    ) -> None:
+    def _set_up(self, path: Any, max_rows: int, retry_failures: bool, responses: bool, *others: Any) -> None:
         """Set all attributes without opening the file."""
-        super().__init__(CacheFile(path, timeout))
-        self.max_rows = max_rows
-        self.retry_failures = retry_failures
-        self.responses = responses
-        self.max_response_bytes = max_response_bytes
-        self.verify, self.tolerance = verify, tolerance
+        self.max_rows, self.retry_failures, self.responses = max_rows, retry_failures, responses
+        self.max_response_bytes, self.timeout, self.verify, self.tolerance = others
+        self.file = CacheFile(path, self.timeout)
         self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
         self._waiting: list[tuple] = []
         self._warned_read_only = self._said_evicted = False
 
     def __getstate__(self) -> tuple:
-        return (
-            self.path,
-            self.max_rows,
-            self.retry_failures,
-            self.responses,
-            self.max_response_bytes,
-            self.file.timeout,
-            self.verify,
-            self.tolerance,
-        )
+        return tuple(getattr(self, name) for name in SETTINGS)
 
     def __setstate__(self, state: tuple) -> None:
         self._set_up(*state)  # opens the file when it is needed; a run continues without it if that fails
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self.file.path
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -246,11 +275,11 @@ class SimulationCache(Generations):
         -------
         CachedRows
         """
-        keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+        keys = self._keys(fingerprint, thetas, generation)
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
         with self.file.lock:
             found, bad = {}, []
-            for row in self._try("read", lambda connection: select_rows(connection, keys), []):
+            for row in self._rows(keys):
                 key, _, _, sums, steps, reason = row[:6]
                 if not is_undamaged(*row) or len(sums) != 8 * n_channels or steps != n_steps:
                     bad.append(key)
@@ -322,15 +351,13 @@ class SimulationCache(Generations):
         generation, label : int
             See `StoredLabel`; by default the latest.
         """
-        rows = []
         generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
-        for key, theta, response in zip(keys, thetas, responses, strict=True):
-            if np.isfinite(response).all():
-                data = np.asarray(response, dtype="<f8").tobytes()
-                point = np.asarray(theta, dtype="<f8").tobytes()
-                crc = zlib.crc32(key + data)
-                rows.append((key, source, point, len(response), len(data), crc, data, generation, label))
+        rows = [
+            pack_response(key, source, theta, response, generation, label)
+            for key, theta, response in zip(keys, thetas, responses, strict=True)
+            if np.isfinite(response).all()
+        ]
         if rows:
             self._write(STORE_RESPONSE, rows)
 
@@ -354,11 +381,10 @@ class SimulationCache(Generations):
         """
         shape = len(model.channels), model.n_steps
         size = 8 * shape[0] * shape[1]
-        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
-        query = "key, crc, response FROM responses"
+        keys = self._keys(model.fingerprint, thetas, generation)
         found, bad = {}, []
         with self.file.lock:
-            for key, crc, data in self._try("read", lambda connection: select_rows(connection, keys, query), []):
+            for key, crc, data in self._rows(keys, "key, crc, response FROM responses"):
                 if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) not in (size, size // 2):
                     bad.append(key)
                 elif len(data) == size:
@@ -383,14 +409,10 @@ class SimulationCache(Generations):
         (n,) bool
             The rows are neither verified nor checked for damage, and not counted.
         """
-        tables, stored = ("simulations", "responses", "failures"), np.zeros(len(thetas), dtype=bool)
+        stored = np.zeros(len(thetas), dtype=bool)
         for fingerprint in fingerprints:
-            keys = simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
-
-            def find(connection: sqlite3.Connection, keys: list[bytes] = keys) -> set:
-                return {row for table in tables for (row,) in select_rows(connection, keys, f"key FROM {table}")}
-
-            found = self._try("read", find, set())
+            keys = self._keys(fingerprint, thetas, generation)
+            found = {key for table in TABLES[:3] for (key,) in self._rows(keys, f"key FROM {table}")}
             stored |= [key in found for key in keys]
         return stored
 
@@ -438,11 +460,10 @@ class SimulationCache(Generations):
         if self.retry_failures:
             return [""] * len(thetas)
         limit = getattr(model, "time_limit", None) or np.inf
-        keys = simulation_keys(model.fingerprint, thetas, self._given_or_latest(model.fingerprint, generation))
-        query = "key, source, reason, time_limit, crc, stops FROM failures"
+        keys = self._keys(model.fingerprint, thetas, generation)
         found, bad = {}, []
         with self.file.lock:
-            for *row, stops in self._try("read", lambda connection: select_rows(connection, keys, query), []):
+            for *row, stops in self._rows(keys, "key, source, reason, time_limit, crc, stops FROM failures"):
                 reason = unpack_failure(*row)
                 if reason is None:
                     bad.append(row[0])
@@ -451,23 +472,80 @@ class SimulationCache(Generations):
             self._drop("failures", bad)
         return [found.get(key, "") for key in keys]
 
-    def store_remark(self, model: Model, text: str) -> None:
-        """Store the remark of a model, unless there is one or the file is read-only."""
-        source = source_number(model.fingerprint)
-        row = remark_key(source), source, text.encode("utf-8", "backslashreplace")
-        with self.file.lock:
-            if self.file.writable:
-                self._try("written", lambda connection: connection.execute(STORE_REMARK, row), None)
+    def store_remark(self, model: Model) -> None:
+        """Store the attribute `range_remark` of a model, if it has one and none is stored: a law beyond its range."""
+        if text := getattr(model, "range_remark", ""):
+            source = source_number(model.fingerprint)
+            row = _remark_key(source), source, text.encode("utf-8", "backslashreplace")
+            self.file.write(STORE_REMARK, [row])
 
     def look_up_remark(self, model: Model) -> str:
         """Remark of a model; empty if there is none."""
-        key = remark_key(source_number(model.fingerprint))
-
-        query = "SELECT text FROM remarks WHERE key = ?"
-        rows = self._try("read", lambda connection: connection.execute(query, (key,)).fetchall(), [])
+        key = _remark_key(source_number(model.fingerprint))
+        rows = self.file.select("SELECT text FROM remarks WHERE key = ?", (key,))
         return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
 
-    # the file -----------------------------------------------------------------------------------------------------
+    def repeat_remark(self, model: Model) -> None:
+        """Log the stored remark of a model, once per process and not where the model has made one itself.
+
+        A built-in model says once, as a warning, that a simulation was beyond the range of its laws. A later process
+        that takes the simulations from the cache would hear nothing.
+        """
+        place = str(self.path), model.fingerprint
+        if not hasattr(model, "range_remark") or place in _repeated:
+            return
+        _repeated.add(place)
+        text = self.look_up_remark(model)
+        if text and not model.range_remark:
+            logger.warning("simulations of this model in %s: %s", self.path, text)
+
+    # generations ------------------------------------------------------------------------------------------------------
+
+    def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
+        """Generations of the simulations, or of the responses, of one identity, the latest first."""
+        query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
+        return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
+
+    def stored_rows(
+        self, fingerprint: str | int, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
+    ) -> list[StoredSimulation]:
+        """Undamaged simulations of one identity and generation, the latest first, evenly chosen if there are many.
+
+        Parameters
+        ----------
+        fingerprint : str or int
+            As for `look_up`, or the number of a source of an earlier release.
+        generation : int
+        n_channels, n_steps : int
+            Shape of the measurements.
+        most : int
+            Largest number of rows, about.
+        """
+        values = fingerprint if isinstance(fingerprint, int) else source_number(fingerprint), generation
+        where = "FROM simulations WHERE source = ? AND generation = ?"
+        latest = f"SELECT {COLUMNS} {where} ORDER BY id DESC LIMIT ?"
+        ((n,),) = self.file.select(f"SELECT count(*) {where}", values) or [(0,)]
+        n = n if most > 1 else most
+        rows = self.file.select(latest, (*values, most if n <= most else 10))
+        if n > most:
+            some = f"SELECT {COLUMNS} {where} AND id % ? = 0 ORDER BY id DESC"
+            rows += self.file.select(some, (*values, n // most + 1))
+        good = {row[0]: row for row in rows if is_undamaged(*row) and len(row[3]) == 8 * n_channels}
+        return [unpack_row(row) for row in good.values() if row[4] == n_steps]
+
+    def response_points(self, model: Model, generation: int, most: int = MAX_CANDIDATES) -> list[tuple]:
+        """Parameters (n_structural,) and label of stored responses of a model, the latest first."""
+        query = "SELECT theta, label FROM responses WHERE source = ? AND generation = ? ORDER BY id DESC LIMIT ?"
+        rows = self.file.select(query, (source_number(model.fingerprint), generation, most))
+        return [(np.frombuffer(theta, dtype="<f8"), label) for theta, label in rows if isinstance(theta, bytes)]
+
+    def label_of(self, fingerprint: str, theta: np.ndarray, generation: int) -> int:
+        """Id of the label under which a simulation or a response was stored; 0 if it is not known."""
+        keys = simulation_keys(fingerprint, theta[None], generation)
+        found = [row for table in TABLES[:2] for row in self._rows(keys, f"label FROM {table}")]
+        return found[0][0] if found else 0
+
+    # the file ---------------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
         """Write a copy of the cache, with all rows, to a new file: to archive it, or to take it to another machine.
@@ -492,7 +570,7 @@ class SimulationCache(Generations):
         target = Path(path).resolve()
         if target.exists() or not target.parent.is_dir():
             raise ValueError(f"{path}: expected the path of a new file in an existing folder")
-        self._insist(lambda connection: connection.execute("VACUUM INTO ?", (str(target),)))
+        self.file.insist(lambda connection: connection.execute("VACUUM INTO ?", (str(target),)))
         return self.info().simulations
 
     def add(self, path: str | os.PathLike) -> int:
@@ -524,19 +602,15 @@ class SimulationCache(Generations):
         def insert(connection: sqlite3.Connection) -> int:
             connection.execute("ATTACH ? AS other", (str(other.path),))
             try:
-                connection.execute("BEGIN IMMEDIATE")
-                added = [
-                    connection.execute(f"INSERT OR IGNORE INTO {t} ({c}) SELECT {c} FROM other.{t}").rowcount
-                    for t, c in columns.items()
-                ]
-                connection.execute("COMMIT")
+                with transaction(connection):
+                    statements = [
+                        f"INSERT OR IGNORE INTO {t} ({c}) SELECT {c} FROM other.{t}" for t, c in columns.items()
+                    ]
+                    return [connection.execute(statement).rowcount for statement in statements][0]
             finally:
-                if connection.in_transaction:
-                    connection.execute("ROLLBACK")
                 connection.execute("DETACH other")
-            return added[0]
 
-        return self._insist(insert)
+        return self.file.insist(insert)
 
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
@@ -549,7 +623,7 @@ class SimulationCache(Generations):
             return n, int(failures), responses, int(response_bytes), seconds
 
         with self.file.lock:
-            counted = self._try("read", ask, (0, 0, 0, 0, 0.0))
+            counted = self.file.attempt("read", ask, (0, 0, 0, 0, 0.0))
             size = self.path.stat().st_size if self.path.exists() else 0
             counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
             return CacheInfo(self.path, *counted, size, *counts)
@@ -567,9 +641,12 @@ class SimulationCache(Generations):
         OSError
             If the file cannot be read.
         """
-        count = "SELECT count(*) FROM simulations"
-        (rows,) = self._insist(lambda connection: connection.execute(count).fetchone())
-        return rows, rows - sum(len(page) for page in self._pages())
+        rows = good = last = 0
+        query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
+        while page := self.file.insist(lambda connection, last=last: connection.execute(query, (last,)).fetchall()):
+            last = page[-1][0]
+            rows, good = rows + len(page), good + sum(is_undamaged(*row[1:]) for row in page)
+        return rows, rows - good
 
     def clear(self) -> None:
         """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.
@@ -580,17 +657,11 @@ class SimulationCache(Generations):
             If the file cannot be written.
         """
 
-        def delete(connection: sqlite3.Connection) -> None:
-            connection.execute("BEGIN IMMEDIATE")
-            for table in REMOVE:
-                connection.execute(f"DELETE FROM {table}")
-            connection.execute("COMMIT")
-
         with self.file.lock:
-            self._insist(delete)
+            self.file.insist(lambda connection: _delete_rows(connection, "?", [(True,)]))
             self._waiting.clear()
             # returns the space to the disk; may fail while others read
-            self._try("vacuumed", lambda connection: connection.execute("VACUUM"), None)
+            self.file.attempt("vacuumed", lambda connection: connection.execute("VACUUM"), None)
 
     def forget(self, *fingerprints: str) -> int:
         """Delete the simulations and responses of some models, of all generations, for all users of the file.
@@ -612,17 +683,11 @@ class SimulationCache(Generations):
         OSError
             If the file cannot be written.
         """
-        sources = [(source_number(fingerprint),) for fingerprint in fingerprints]
-
-        def delete(connection: sqlite3.Connection) -> int:
-            connection.execute("BEGIN IMMEDIATE")
-            deleted = sum(connection.executemany(statement, sources).rowcount for statement in REMOVE.values())
-            connection.execute("COMMIT")
-            return deleted
-
+        sources = {source_number(fingerprint) for fingerprint in fingerprints}
         with self.file.lock:
-            self._waiting = [row for row in self._waiting if (row[1],) not in sources]
-            return self._insist(delete)
+            self._waiting = [row for row in self._waiting if row[1] not in sources]
+            rows = [(source,) for source in sources]
+            return self.file.insist(lambda connection: _delete_rows(connection, "source = ?", rows))
 
     def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
         """Delete the rows of some simulations, if possible.
@@ -636,41 +701,33 @@ class SimulationCache(Generations):
         generation : int
             See `StoredLabel`; by default the latest.
         """
-        keys = [
-            (key,)
-            for fingerprint in fingerprints
-            for key in simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
-        ]
-
-        def delete(connection: sqlite3.Connection) -> None:
-            connection.execute("BEGIN IMMEDIATE")
-            for table in _KEYED:
-                connection.executemany(f"DELETE FROM {table} WHERE key = ?", keys)
-            connection.execute("COMMIT")
-
+        keys = {key for fingerprint in fingerprints for key in self._keys(fingerprint, thetas, generation)}
         with self.file.lock:
-            self._waiting = [row for row in self._waiting if (row[0],) not in set(keys)]
+            self._waiting = [row for row in self._waiting if row[0] not in keys]
             if self.file.writable:
-                self._try("repaired", delete, None)
+                rows = [(key,) for key in keys]
+                self.file.attempt("repaired", lambda connection: _delete_rows(connection, "key = ?", rows), None)
 
     def close(self) -> None:
         """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
         with self.file.lock:
-            self.retry_times.clear()
+            self.file.retry_times.clear()
             if self._waiting:
                 self._write(STORE, [])
             self.file.close()
 
-    def _pages(self) -> Iterator[list[tuple]]:
-        """All undamaged rows, oldest first."""
-        last = 0
-        while True:
-            query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
-            page = self._insist(lambda connection, q=query, i=last: connection.execute(q, (i,)).fetchall())
-            if not page:
-                return
-            last = page[-1][0]
-            yield [row[1:] for row in page if is_undamaged(*row[1:])]
+    def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
+        if generation is not None:
+            return generation
+        tables = ("simulations", "responses", "labels")
+        return next((found[0] for table in tables if (found := self.generations_of(fingerprint, table))), 1)
+
+    def _keys(self, fingerprint: str, thetas: np.ndarray, generation: int | None) -> list[bytes]:
+        return simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
+
+    def _rows(self, keys: list[bytes], *columns: str) -> list[tuple]:
+        """Stored rows with given keys."""
+        return self.file.attempt("read", lambda connection: select_rows(connection, keys, *columns), [])
 
     def _insert(self, connection: sqlite3.Connection, statement: str, rows: list[tuple]) -> None:
         evicted, responses = insert_rows(connection, statement, rows, self.max_rows, self.max_response_bytes)
@@ -690,9 +747,9 @@ class SimulationCache(Generations):
                 return
             if statement is STORE:  # responses can be computed again and do not wait
                 rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
-            if self._try("written", lambda connection: self._insert(connection, statement, rows) or True, False):
-                if statement is STORE:
-                    self._waiting = []
+            written = self.file.attempt("written", lambda found: self._insert(found, statement, rows) or True, False)
+            if written and statement is STORE:
+                self._waiting = []
 
     def _warn_read_only(self) -> None:
         if not self._warned_read_only:
@@ -706,12 +763,16 @@ class SimulationCache(Generations):
         if not self.damaged:
             logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
         self.damaged += len(keys)
-        if not self.file.writable:
-            return
-        delete = f"DELETE FROM {table} WHERE key = ?"
-        self._try("repaired", lambda connection: connection.executemany(delete, [(key,) for key in keys]), None)
+        self.file.write(f"DELETE FROM {table} WHERE key = ?", [(key,) for key in keys], "repaired")
 
 
-def remark_key(source: int) -> bytes:
+def _delete_rows(connection: sqlite3.Connection, condition: str, rows: Collection[tuple]) -> int:
+    """Delete rows of all tables in one transaction; return their number."""
+    with transaction(connection):
+        statements = [f"DELETE FROM {table} WHERE {condition}" for table in TABLES]
+        return sum(connection.executemany(statement, rows).rowcount for statement in statements)
+
+
+def _remark_key(source: int) -> bytes:
     """Key of the remark of a model."""
     return source.to_bytes(8, "little", signed=True)

@@ -13,8 +13,8 @@ import numpy as np
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, simulate_batch
 from ..simulation.opened import observing
+from .comparison import VerifyingRun
 from .simulation_cache import SimulationCache
-from .tolerance import VerifyingRun
 from .verification import VerifiedCache
 
 __all__ = ["StoredResponses"]

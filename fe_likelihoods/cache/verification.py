@@ -16,21 +16,34 @@ All simulations complete the label, by what they open while they run. Files of e
 rows without a label. Those with the right numbers of parameters, channels and samples are compared in the same way.
 
 Failures count only where there is no successful simulation, since a changed model often fails at the same points.
-Likelihoods that are made with one model object, pool and file share their comparisons. Rows that the same likelihood
-has stored itself need no verification.
+Likelihoods of one model and file share what they have verified and stored (`fe_likelihoods.cache.labels.shared_trust`).
 """
 
 import logging
+import random
 import time
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
-from ..signals.comparison import measured_values
-from ..simulation.model import misfit_batch
-from .adoption import LATEST, MAX_ATTEMPTS, Adoption, is_transient, row_of_response
-from .rows import CachedRows, StoredSimulation, simulation_keys
-from .tolerance import DEFAULT_TOLERANCE, VerifyingRun, difference_of
+from ..simulation.label import ModelLabel
+from ..simulation.model import Model
+from ..simulation.opened import Opened
+from .adoption import LATEST, MAX_ATTEMPTS, Adoption
+from .comparison import (
+    Repetition,
+    Simulated,
+    VerifyingRun,
+    difference_of,
+    is_transient,
+    response_tolerance,
+    row_of_response,
+    simulate_again,
+)
+from .labels import Trust, labels_of, shared_trust
+from .rows import CachedRows, StoredLabel, StoredSimulation, simulation_keys
+from .simulation_cache import SimulationCache
 
 __all__ = ["StaleCache", "VerifiedCache"]
 
@@ -71,7 +84,7 @@ class StaleCache(ValueError):
         return type(self), (str(self), self.theta)
 
 
-class VerifiedCache(Adoption):
+class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
     Copies in another process verify rows of their own, once for all copies of that process.
@@ -96,7 +109,103 @@ class VerifiedCache(Adoption):
         Wall time of the simulations for verification [s].
     """
 
-    # rows ---------------------------------------------------------------------------------------------------------
+    def __init__(self, cache: SimulationCache, model: Model, pool: Any, label: ModelLabel) -> None:
+        self._set_up(cache, shared_trust(cache, model, pool, label, response_tolerance(model) == 0.0))
+
+    def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
+        self.cache, self._trust = cache, trust
+        self._again = Repetition(cache.file, trust)
+        self._adoption = Adoption(cache, trust, self._again)
+        self._model: Any = None  # of the last look-up; None if there was none, or in another process
+        self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
+
+    def __getstate__(self) -> tuple:
+        return self.cache, self._trust
+
+    def __setstate__(self, state: tuple) -> None:
+        self._set_up(*state)
+
+    @property
+    def compared(self) -> int:
+        """Rows that were compared with a new simulation."""
+        return self._again.compared
+
+    @property
+    def unverified(self) -> int:
+        """Rows that could not be compared."""
+        return self._again.unverified
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the simulations for verification [s]."""
+        return self._again.seconds
+
+    @property
+    def label(self) -> ModelLabel:
+        """Label of the model."""
+        return self._trust.label
+
+    def complete(self, opened: Opened | None) -> None:
+        """Add to the label of the model what simulations opened."""
+        self._trust.complete(self.cache.file, opened)
+
+    def share_trust(self, other: "VerifiedCache") -> None:
+        """Verify no row that another object has verified or stored, unless the code is another one."""
+        if other._trust.label.code == self._trust.label.code:
+            self._set_up(self.cache, other._trust)
+
+    # storing ----------------------------------------------------------------------------------------------------------
+
+    def store(
+        self,
+        fingerprint: str,
+        thetas: np.ndarray,
+        misfit: np.ndarray | None,
+        reasons: list[str],
+        responses: np.ndarray | None,
+        seconds: float,
+        run: VerifyingRun,
+    ) -> None:
+        """Store simulations under the label of the model: their statistics, responses and failures, where given."""
+        stored = self._label_to_store(run.model)
+        if stored is None:
+            return
+        place = stored.generation, stored.id
+        if responses is not None:
+            # before the statistics, which are computed from them if the program is killed in between
+            self.cache.store_responses(run.model, thetas, responses, *place)
+        if misfit is not None:
+            self.cache.store(fingerprint, thetas, run.n_steps, misfit, reasons, seconds, *place)
+        self.cache.store_failures(run.model, thetas, reasons, stored.generation)
+        self._trust.add_own(thetas, stored.generation, *{fingerprint, run.model.fingerprint})
+
+    def _label_to_store(self, model: Model) -> StoredLabel | None:
+        """The label under which new simulations are stored; None while it is not known which rows agree with them."""
+        trust = self._trust
+        with trust.lock:
+            if trust.find(self.cache.file, model) is None:
+                if time.monotonic() < trust.pause_ends and not trust.generations:
+                    return None
+                trust.begin(self.cache.file, model, set())
+            return trust.find(self.cache.file, model)
+
+    def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
+        """Delete rows that were stored here."""
+        if self._trust.stored is not None:
+            self.cache.discard(thetas, *fingerprints, generation=self._trust.stored.generation)
+
+    def are_stored(self, fingerprints: tuple[str, ...], thetas: np.ndarray, model: Model) -> np.ndarray:
+        """Whether rows are stored (n,), in any generation that may be used; nothing is verified."""
+        with self._trust.lock:
+            stored = self._trust.find(self.cache.file, model)
+        if stored is not None:
+            return self.cache.are_stored(fingerprints, thetas, stored.generation)
+        found = np.zeros(len(thetas), dtype=bool)
+        for generation in {each for name in fingerprints for each in self.cache.generations_of(name)}:
+            found |= self.cache.are_stored(fingerprints, thetas, generation)
+        return found
+
+    # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
         """Rows of `SimulationCache.look_up`, of which some are verified.
@@ -115,14 +224,13 @@ class VerifiedCache(Adoption):
             If a stored row and a new simulation differ, although the label of the model is known.
         """
         self._notice_other_model(run)
-        n_steps = measured_values(run.measured).shape[1]
         while True:
-            generation = self._generation(fingerprint, run)
+            generation = self._adoption.generation(fingerprint, run)
             if generation is None:
                 self.cache.misses += len(thetas)
                 shape = len(thetas), run.n_numbers
                 return CachedRows(np.full(shape, np.nan), [""] * len(thetas), np.zeros(len(thetas), bool))
-            rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, n_steps, generation)
+            rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, run.n_steps, generation)
             if self._verify_rows(fingerprint, thetas, rows, generation, run):
                 return rows
 
@@ -138,8 +246,7 @@ class VerifiedCache(Adoption):
         first = not self._trust.served["simulations", fingerprint]
         latest = None
         if first or not succeeded:
-            n_steps = measured_values(run.measured).shape[1]
-            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, n_steps, LATEST)
+            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, run.n_steps, LATEST)
             others = (row for row in stored if not row.reason)
             latest = next(others, None)
             if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0], generation):
@@ -168,7 +275,7 @@ class VerifiedCache(Adoption):
         self._notice_other_model(run)
         fingerprint = run.model.fingerprint
         while True:
-            generation = self._generation(fingerprint, run, of_responses=True)
+            generation = self._adoption.generation(fingerprint, run)
             if generation is None:
                 return [None] * len(thetas)
             responses = self.cache.look_up_responses(run.model, thetas, generation)
@@ -194,7 +301,7 @@ class VerifiedCache(Adoption):
         """
         self._notice_other_model(run)
         with self._trust.lock:
-            stored = self._trust.find(self.cache, run.model)
+            stored = self._trust.find(self.cache.file, run.model)
         if stored is None:
             return [""] * len(thetas)
         reasons = self.cache.look_up_failures(run.model, thetas, stored.generation)
@@ -215,7 +322,7 @@ class VerifiedCache(Adoption):
         """Those of some rows that were not stored here; none if the cache is not to be verified."""
         if not self.cache.verify or not rows:
             return []
-        own = self._own_rows()
+        own = self._trust.own
         if not own:
             return rows
         keys = simulation_keys(fingerprint, thetas[rows], generation)
@@ -248,7 +355,7 @@ class VerifiedCache(Adoption):
                 trust.stale = fingerprint, error
                 raise
             finally:
-                trust.simulated.clear()
+                self._again.found.clear()
             if compared is None:
                 return False
             if not compared:
@@ -276,10 +383,10 @@ class VerifiedCache(Adoption):
             if not chosen:
                 break
             attempts -= len(chosen)
-            for row, new in zip(chosen, self._simulate_again(fingerprint, chosen, run), strict=True):
+            for row, new in zip(chosen, self._again.simulate(fingerprint, chosen, run), strict=True):
                 if is_transient(new.reason):
                     reasons.append(new.reason)
-                elif self._differs(row, new.misfit, new.reason, fingerprint, run):
+                elif self._differs(row, new, fingerprint, run):
                     return None
                 else:
                     done += 1
@@ -296,29 +403,26 @@ class VerifiedCache(Adoption):
             )
         return bool(succeeded or (done and not reasons))
 
-    def _differs(
-        self, row: StoredSimulation, new: np.ndarray, reason: str, fingerprint: str, run: VerifyingRun
-    ) -> bool:
+    def _differs(self, row: StoredSimulation, new: Simulated, fingerprint: str, run: VerifyingRun) -> bool:
         """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
-        if row.reason and reason:
+        if row.reason and new.reason:
             return False
         label = self._label_of(row, fingerprint, run)
         names = [channel.name for channel in run.model.channels]
-        if row.reason or reason:
-            was, now = (f"failed ({text})" if text else "succeeded" for text in (row.reason, reason))
+        if row.reason or new.reason:
+            was, now = (f"failed ({text})" if text else "succeeded" for text in (row.reason, new.reason))
             difference, advice = f"the stored simulation {was}; simulated again, it {now}", ""
             if row.reason:
                 advice = ". If failures depend on anything but the parameters, set retry_failures=True"
         else:
-            tolerances = self._tolerances(run)
-            found = difference_of(row.misfit, new, run, tolerances.get(label, max(tolerances[0], DEFAULT_TOLERANCE)))
+            found = difference_of(row.misfit, new, run, self._again.tolerances(run)[label])
             if found is None:
                 return False
             index, change = found
             what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
             difference = (
                 f"channel {names[index % len(names)]!r}, {what}: stored {row.misfit[index]:.17g}, simulated again "
-                f"{new[index]:.17g}"
+                f"{new.misfit[index]:.17g}"
             )
             advice = ""
             if change < LARGEST_ROUNDING:
@@ -326,14 +430,14 @@ class VerifiedCache(Adoption):
                     ". If the model is not exactly repeatable, for example on another machine, accept differences of "
                     f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
                 )
-        scatter = self._scatter(row.theta, new, reason, run)
+        scatter = self._scatter(row.theta, new, run)
         served = self._trust.served.total()
-        self._start_again()
-        stored = self._trust.stored
-        of_others = {each.id for each in self.cache.labels_of(run.model) if stored and each.label != stored.label}
+        self._trust.start_again()
+        stored, labels = self._trust.stored, labels_of(self.cache.file, run.model)
+        of_others = {each.id for each in labels if stored and each.label != stored.label}
         if label in of_others and not scatter:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
-            self._begin(fingerprint, run)
+            self._adoption.begin(fingerprint, run)
             if not served:
                 return True
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
@@ -351,25 +455,25 @@ class VerifiedCache(Adoption):
         generation = self._trust.generations.get(fingerprint)
         return 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
 
-    def _scatter(self, theta: np.ndarray, earlier: np.ndarray, reason: str, run: VerifyingRun) -> str:
+    def _scatter(self, theta: np.ndarray, earlier: Simulated, run: VerifyingRun) -> str:
         """Advice for a model whose new simulations differ among themselves, after one more; empty if they agree."""
         start = time.perf_counter()
-        (new,), (new_reason,) = misfit_batch(run.model, theta[None], run.measured, run.pool, run.statistic)
-        self.seconds += time.perf_counter() - start
-        if is_transient(new_reason) or (reason and new_reason):
+        (new,), _ = simulate_again(run, theta[None])
+        self._again.seconds += time.perf_counter() - start
+        if is_transient(new.reason) or (earlier.reason and new.reason):
             return ""
         text = "The model is not repeatable: one more simulation at this point "
-        if reason or new_reason:
-            outcome = f"failed ({new_reason})" if new_reason else "succeeded"
+        if earlier.reason or new.reason:
+            outcome = f"failed ({new.reason})" if new.reason else "succeeded"
             return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
-        found = difference_of(earlier, new, run, self._tolerances(run)[0])
+        found = difference_of(earlier.misfit, new, run, self._again.tolerances(run)[0])
         if found is None:
             return ""
         index, change = found
         return (
-            f"{text}gave {new[index]:.17g} instead of {earlier[index]:.17g}, a change of {change:.1e} of the response. "
-            "Make it depend on its parameters alone, for example with a fixed seed, or accept such differences with "
-            f"SimulationCache(path, tolerance={10.0 * change:.1e})"
+            f"{text}gave {new.misfit[index]:.17g} instead of {earlier.misfit[index]:.17g}, a change of {change:.1e} of "
+            "the response. Make it depend on its parameters alone, for example with a fixed seed, or accept such "
+            f"differences with SimulationCache(path, tolerance={10.0 * change:.1e})"
         )
 
     def _notice_other_model(self, run: VerifyingRun) -> None:
@@ -377,10 +481,12 @@ class VerifiedCache(Adoption):
         if run.model is not self._model:
             if self._model is not None:
                 with self._trust.lock:
-                    self._start_again()
+                    self._trust.start_again()
                     self._trust.stale = None
             self._model = run.model
 
-    def _start_again(self) -> None:
-        self._trust.served.clear()
-        self._trust.restarts += 1
+    def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:
+        """Indices in random order, first those that have just been simulated again."""
+        again = {key[-1] for key in self._again.found}
+        shuffled = self._random.sample(rows, len(rows))
+        return sorted(shuffled, key=lambda row: thetas[row].tobytes() not in again) if again else shuffled

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..cache.file import CacheFile
 from ..cache.salvage import number_or_unknown, salvage
 from ..cache.simulation_cache import SimulationCache
-from ..cache.sqlite_file import CacheFile
 from ..probability.likelihood import FELikelihood
 
 __all__ = ["Verified", "describe", "export_cache", "latest_stored", "salvage_cache", "verify_cache"]

@@ -16,7 +16,6 @@ import numpy as np
 
 from ..cache.guard import ModelGuard
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys
-from ..cache.remarks import repeat_remark_of
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import StaleCache, VerifiedCache
 from ..noise.sample_counts import count_samples
@@ -450,7 +449,8 @@ class CachedSimulations(NewSimulations):
         self._has_results = self._has_results or len(rows) > 0
         if len(rows) and not self._has_repeated_remark:
             self._has_repeated_remark = True
-            repeat_remark_of(self.model, self.cache)
+            if self.cache is not None:
+                self.cache.repeat_remark(self.model)
         for row in rows:
             if requested.reasons[row]:
                 self._failures.add(requested.thetas[row], requested.reasons[row])

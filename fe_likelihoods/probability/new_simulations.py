@@ -15,13 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from ..cache.adoption import observed_batch
+from ..cache.comparison import VerifyingRun, observed_batch
 from ..cache.guard import EarlierPoint, ModelGuard
-from ..cache.memory import MemoryCache, ResponseMemory
-from ..cache.remarks import store_remark_of
-from ..cache.row_buffer import FinishedRows, RowBuffer
+from ..cache.memory import FinishedRows, MemoryCache, ResponseMemory, RowBuffer
 from ..cache.simulation_cache import SimulationCache
-from ..cache.tolerance import VerifyingRun
 from ..cache.verification import VerifiedCache
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
@@ -431,7 +428,7 @@ class NewSimulations:
         self._verified_cache.store(
             self._key, rows.thetas, rows.misfit, rows.reasons, rows.response, rows.seconds, self._verifying_run
         )
-        store_remark_of(self.model, self.cache)
+        self.cache.store_remark(self.model)
 
     @property
     def _verifying_run(self) -> VerifyingRun:

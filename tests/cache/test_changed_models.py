@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
-from fe_likelihoods.cache import trust
-from fe_likelihoods.cache.coverage import choose_rows
+from fe_likelihoods.cache import labels
+from fe_likelihoods.cache.adoption import choose_rows
+from fe_likelihoods.cache.file import APPLICATION_ID
 from fe_likelihoods.cache.rows import StoredSimulation
 from fe_likelihoods.cache.simulation_cache import rows_to_compare
-from fe_likelihoods.cache.sqlite_file import APPLICATION_ID
 from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.faults import ChangedModel
@@ -227,7 +227,7 @@ def test_versions_and_dependencies_are_declared(workshop):
 
 def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
     first = workshop.run()
-    monkeypatch.setattr(trust, "cpu_name", lambda: "another")
+    monkeypatch.setattr(labels, "cpu_name", lambda: "another")
     monkeypatch.setattr(FunctionModel, "response_tolerance", 0.0, raising=False)
     law = type(first.model)._respond
     monkeypatch.setattr(FunctionModel, "_respond", lambda self, theta: law(self, theta) * (1.0 + 1e-13))
@@ -413,7 +413,6 @@ def test_rows_of_an_earlier_release_are_adopted_if_they_agree(workshop, version,
     true = reference.statistics(POINTS)
     reference.cache.close()
     (workshop.folder / "cache.sqlite").unlink()
-    trust._of_models.clear()
     earlier_file(workshop.folder / "cache.sqlite", true * factor, version)
     likelihood = workshop.run()
     np.testing.assert_array_equal(likelihood.statistics(POINTS), true)

@@ -18,9 +18,9 @@ import h5py
 import numpy as np
 import pytest
 
-from fe_likelihoods.cache import guarded_file
+from fe_likelihoods.cache import file as cache_file
+from fe_likelihoods.cache.file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.cache.sqlite_file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
@@ -553,8 +553,8 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
     likelihood.cache.file.close()
     likelihood.misfit(thetas[300:310])
     assert likelihood.cache.info().simulations == stored  # writing is not tried again before the pause ends
-    monkeypatch.setattr(guarded_file, "RETRY_SECONDS", 0.0)
-    likelihood.cache.retry_times["written"] = time.monotonic()
+    monkeypatch.setattr(cache_file, "RETRY_SECONDS", 0.0)
+    likelihood.cache.file.retry_times["written"] = time.monotonic()
     likelihood.misfit(thetas[310:320])
     again = likelihood_of(path)
     np.testing.assert_array_equal(again.misfit(thetas[:320]), expected[:320])

@@ -7,6 +7,8 @@ version is the version of the layout. A file with another id or version is never
 SQLite connections must not be used after a fork. Therefore every process has its own connection, opened when it is
 first needed, and the connections of a process are closed before it forks. WAL mode needs memory shared by all users of
 a file, so the file must be on a local disk, not on a network file system.
+
+A cache never makes a run fail: `CacheFile.attempt` logs an error of the file and returns what the run continues with.
 """
 
 import contextlib
@@ -17,8 +19,9 @@ import sqlite3
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 try:
     from fcntl import LOCK_EX, LOCK_NB
@@ -26,9 +29,10 @@ try:
 except ImportError:  # without such locks two programs must not find the same damage at the same time
     lock_file = None
 
+from .rows import transaction
 from .salvage import number_or_unknown, read_options, salvage
 
-__all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile", "is_damage"]
+__all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +78,7 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
+RETRY_SECONDS = 60.0  # wait after a failed access to the file
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
 _files_lock = threading.Lock()
@@ -109,7 +114,7 @@ def _code(error: Exception) -> int:
     return (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
 
 
-def is_damage(error: Exception) -> bool:
+def _is_damage(error: Exception) -> bool:
     """Whether an error means that the file itself is damaged."""
     if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes damaged contents
         return True
@@ -148,6 +153,10 @@ class CacheFile:
         Lock of the threads of this process.
     writable : bool
         False for a read-only file.
+    retry_times : dict of str to float
+        Actions that failed, and the monotonic time [s] before which they are not tried again.
+    has_earlier_rows : bool or None
+        Whether there are rows of earlier releases; None until somebody has looked.
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
@@ -155,6 +164,8 @@ class CacheFile:
         self.timeout = float(timeout)
         self.lock = threading.RLock()
         self.writable = True
+        self.retry_times: dict[str, float] = {}
+        self.has_earlier_rows: bool | None = None
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
         self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new one
@@ -197,7 +208,7 @@ class CacheFile:
                 self._check_integrity(self.connection())
             except (sqlite3.Error, UnicodeDecodeError) as error:
                 self.close()
-                if not is_damage(error):
+                if not _is_damage(error):
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
                 self._replace(error)
 
@@ -215,7 +226,7 @@ class CacheFile:
             self._identify(connection)
             self._check_integrity(connection, seconds=math.inf)
         except (sqlite3.Error, UnicodeDecodeError) as error:
-            if not is_damage(error):
+            if not _is_damage(error):
                 raise ValueError(f"{self.path} cannot be opened as a cache: {error}") from error
             self._refuse_other_files()
             return " ".join(str(error).split())
@@ -234,6 +245,72 @@ class CacheFile:
                 f"{self.path} is damaged ({error}) and cannot be moved aside ({failure}); remove it, or give another "
                 "path"
             ) from failure
+
+    def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
+        """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action.
+
+        Parameters
+        ----------
+        what : str
+            Participle that the warning uses, such as "read"; actions of one name pause together.
+        action : callable
+            Takes the connection.
+        otherwise : object
+            Returned where the action fails or pauses.
+        """
+        with self.lock:
+            if time.monotonic() < self.retry_times.get(what, -math.inf):
+                return otherwise
+            for is_last in (False, True):
+                try:
+                    result = action(self.connection())
+                    self.retry_times.pop(what, None)
+                    return result
+                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
+                    self.close()  # also ends a transaction
+                    failure = error
+                except BaseException:
+                    self.close()
+                    raise
+                if is_last or not self.writable or not _is_damage(failure):
+                    break
+                try:
+                    self.set_aside(str(failure))
+                except (OSError, ValueError) as error:
+                    failure = error
+                    break
+            if what not in self.retry_times:
+                text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
+                logger.warning(text, self.path, what, failure, RETRY_SECONDS)
+            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
+            return otherwise
+
+    def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
+        """Result of an action that the user has called explicitly; OSError where the file cannot be used."""
+        with self.lock:
+            try:
+                return action(self.connection())
+            except (sqlite3.Error, ValueError) as error:
+                self.close()
+                raise OSError(f"{self.path} cannot be used: {error}") from error
+            except BaseException:
+                self.close()
+                raise
+
+    def select(self, query: str, values: tuple = ()) -> list[tuple]:
+        """Rows of a query; none where the file cannot be read."""
+        return self.attempt("read", lambda connection: connection.execute(query, values).fetchall(), [])
+
+    def write(self, statement: str, rows: list[tuple], what: str = "written") -> bool:
+        """Execute a statement for some rows in one transaction; False where the file cannot be written."""
+
+        def execute(connection: sqlite3.Connection) -> bool:
+            with transaction(connection):
+                connection.executemany(statement, rows)
+            return True
+
+        with self.lock:
+            return self.writable and self.attempt(what, execute, False)
 
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.

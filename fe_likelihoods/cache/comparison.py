@@ -1,0 +1,280 @@
+"""Simulations that are run again, and how much two simulations with the same parameters may differ."""
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..signals.comparison import Comparison, measured_values
+from ..simulation.faults import TransientReason
+from ..simulation.label import ModelLabel
+from ..simulation.model import (
+    Model,
+    SimulationBatch,
+    misfit_batch,
+    misfit_of_responses,
+    sent_simulation,
+    simulate_batch,
+)
+from ..simulation.opened import Observed, Opened, observing, unpack
+from ..simulation.residual_statistics import Statistic, needs_response
+from ..simulation.user_code import is_of_user
+from .file import CacheFile
+from .labels import Trust, labels_of
+from .rows import StoredSimulation
+
+__all__ = [
+    "DEFAULT_TOLERANCE",
+    "Repetition",
+    "Simulated",
+    "VerifyingRun",
+    "difference_of",
+    "is_transient",
+    "largest_difference",
+    "observed_batch",
+    "response_tolerance",
+    "row_of_response",
+    "simulate_again",
+]
+
+DEFAULT_TOLERANCE = 1e-9
+ROUNDING = 1e-13  # of a sum of squares, whose terms another processor adds in another order
+RESPONSE_VALUES = 2**23  # responses held at once: 64 MiB
+
+
+class VerifyingRun(NamedTuple):
+    """What a simulation for verification needs.
+
+    Attributes
+    ----------
+    model : Model
+    pool : executor or None
+        Where the simulations of the likelihood run.
+    measured : (n_channels, n_steps) float, or Comparison
+        Measured response [SI].
+    statistic : Statistic or None
+        Statistic of the residuals that is stored; None for the sums of squares.
+    n_numbers : int
+        Length of the statistic.
+    tolerance : float or None
+        As for `SimulationCache`.
+    """
+
+    model: Model
+    pool: Any
+    measured: np.ndarray | Comparison
+    statistic: Statistic | None
+    n_numbers: int
+    tolerance: float | None = None
+
+    @property
+    def n_steps(self) -> int:
+        """Number of measured samples."""
+        return measured_values(self.measured).shape[1]
+
+
+class Simulated(NamedTuple):
+    """A simulation that was run again.
+
+    Attributes
+    ----------
+    misfit : (n_numbers,) float
+        Statistics; NaN where it failed.
+    reason : str
+        Reason of the failure; empty where it succeeded.
+    norm : (n_channels,) float
+        Norm of the response of each channel [SI].
+    """
+
+    misfit: np.ndarray
+    reason: str
+    norm: np.ndarray
+
+
+# new simulations ------------------------------------------------------------------------------------------------------
+
+
+def observed_batch(
+    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel
+) -> tuple[np.ndarray, list[str], Opened | None]:
+    """Statistics (n, n_numbers) and reasons of simulations, and what they opened; None for nothing new."""
+    if not label.observes:
+        return *misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic), None
+    if run.pool is None:
+        with observing() as observer:
+            misfit, reasons = misfit_batch(run.model, thetas, run.measured, None, run.statistic)
+        return misfit, reasons, observer.result(label.known)
+    function = Observed(sent_simulation(run.model, run.measured, run.statistic))
+    return _in_pool(run, function, thetas, (run.n_numbers,))
+
+
+def _observed_responses(
+    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None
+) -> tuple[SimulationBatch, Opened | None]:
+    """Responses of simulations, and what they opened."""
+    if label is None or not label.observes:
+        return simulate_batch(run.model, thetas, run.pool), None
+    if run.pool is None:
+        with observing() as observer:
+            batch = simulate_batch(run.model, thetas)
+        return batch, observer.result(label.known)
+    shape = len(run.model.channels), run.model.n_steps
+    responses, reasons, opened = _in_pool(run, Observed(sent_simulation(run.model)), thetas, shape)
+    return SimulationBatch(responses, reasons), opened
+
+
+def _in_pool(
+    run: VerifyingRun, function: Observed, thetas: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, list[str], Opened]:
+    values, reasons, opened = np.full((len(thetas), *shape), np.nan), [], Opened({})
+    for row, outcome in zip(values, run.pool.map(function, list(thetas)), strict=True):
+        (result, reason), found = unpack(outcome)
+        reasons.append(reason)
+        opened = opened if found is None else opened | found
+        if result is not None:
+            row[...] = result
+    return values, reasons, opened
+
+
+def simulate_again(
+    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None = None
+) -> tuple[list[Simulated], Opened | None]:
+    """New simulations, and what they opened if the label of the model is given."""
+    rows, opened = [], None
+    size = max(1, RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))
+    for start in range(0, len(thetas), size):
+        batch, found = _observed_responses(run, thetas[start : start + size], label)
+        opened = found if opened is None or found is None else opened | found
+        misfit, reasons = misfit_of_responses(run.model, batch, run.measured, run.statistic)
+        with np.errstate(over="ignore", invalid="ignore"):
+            norms = np.linalg.norm(batch.response, axis=2)
+        rows += map(Simulated, misfit, reasons, norms)
+    return rows, opened
+
+
+class Repetition:
+    """Simulations that are run again for one likelihood.
+
+    Parameters
+    ----------
+    file : CacheFile
+    trust : Trust
+
+    Attributes
+    ----------
+    compared, unverified, seconds
+        As for `VerifiedCache`.
+    found : dict
+        New simulations of the search or verification that goes on.
+    """
+
+    def __init__(self, file: CacheFile, trust: Trust) -> None:
+        self.file, self.trust = file, trust
+        self.compared, self.unverified, self.seconds = 0, 0, 0.0
+        self.found: dict[tuple, tuple[np.ndarray, Simulated]] = {}
+
+    def simulate(self, fingerprint: str, rows: list[StoredSimulation], run: VerifyingRun) -> list[Simulated]:
+        """New simulations at the points of some rows; those that were found before are not run again."""
+        keys = [(fingerprint, id(run.measured), id(run.statistic), row.theta.tobytes()) for row in rows]
+        left = {key: row.theta for key, row in zip(keys, rows, strict=True) if key not in self.found}
+        if left:
+            start, label, thetas = time.perf_counter(), self.trust.label, list(left.values())
+            new, opened = simulate_again(run, np.array(thetas), label)
+            self.trust.complete(self.file, opened)
+            if run.pool is None and label.observes:
+                label.has_changed_itself(label.changed(run.model))
+            self.seconds += time.perf_counter() - start
+            stopped = sum(is_transient(each.reason) for each in new)
+            self.compared, self.unverified = self.compared + len(new) - stopped, self.unverified + stopped
+            self.found |= dict(zip(left, zip(thetas, new, strict=True), strict=True))
+        return [self.found[key][1] for key in keys]
+
+    def tolerances(self, run: VerifyingRun) -> Mapping[int, float]:
+        """Tolerances by the label of a row; a row of an unknown label may be that of another processor."""
+        same = response_tolerance(run.model) if run.tolerance is None else run.tolerance
+        other = max(same, DEFAULT_TOLERANCE) if run.tolerance is None else same
+        cpu = self.trust.cpu
+        found = {each.id: same if each.cpu == cpu != "" else other for each in labels_of(self.file, run.model)}
+        return defaultdict(lambda: other, found | {0: same})
+
+
+def row_of_response(theta: np.ndarray, response: np.ndarray, label: int, run: VerifyingRun) -> StoredSimulation:
+    """A stored response as its statistics."""
+    batch = SimulationBatch(response[None], [""])
+    misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
+    return StoredSimulation(theta, misfit[0], reason, label)
+
+
+def is_transient(reason: str) -> bool:
+    """Whether a simulation failed for a reason that says nothing about the model."""
+    return isinstance(reason, TransientReason)
+
+
+# differences ----------------------------------------------------------------------------------------------------------
+
+
+def response_tolerance(model: Model) -> float:
+    """Relative difference of responses with the same parameters that a model may have.
+
+    It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
+    responses are the same to the last bit on the same processor. For models without the attribute, and for subclasses
+    of the user that do not define it, it is 1e-9, because sums of several threads may differ in their last digits.
+    """
+    cls = type(model)
+    if is_of_user(cls.__module__) and "response_tolerance" not in getattr(model, "__dict__", {}):
+        defined = next((base for base in cls.__mro__ if "response_tolerance" in vars(base)), None)
+        if defined is not None and not is_of_user(defined.__module__):
+            return DEFAULT_TOLERANCE
+    return float(getattr(model, "response_tolerance", DEFAULT_TOLERANCE))
+
+
+def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
+    """Number and size of the largest difference beyond a tolerance, as of `largest_difference`; None if they agree."""
+    return largest_difference(stored, new.misfit, new.norm, tolerance, needs_response(run.statistic))
+
+
+def largest_difference(
+    stored: np.ndarray, new: np.ndarray, norm: np.ndarray, tolerance: float, of_response: bool = False
+) -> tuple[int, float] | None:
+    """The statistic that differs most between two simulations with the same parameters, if one differs too much.
+
+    Parameters
+    ----------
+    stored, new : (n_numbers,) float
+        Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
+        scale of the sums.
+    norm : (n_channels,) float
+        Norm of the new response of each channel [SI].
+    tolerance : float
+        Accepted change of the response of a channel, relative to its norm; zero for equal bits.
+    of_response : bool
+        Whether sums of squares of the response are among the further numbers.
+
+    Returns
+    -------
+    int, float
+        Index of the number, and the change of the response that explains its difference, relative as for `tolerance`;
+        None if all numbers agree.
+
+    Notes
+    -----
+    If a response of the norm r changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does
+    a sum of products of two residuals of the channel. A sum of squares of the response changes by at most
+    2 r t r + (t r)^2. The rounding of the sums themselves is no change of the response.
+    """
+    if np.array_equal(stored, new):
+        return None
+    n, channels = len(norm), np.arange(len(stored)) % len(norm)
+    s, r = np.sqrt(np.minimum(stored[:n], new[:n]))[channels], norm[channels]
+    if of_response:
+        s[n:] = r[n:]
+    difference = np.abs(stored - new)
+    if tolerance:
+        difference = np.where(difference <= ROUNDING * s**2, 0.0, difference)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
+        change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
+    worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
+    return (worst, float(change[worst])) if not change[worst] <= tolerance else None
