@@ -29,7 +29,7 @@ def _seconds(function: Callable, *arguments) -> float:
 def _fresh(likelihood: FELikelihood, path: Path) -> FELikelihood:
     """A likelihood with an empty memory cache and an open file."""
     other = FELikelihood(likelihood.model, likelihood.measurements, cache=SimulationCache(path, verify=False))
-    other.cache.look_up("", np.zeros((1, 5)), 2, 1)
+    other.simulator.cache.look_up("", np.zeros((1, 5)), 2, 1)
     return other
 
 
@@ -42,11 +42,11 @@ def cache(repeats: int, stored: int = 100_000) -> list[Row]:
         path = Path(folder) / "cache.sqlite"
         # the stored numbers are random, so they cannot be verified
         likelihood = bridge_column(cache=SimulationCache(path, verify=False)).likelihood
-        n_steps, key = likelihood.measurements.n_steps, likelihood.simulation_key
+        n_steps, key = likelihood.measurements.n_steps, likelihood.simulator.simulation_key
         misfit = rng.uniform(size=(stored, 2))
 
         def store(batch: np.ndarray) -> None:
-            likelihood.cache.store(key, thetas[batch], n_steps, misfit[batch], [""] * len(batch), 1.0)
+            likelihood.simulator.cache.store(key, thetas[batch], n_steps, misfit[batch], [""] * len(batch), 1.0)
 
         for start in range(0, stored, 1000):
             store(np.arange(start, start + 1000))
@@ -57,8 +57,8 @@ def cache(repeats: int, stored: int = 100_000) -> list[Row]:
                 batches = rng.choice(stored, size=(20, size), replace=False)
                 disk.append(median(_seconds(other.misfit, thetas[batch]) for batch in batches) / size)
                 memory.append(median(_seconds(other.misfit, thetas[batch]) for batch in batches) / size)
-                if other.simulations or other.disk_hits != 20 * size:
-                    raise RuntimeError(f"expected {20 * size} rows from disk, got {other.disk_hits}")
+                if other.simulations or other.simulator.disk_hits != 20 * size:
+                    raise RuntimeError(f"expected {20 * size} rows from disk, got {other.simulator.disk_hits}")
                 thetas[batches] += 1.0  # not yet in the cache
                 added.append(median(_seconds(store, batch) for batch in batches) / size)
             case = f"batches of {size}"
@@ -79,7 +79,7 @@ def cache(repeats: int, stored: int = 100_000) -> list[Row]:
                 ),
                 Row("cache, wall time per row", f"stored, {case}", 1e6 * median(added), "us"),
             ]
-        likelihood.cache.close()
+        likelihood.simulator.cache.close()
         size = path.stat().st_size
         opened = median(_seconds(SimulationCache, path) for _ in range(repeats))
         copies = [pickle.loads(pickle.dumps(likelihood)) for _ in range(repeats)]

@@ -111,7 +111,7 @@ def run_with_guide(path: str, lengths: str, workers: int, nwalkers: int, seed: i
     """Cluster, sampler, points and truth of a run with the guide of a posterior."""
     posterior, truth = vibration(), truth_of_vibration()
     length, n_steps = lengths_of(lengths, truth, np.random.default_rng(seed)), posterior.likelihood.model.n_steps
-    posterior.likelihood.pool = pool = SimulatedPool(workers, lambda theta: length(theta[None])[0], n_steps)
+    posterior.likelihood.simulator.pool = pool = SimulatedPool(workers, lambda theta: length(theta[None])[0], n_steps)
     sampler = SMCSampler(
         nwalkers, 2, posterior, vectorize=True, seed=seed, guide=posterior.guide(), asynchronous=GUIDED[path]
     )

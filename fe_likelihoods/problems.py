@@ -272,7 +272,9 @@ def bridge_column(
     early = measurements.complete or (measurements.times_of_first_samples < end).all()
     if end > record.dt and early:
         cheap = replace(model, loading=record.trim(0.0, end), **_COARSE_TOLERANCES)
-        coarse = Posterior(FELikelihood(cheap, measurements.trim(0.0, end), law, cache=likelihood.cache), prior)
+        coarse = Posterior(
+            FELikelihood(cheap, measurements.trim(0.0, end), law, cache=likelihood.simulator.cache), prior
+        )
     posterior = Posterior(likelihood, prior, coarse)
     return posterior.marginal() if noise == "marginal" else posterior
 

@@ -239,7 +239,7 @@ def cached() -> Results:
         paths = [str(Path(folder) / name) for name in ("one.db", "copy.db", "two.db")]
         posterior = Posterior(FELikelihood(model, measured, cache=paths[0]), Prior(prior))
         first = posterior(points)
-        posterior.likelihood.cache.copy(paths[1])
+        posterior.likelihood.simulator.cache.copy(paths[1])
         second = SimulationCache(paths[2])
         second.add(paths[1])
         again = Posterior(FELikelihood(model, measured, cache=second), Prior(prior))

@@ -427,7 +427,7 @@ def test_the_coarse_column_uses_the_first_part_of_the_record(data, tmp_path):
     assert coarse.coarse is None
     assert coarse.prior.distributions == fine.prior.distributions
     assert coarse.fingerprint != fine.fingerprint
-    assert coarse.likelihood.cache is fine.likelihood.cache
+    assert coarse.likelihood.simulator.cache is fine.likelihood.simulator.cache
     n, measured = coarse.likelihood.measurements.n_steps, fine.likelihood.measurements
     np.testing.assert_array_equal(coarse.likelihood.measurements.values, measured.values[:, :n])
     intensity = np.cumsum(fine.likelihood.model.loading.acceleration**2)

@@ -201,7 +201,7 @@ class SimulationCache:
     Examples
     --------
     >>> likelihood = FELikelihood(model, measurements, cache="column.sqlite")
-    >>> likelihood.cache.info().simulations
+    >>> likelihood.simulator.cache.info().simulations
     """
 
     def __init__(
@@ -671,7 +671,7 @@ class SimulationCache:
         Parameters
         ----------
         *fingerprints : str
-            As for `look_up`; ``cache.forget(*likelihood.cache_keys)`` deletes what a likelihood uses.
+            As for `look_up`; ``cache.forget(*likelihood.simulator.cache_keys)`` deletes what a likelihood uses.
 
         Returns
         -------

@@ -54,7 +54,7 @@ ROWS_PER_VERIFICATION = 1000
 LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
-    "cache.forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)"
+    "cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or depends_on=)"
 )
 MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
 PAUSE_SECONDS = 60.0  # after failed attempts; at least

@@ -123,8 +123,8 @@ def salvage_cache(file: Path, out: Path) -> str:
 
 def latest_stored(likelihood: FELikelihood) -> np.ndarray | None:
     """Structural parameters of the successful simulation that the cache of a likelihood stored last, if any."""
-    cache, key = likelihood.cache, likelihood.simulation_key
-    width = likelihood.statistics(np.zeros((0, len(likelihood.model.parameter_names)))).shape[1]
+    cache, key = likelihood.simulator.cache, likelihood.simulator.simulation_key
+    width = likelihood.simulator.n_numbers
     for generation in cache.generations_of(key):
         for row in cache.stored_rows(key, generation, width, likelihood.measurements.n_steps, most=100):
             if not row.reason:

@@ -197,7 +197,7 @@ def _predict_event(
                 samples,
                 record=event.record,
                 quantity={name: quantities[name] for name in quantities if noises[name] == noise},
-                cache=posterior.likelihood.cache,
+                cache=posterior.likelihood.simulator.cache,
                 noise=noise,
                 **options,
                 progress=progress,

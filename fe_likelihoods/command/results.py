@@ -99,9 +99,9 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
 
 def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
     """How many runs of the model are stored, where a guide has made some of a part of the record, as a line of text."""
-    if likelihood.cache is None or float(simulations).is_integer():
+    if likelihood.simulator.cache is None or float(simulations).is_integer():
         return []
-    stored = likelihood.cache.info()
+    stored = likelihood.simulator.cache.info()
     return [
         f"{stored.simulations} runs of the model are stored, {stored.failures} of which failed, those for tables, "
         f"report and predictions included. The sampling counts as {simulations:.0f} full simulations, since the guide "

@@ -324,7 +324,7 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
     if not len(drawn):
         return None
-    cache = problem.posterior.likelihood.cache
+    cache = problem.posterior.likelihood.simulator.cache
     try:
         return propagate_quietly(problem.posterior, drawn, cache=cache, **prediction_options(job), progress=progress)
     except ValueError as error:

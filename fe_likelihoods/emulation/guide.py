@@ -83,7 +83,7 @@ class ResponseGuide:
 
     def __init__(self, posterior: Any, starts: int = 8) -> None:
         starts = check_starts(starts)
-        fewest = min(part.memory_cache.rows for part, _ in posterior.likelihood.parts())
+        fewest = min(part.simulator.memory_cache.rows for part, _ in posterior.likelihood.parts())
         if fewest < _FEWEST_CACHED:
             raise ValueError(
                 f"a guide needs a likelihood with memory_rows of {_FEWEST_CACHED} or more, so that no simulation is "
@@ -220,7 +220,7 @@ class ResponseGuide:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
         if is_joint(self._posterior.likelihood):
             raise ValueError("asynchronous=True is not possible with a guide of a JointLikelihood: leave it out")
-        target, memory = self._target, self._posterior.likelihood.response_memory
+        target, memory = self._target, self._posterior.likelihood.simulator.response_memory
         most = self._starts * max(target.n_structural, POINTS_PER_STEP)
         needed = 8 * most * len(target.model.channels) * target.model.n_steps
         if memory.max_bytes < needed:

@@ -141,6 +141,11 @@ class StackedLikelihood:
         self.noise, self.n_samples = _StackedNoise(found), tuple(part.likelihood.n_samples for part in found)
         self.measured = self._filled([part.likelihood.measured[None] for part in found], 1)[0]
 
+    @property
+    def simulator(self) -> "StackedLikelihood":
+        """Runs and recalls the simulations of all models: this object."""
+        return self
+
     def _filled(self, arrays: Sequence[np.ndarray], n: int) -> np.ndarray:
         """Histories (n, n_channels, n_steps) of all data sets, zero after the end of each."""
         filled = np.zeros((n, len(self.model.channels), self.model.n_steps))
@@ -169,16 +174,16 @@ class StackedLikelihood:
         left = np.arange(len(thetas))
         for part in self._parts:
             if len(left) > 0:
-                result[left, part.numbers] = part.likelihood.statistics(thetas[np.ix_(left, part.structural)])
+                result[left, part.numbers] = part.likelihood.simulator.statistics(thetas[np.ix_(left, part.structural)])
                 left = left[np.isfinite(result[left, part.numbers]).all(axis=1)]
         return result
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
-        """Cache what an earlier run has found, as `FELikelihood.recall`."""
+        """Cache what an earlier run has found, as `Simulator.recall`."""
         left = np.arange(len(thetas))
         for part in self._parts:
             own = statistics[left, part.numbers]
             good = np.isfinite(own).all(axis=1)
             known = ["" if fine else reasons[row] for row, fine in zip(left, good, strict=True)]
-            part.likelihood.recall(thetas[np.ix_(left, part.structural)], own, known)
+            part.likelihood.simulator.recall(thetas[np.ix_(left, part.structural)], own, known)
             left = left[good]

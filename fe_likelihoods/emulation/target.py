@@ -52,12 +52,9 @@ class _Likelihood(Protocol):
     measured: Any
     n_samples: Any
     noise: Any
-    simulations: int
+    simulator: Any
 
     def simulate(self, thetas: np.ndarray) -> Any: ...
-    def running_requests(self) -> Any: ...
-    def statistics(self, thetas: np.ndarray) -> np.ndarray: ...
-    def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None: ...
 
 
 class _Posterior(Protocol):
@@ -316,7 +313,7 @@ class ResponseTarget:
             with np.errstate(over="ignore"):
                 residuals = self._residuals(batch.response).astype(np.float32)
             reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
-            return [residuals, self._likelihood.statistics(thetas), reasons]
+            return [residuals, self._likelihood.simulator.statistics(thetas), reasons]
 
         text = f"residuals of {self.model.fingerprint}".encode()  # files of earlier versions have responses
         if isinstance(self.comparison, Comparison):
@@ -324,14 +321,14 @@ class ResponseTarget:
         key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
         residuals, statistics, reasons = remember(key, compute)
         if not computed:
-            self._likelihood.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
+            self._likelihood.simulator.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
         failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
         self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
         return Runs(residuals.astype(float), statistics, failed)
 
     def running_requests(self) -> Any:
         """Requests for simulations that go on while others are waited for; `run` finds their responses in the cache."""
-        return self._likelihood.running_requests()
+        return self._likelihood.simulator.running_requests()
 
     def _residuals(self, responses: np.ndarray) -> np.ndarray:
         """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""

@@ -354,7 +354,7 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
             f"{likelihood.ndim} parameters"
         )
     noise = as_points(samples, likelihood.parameter_names)[:, thetas.shape[1] :]
-    return likelihood.noise.misfit(likelihood.statistics(thetas), noise) / power
+    return likelihood.noise.misfit(likelihood.simulator.statistics(thetas), noise) / power
 
 
 def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:

@@ -21,8 +21,9 @@ from ..simulation.model import has_batch_method
 from .inputs import as_points
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
-from .new_simulations import RunningSimulation, take_all
 from .priors import Prior
+from .running_simulations import RunningSimulation, take_all
+from .simulator import Simulator
 
 __all__ = ["EvaluationQueue"]
 
@@ -50,18 +51,13 @@ class _Part:
     """
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
-        self.likelihood, self.columns = likelihood, columns
+        self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
         self.running: dict[RunningSimulation, list[_Point]] = {}
         self.unstarted: deque[list[_Point]] = deque()  # without a pool, or stored on disk, or after an error
 
     def thetas(self, points: Sequence[_Point]) -> np.ndarray:
         """Structural parameters (n, n_structural)."""
-        n_structural = len(self.likelihood.model.parameter_names)
-        return np.concatenate([point.row[:, self.columns] for point in points])[:, :n_structural]
-
-    def are_stored(self, thetas: np.ndarray) -> np.ndarray:
-        """Whether the cache on disk has rows (n,), which are not read yet, since that may take a verification."""
-        return self.likelihood.are_stored(thetas)
+        return np.concatenate([point.row[:, self.columns] for point in points])[:, : self.simulator.n_structural]
 
     def value(self, point: _Point, misfit: np.ndarray) -> float:
         """Log-likelihood of a point from the statistics (n_numbers,) of its simulation."""
@@ -72,8 +68,8 @@ class EvaluationQueue:
     """Queue of points of a posterior, see `Posterior.evaluation_queue`.
 
     Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
-    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect`
-    evaluates the points of one `submit` as a batch.
+    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect` runs
+    the simulations of one `submit` in parts.
 
     Parameters
     ----------
@@ -104,7 +100,7 @@ class EvaluationQueue:
     @property
     def workers(self) -> int | None:
         """Number of evaluations that run at once; None if a pool does not say."""
-        pools = {id(part.likelihood.pool): part.likelihood.pool for part in self._parts}
+        pools = {id(part.simulator.pool): part.simulator.pool for part in self._parts}
         sizes = [getattr(pool, "n_workers", None) for pool in pools.values() if pool is not None]
         if not sizes:
             return (os.cpu_count() or 1) if any(has_batch_method(part.likelihood.model) for part in self._parts) else 1
@@ -176,7 +172,7 @@ class EvaluationQueue:
             while not self._finished:
                 if self._error is not None:
                     raise self._error
-                if not self._evaluate_unstarted():
+                if not self._begin_unstarted():
                     self._receive(wait=True)
         except BaseException:
             self._write()
@@ -195,7 +191,7 @@ class EvaluationQueue:
         self._require_open()
         for part in self._parts:
             # not all of them may have announced their end
-            self._taken += [running for running in part.running if running.future.done()]
+            self._taken += [running for running in part.running if running.future and running.future.done()]
         self._receive(wait=False)
         return self._collected + self._finished
 
@@ -208,9 +204,9 @@ class EvaluationQueue:
             return
         self._closed = True
         for part in self._parts:
-            left = part.likelihood.leave_simulations(list(part.running), self._arrived, running=False)
+            left = part.simulator.leave(list(part.running), self._arrived, running=False)
             if left:
-                threading.Thread(target=_cache_rest, args=(part.likelihood, left), daemon=True).start()
+                threading.Thread(target=_cache_rest, args=(part.simulator, left), daemon=True).start()
 
     def _require_open(self) -> None:
         if self._closed:
@@ -218,7 +214,7 @@ class EvaluationQueue:
 
     def _write(self) -> None:
         for part in self._parts:
-            part.likelihood.write_simulations()
+            part.simulator.flush()
 
     def _finish(self, point: _Point, log_likelihood: float) -> None:
         self._finished.append((point.ticket, point.log_prior + log_likelihood))
@@ -231,12 +227,11 @@ class EvaluationQueue:
         unknown = self._look_up(stage, points, on_disk=False)
         if not unknown:
             return
-        thetas = part.thetas(unknown)
-        if not part.likelihood.streams or self._error is not None:
+        if not part.simulator.streams or self._error is not None:
             part.unstarted.append(unknown)
             return
-        stored = part.are_stored(thetas)
-        if stored.any():
+        stored = part.simulator.are_stored(part.thetas(unknown))
+        if stored.any():  # not read yet, since that may take a verification
             part.unstarted.append([point for point, is_stored in zip(unknown, stored, strict=True) if is_stored])
         self._start(part, [point for point, is_stored in zip(unknown, stored, strict=True) if not is_stored])
 
@@ -244,7 +239,7 @@ class EvaluationQueue:
         """Pass points on whose simulations are cached; returns the others."""
         part = self._parts[stage]
         keys, distinct = distinct_keys(part.thetas(points))
-        misfit, cached = part.likelihood.look_up(keys, distinct, on_disk)
+        misfit, cached = part.simulator.look_up(keys, distinct, on_disk)
         for point, place in zip(points, distinct, strict=True):
             if cached[place]:
                 self._pass_on(stage, point, misfit[place])
@@ -258,7 +253,7 @@ class EvaluationQueue:
         keys, distinct = distinct_keys(thetas)
         first = [distinct.index(place) for place in range(len(keys))]
         try:
-            started = part.likelihood.start_simulations(keys, thetas[first], self._responses, self._arrived)
+            started = part.simulator.start(keys, thetas[first], self._responses, self._arrived)
         except Exception as error:  # raised by `collect`, as in a call of the posterior
             self._error = self._error or error
             part.unstarted.append(points)
@@ -266,20 +261,13 @@ class EvaluationQueue:
         for point, place in zip(points, distinct, strict=True):
             part.running.setdefault(started[place], []).append(point)
 
-    def _evaluate_unstarted(self) -> bool:
-        """Evaluate points that were not sent to a pool, or read them from the disk; returns whether there were any."""
+    def _begin_unstarted(self) -> bool:
+        """Read points from the caches, or begin their simulations; returns whether there were any."""
         for stage, part in enumerate(self._parts):
-            if part.unstarted:
-                points = part.unstarted[0]
+            # those that are not in a pool are run first, since they may be the same points
+            if part.unstarted and (part.simulator.streams or not part.running):
                 try:
-                    if part.likelihood.streams:
-                        unknown = self._look_up(stage, points, on_disk=True)
-                    else:
-                        if self._responses:
-                            part.likelihood.simulate(part.thetas(points))
-                        misfit, unknown = part.likelihood.statistics(part.thetas(points)), []
-                        for point, row in zip(points, misfit, strict=True):
-                            self._pass_on(stage, point, row)
+                    unknown = self._look_up(stage, part.unstarted[0], on_disk=True)
                 except Exception as error:
                     self._error = self._error or error
                     return True
@@ -290,15 +278,17 @@ class EvaluationQueue:
 
     def _receive(self, wait: bool) -> None:
         """Take simulations that have ended; with `wait`, at least one."""
-        self._taken += take_all(self._arrived, wait and not self._taken)
+        self._taken += take_all(self._arrived, wait=False)
+        if wait and not self._taken:
+            self._wait()
         for stage, part in enumerate(self._parts):
             ended = [running for running in dict.fromkeys(self._taken) if running in part.running]
             if not ended:
                 continue
             try:
-                part.likelihood.receive_simulations(ended)
+                part.simulator.receive(ended)
                 if any(running not in ended for running in part.running):
-                    part.likelihood.check_failures()
+                    part.simulator.check_failures()
             except Exception as error:
                 self._error = self._error or error
             for running in ended:
@@ -310,6 +300,17 @@ class EvaluationQueue:
                     self._error = self._error or running.error
         self._taken.clear()
 
+    def _wait(self) -> None:
+        """Wait for a simulation, or run some that are not in a pool."""
+        here = [part for part in self._parts if part.running and not part.simulator.streams]
+        if not here:
+            self._taken += take_all(self._arrived, wait=True)
+            return
+        try:
+            self._taken += here[0].simulator.wait(here[0].running, self._arrived)
+        except Exception as error:
+            self._error = self._error or error
+
     def _pass_on(self, stage: int, point: _Point, misfit: np.ndarray) -> None:
         """Pass a point on to the next part, from the statistics of its simulation."""
         point.log_likelihood += self._parts[stage].value(point, misfit)
@@ -319,13 +320,13 @@ class EvaluationQueue:
             self._advance(stage + 1, [point])
 
 
-def _cache_rest(likelihood: FELikelihood, left: list[RunningSimulation]) -> None:
+def _cache_rest(simulator: Simulator, left: list[RunningSimulation]) -> None:
     """Cache simulations of a closed queue when they end; in a thread."""
     running = {each.future: each for each in left}
     try:
         for future in as_completed(running):
-            likelihood.receive_simulations([running[future]])
+            simulator.receive([running[future]])
     except Exception as error:
         logger.warning("simulations of a closed queue are not stored: %s", error)
     finally:
-        likelihood.write_simulations()
+        simulator.flush()

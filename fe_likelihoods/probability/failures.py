@@ -53,6 +53,8 @@ class FailureLog:
 
     Attributes
     ----------
+    outcomes : int
+        Simulations of which is known whether they failed: run here, read from the disk, or recalled.
     count : int
         Number of failures.
     records : list of dict
@@ -75,7 +77,7 @@ class FailureLog:
         if not 0.0 <= max_share <= 1.0:
             raise ValueError(f"FELikelihood: max_failure_share must be in [0, 1]; got {max_share!r}")
         self.max_share = max_share
-        self.count = self.transient = 0
+        self.outcomes = self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
         self._reasons_of_model: set[str] = set()
@@ -86,6 +88,13 @@ class FailureLog:
     def fault(self, theta: np.ndarray) -> str:
         """Reason of the failure at the structural parameters `theta` if its cause is not the model, else empty."""
         return self._faults.get((theta + 0.0).tobytes(), "") if self._faults else ""
+
+    def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
+        """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
+        self.outcomes += len(thetas)
+        for theta, reason in zip(thetas, reasons, strict=True):
+            if reason:
+                self.add(theta, reason)
 
     def add(self, theta: np.ndarray, reason: str) -> None:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
@@ -116,12 +125,12 @@ class FailureLog:
         other = _OTHER_FAULTS if transient else _OTHER_REASONS
         self.reasons[_counted_under(reason, known) or other] += 1
 
-    def check(self, n_simulations: int, running: int = 0) -> None:
-        """Raise `TooManyFailures` if too large a share of `n_simulations` simulations (20 or more) failed.
+    def check(self, running: int = 0) -> None:
+        """Raise `TooManyFailures` if too large a share of the simulations (20 or more) failed.
 
         Simulations that are `running` count as successes, because failures often end sooner.
         """
-        n_simulations += running
+        n_simulations = self.outcomes + running
         if n_simulations >= _MIN_SIMULATIONS and self.count > self.max_share * n_simulations:
             (reason, count), *_ = self.reasons.most_common(1)
             running_too = f" ({running} of them still run)" if running else ""

@@ -19,9 +19,19 @@ from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .parameters import Parameter, channels_of_deviations
-from .report import simulation_report
 
 __all__ = ["JointLikelihood"]
+
+_COUNTS = (  # of the report that are added
+    "simulations",
+    "verifications",
+    "unverified",
+    "cache_hits",
+    "disk_hits",
+    "failure_count",
+    "transient_failures",
+    "seconds",
+)
 
 
 class JointLikelihood:
@@ -209,61 +219,15 @@ class JointLikelihood:
     @property
     def simulations(self) -> int:
         """Simulations run by this object in this process, of all models."""
-        return self._total("simulations")
-
-    @property
-    def verifications(self) -> int:
-        """Number of rows of caches on disk that were compared with a new simulation."""
-        return self._total("verifications")
-
-    @property
-    def unverified(self) -> int:
-        """Number of rows that could not be compared, because the new simulation was stopped."""
-        return self._total("unverified")
-
-    @property
-    def cache_hits(self) -> int:
-        """Rows whose statistics were cached, in memory or on disk, counted for each likelihood."""
-        return self._total("cache_hits")
-
-    @property
-    def disk_hits(self) -> int:
-        """Rows among them that came from a cache on disk."""
-        return self._total("disk_hits")
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of the simulations [s]."""
-        return self._total("seconds")
-
-    @property
-    def failure_count(self) -> int:
-        """Number of failed simulations."""
-        return self._total("failure_count")
-
-    @property
-    def transient_failure_count(self) -> int:
-        """Number of failures whose cause is not the model."""
-        return self._total("transient_failure_count")
-
-    @property
-    def failures(self) -> list[dict]:
-        """The first failures of each likelihood, as `FELikelihood.failures`, with its name under ``"likelihood"``."""
-        return [
-            {"likelihood": key, **failure}
-            for key, likelihood in self.likelihoods.items()
-            for failure in likelihood.failures
-        ]
-
-    @property
-    def failure_reasons(self) -> Counter[str]:
-        """Number of failures per reason."""
-        return sum((likelihood.failure_reasons for likelihood in self.likelihoods.values()), Counter())
+        return sum(likelihood.simulations for likelihood in self.likelihoods.values())
 
     def report(self) -> dict:
         """Summary of all simulations, and under ``"likelihoods"`` that of each likelihood, see `Posterior.report`."""
-        parts = {key: simulation_report(likelihood) for key, likelihood in self.likelihoods.items()}
-        return simulation_report(self) | {"likelihoods": parts}
+        parts = {key: likelihood.report() for key, likelihood in self.likelihoods.items()}
+        total = {name: sum(part[name] for part in parts.values()) for name in _COUNTS}
+        total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
+        total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
+        return total | {"likelihoods": parts}
 
     # identity ----------------------------------------------------------------------------------------------------
 
@@ -343,9 +307,6 @@ class JointLikelihood:
     def _joint_name(self, key: str, name: str) -> str:
         """Name in the joint likelihood of a parameter of one likelihood."""
         return f"{name}_{key}" if name in self.separate else name
-
-    def _total(self, name: str) -> Any:
-        return sum(getattr(likelihood, name) for likelihood in self.likelihoods.values())
 
     def _check_units(self) -> None:
         """Raise ValueError if a parameter has different units, or multiples of different nominal values."""

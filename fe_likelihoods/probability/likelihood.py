@@ -2,8 +2,8 @@
 
 The steps are: structural parameters to the response of the model, response to the sums of squared residuals J per
 channel, J and the parameters of the noise to the log-likelihood. (A noise may need more numbers than J, its statistic
-of the residuals, see `fe_likelihoods.noise.gaussian`.) The simulations are run and cached by the base class, in
-`fe_likelihoods.probability.cached_simulations`. The equations are on the page ``docs/theory/likelihood.rst``.
+of the residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches the simulations
+(`fe_likelihoods.probability.simulator`). The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -19,23 +19,23 @@ from ..cache.simulation_cache import SimulationCache
 from ..noise.events import named_noise
 from ..noise.gaussian import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
 from ..noise.marginal import MarginalNoise
+from ..noise.sample_counts import count_samples
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
 from ..signals.sampling import same_step
-from ..simulation.model import Model, SimulationFailed, first_part, simulate_batch
-from .cached_simulations import CachedSimulations
+from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
 from .data_identity import combined_digest, data_digests
 from .distributions import Distribution, RandomState, uniform_numbers
 from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
 from .multivariate import as_distribution
 from .parameters import Parameter, describe_parameters
-from .report import simulation_report
+from .simulator import Simulator
 
 __all__ = ["FELikelihood"]
 
 
-class FELikelihood(CachedSimulations):
+class FELikelihood:
     """Log-likelihood of structural parameters and noise parameters, given measurements.
 
     Calling the object is `log_likelihood`.
@@ -82,21 +82,12 @@ class FELikelihood(CachedSimulations):
         Names of the structural parameters, then of the noise parameters.
     fast_parameters : tuple of int
         Indices of the parameters whose change needs no simulation: those of the noise.
-    simulations : int
-        Simulations run by this object in this process.
-    cache_hits : int
-        Rows whose statistics were cached, in memory or on disk.
-    disk_hits : int
-        Rows among them that came from the cache on disk.
-    seconds : float
-        Wall time of the simulations [s], those for verification included.
-    memory_cache : MemoryCache
-        The statistics that are cached in memory.
-    response_memory : ResponseMemory
-        The responses that are cached in memory.
-    chunk_size : int
-        Number of simulations after which the next results are stored on disk, where they are simulated in chunks;
-        adapted to their duration.
+    simulator : Simulator
+        Runs, counts and caches the simulations.
+    n_samples : int or (n_channels,) ndarray
+        Number of samples that are compared, in each channel if these differ.
+    shortened : list of FELikelihood
+        Likelihoods of first parts of the measurements, see `first`.
 
     Raises
     ------
@@ -136,18 +127,47 @@ class FELikelihood(CachedSimulations):
         if len(set(self.parameter_names)) != len(self.parameter_names):
             raise ValueError(f"the names of model and noise must differ; got {', '.join(self.parameter_names)}")
         self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
-        statistic = noise_statistic(self.noise)
-        super().__init__(
+        self.simulator = Simulator(
             model,
             measurements,
-            statistic,
-            pool,
-            memory_rows,
-            memory_bytes,
-            cache,
-            max_failure_share,
+            noise_statistic(self.noise),
             noise_time_shifts(self.noise),
+            pool=pool,
+            cache=cache,
+            memory_rows=memory_rows,
+            memory_bytes=memory_bytes,
+            max_failure_share=max_failure_share,
         )
+        self.n_samples = count_samples(getattr(self.measured, "values", self.measured))
+        self.shortened: list[FELikelihood] = []
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"shortened": []}
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.simulator.model
+
+    @property
+    def measurements(self) -> Measurements:
+        """The measurements, in the order of the model's channels."""
+        return self.simulator.measurements
+
+    @property
+    def measured(self) -> np.ndarray | Comparison:
+        """What responses are compared with: values (n_channels, n_steps), or a `Comparison` if samples are missing."""
+        return self.simulator.measured
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations that this object has run in this process."""
+        return self.simulator.simulations
+
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest of everything that is known of what the statistics depend on, see `Simulator.fingerprint`."""
+        return self.simulator.fingerprint
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_likelihood`."""
@@ -231,13 +251,14 @@ class FELikelihood(CachedSimulations):
             If the simulation fails.
         """
         theta = np.asarray(theta, dtype=float)
-        if theta.shape not in ((self._n_structural,), (self.ndim,)):
+        n_structural = self.simulator.n_structural
+        if theta.shape not in ((n_structural,), (self.ndim,)):
             raise ValueError(
-                f"expected one point, of shape ({self._n_structural},), or ({self.ndim},) with the noise parameters; "
+                f"expected one point, of shape ({n_structural},), or ({self.ndim},) with the noise parameters; "
                 f"got shape {theta.shape}"
             )
         shifts = self._shifts_of(theta)
-        response, (reason,) = simulate_batch(self.model, theta[None, : self._n_structural])
+        response, (reason,) = simulate_batch(self.model, theta[None, :n_structural])
         if reason:
             raise SimulationFailed(reason)
         return self._residuals(response[0], shifts)
@@ -298,13 +319,26 @@ class FELikelihood(CachedSimulations):
             where x is not finite; never NaN.
         """
         points = as_points(x, self.parameter_names)
+        n = self.simulator.n_structural
+        if points.ndim == 1 and (misfit := self.simulator.in_memory(points[:n])) is not None:
+            (value,) = self.noise.log_likelihood(misfit, self.n_samples, points[None, n:])
+            if abs(value) < np.inf:
+                return float(value)  # most calls of a sampler that calls with single points; others take all steps
         rows = np.atleast_2d(points)
         possible = self.possible(rows)
         result = np.full(len(rows), -np.inf)
         if possible.any():
-            misfit = self.statistics(rows[possible, : self._n_structural])
+            misfit = self.simulator.statistics(rows[possible, :n])
             result[possible] = self.of_statistics(rows[possible], misfit)
         return result if points.ndim == 2 else float(result[0])
+
+    def misfit(self, thetas: np.ndarray) -> np.ndarray:
+        """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""
+        return self.simulator.misfit(thetas)
+
+    def simulate(self, thetas: np.ndarray) -> SimulationBatch:
+        """Responses (n, n_channels, n_steps) at structural parameters, which are cached, see `Simulator.simulate`."""
+        return self.simulator.simulate(thetas)
 
     def of_statistics(self, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
         """Log-likelihood of points with possible noise parameters, from the statistics of their simulations.
@@ -314,18 +348,20 @@ class FELikelihood(CachedSimulations):
         rows : (n, ndim) float
             Structural parameters, then noise parameters.
         misfit : (n, n_numbers) float
-            What `statistics` returns for them.
+            What `Simulator.statistics` returns for them.
 
         Returns
         -------
         (n,) float
             -inf where the simulation failed.
         """
-        values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self._n_structural :])
+        values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self.simulator.n_structural :])
         usable = values < np.inf  # neither NaN nor infinite
         simulated = np.isfinite(misfit).all(axis=1)
         for row in np.flatnonzero(simulated & ~usable):
-            self._failures.add(rows[row, : self._n_structural], f"the log-likelihood of the noise is {values[row]}")
+            self.simulator.failures.add(
+                rows[row, : self.simulator.n_structural], f"the log-likelihood of the noise is {values[row]}"
+            )
         return np.where(simulated & usable, values, -np.inf)
 
     def parts(self) -> list[tuple["FELikelihood", list[int]]]:
@@ -337,8 +373,8 @@ class FELikelihood(CachedSimulations):
         possible = np.isfinite(rows).all(axis=1)
         if self.fast_parameters:
             # statistics of zero (a perfect fit) show before any simulation which noise parameters are possible
-            perfect = np.zeros((len(rows), self._width))
-            noise = rows[:, self._n_structural :]
+            perfect = np.zeros((len(rows), self.simulator.n_numbers))
+            noise = rows[:, self.simulator.n_structural :]
             possible &= ~np.isneginf(self.noise.log_likelihood(perfect, self.n_samples, noise))
         return possible
 
@@ -355,7 +391,7 @@ class FELikelihood(CachedSimulations):
 
     def report(self) -> dict:
         """Summary of the simulations, see `Posterior.report`."""
-        return simulation_report(self)
+        return self.simulator.report()
 
     def marginal(self, priors: Mapping[str, Distribution]) -> "FELikelihood":
         """The same likelihood with the standard deviations of its white noise integrated out (`Posterior.marginal`).
@@ -374,7 +410,7 @@ class FELikelihood(CachedSimulations):
         ValueError
             If the noise is not white, has sensor noise, or is integrated out already.
         """
-        names = self.parameter_names[self._n_structural :]
+        names = self.parameter_names[self.simulator.n_structural :]
         if joint := [name for name in names if name not in priors]:
             raise ValueError(
                 f"{', '.join(joint)} have a joint prior distribution and cannot be integrated out; give them "
@@ -393,7 +429,7 @@ class FELikelihood(CachedSimulations):
         points = np.atleast_2d(as_points(x, self.parameter_names))
         drawn = self.noise.noise.parameter_names
         uniform = uniform_numbers((len(points), len(drawn)), rng)
-        sigmas = self.noise.draw(self.misfit(points), self.n_samples, uniform)
+        sigmas = self.noise.draw(self.simulator.misfit(points), self.n_samples, uniform)
         names = (*self.parameter_names, *drawn)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 
@@ -410,7 +446,7 @@ class FELikelihood(CachedSimulations):
         str
             Empty where the simulation succeeded, or its failure is an answer of the model.
         """
-        return self._failures.fault(as_points(x, self.parameter_names)[: self._n_structural])
+        return self.simulator.failures.fault(as_points(x, self.parameter_names)[: self.simulator.n_structural])
 
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
@@ -420,16 +456,16 @@ class FELikelihood(CachedSimulations):
         return self._with(self.model, self.measurements, noise)
 
     def _with(self, model: Model, measurements: Measurements, noise: Noise) -> "FELikelihood":
+        own = self.simulator
         other = FELikelihood(
             model,
             measurements,
             noise,
-            memory_rows=self.memory_cache.rows,
-            memory_bytes=self.response_memory.max_bytes,
-            cache=self.cache,
-            max_failure_share=self.max_failure_share,
+            own.pool,
+            cache=own.cache,
+            memory_rows=own.memory_cache.rows,
+            memory_bytes=own.response_memory.max_bytes,
+            max_failure_share=own.failures.max_share,
         )
-        other.pool, other.response_memory = self.pool, self.response_memory
-        if self._verified_cache is not None:
-            other._verified_cache.share_trust(self._verified_cache)
+        other.simulator.share(own)
         return other

@@ -380,7 +380,7 @@ class Posterior:
         parts = self.likelihood.parts()
         share = 1.0 / len(parts)
         for likelihood, _ in parts:
-            likelihood.when_simulated = None if callback is None else lambda n: callback(n * share)
+            likelihood.simulator.when_simulated = None if callback is None else lambda n: callback(n * share)
 
     def fault(self, x: Any) -> str:
         """As `FELikelihood.fault`: samplers record the reason where they evaluate points in other processes.

@@ -289,8 +289,12 @@ def _of_the_model(run: FinishedRun) -> list[Advice]:
     found, likelihoods = [], [] if run.likelihood is None else [each for each, _ in run.likelihood.parts()]
     for likelihood in likelihoods:
         text = getattr(likelihood.model, "range_remark", "")
-        if not text and isinstance(likelihood.cache, SimulationCache) and hasattr(likelihood.model, "range_remark"):
-            text = likelihood.cache.look_up_remark(likelihood.model)
+        if (
+            not text
+            and isinstance(likelihood.simulator.cache, SimulationCache)
+            and hasattr(likelihood.model, "range_remark")
+        ):
+            text = likelihood.simulator.cache.look_up_remark(likelihood.model)
         if text:
             action = "See whether samples of the posterior are concerned, or only draws far from it."
             found.append(

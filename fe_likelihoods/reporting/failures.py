@@ -109,13 +109,13 @@ def failures(run: FinishedRun) -> Failures:
 def _of_likelihood(run: FinishedRun, likelihood: FELikelihood, columns: np.ndarray) -> _Source:
     names = likelihood.model.parameter_names
     logs = [likelihood, *likelihood.shortened]
-    records = [record for each in logs for record in each.failures]
+    records = [record for each in logs for record in each.simulator.failures.records]
     return _Source(
         np.asarray(columns)[: len(names)],
         np.array([[record["parameters"][name] for name in names] for record in records]).reshape(-1, len(names)),
         [record["reason"] for record in records],
-        likelihood.memory_cache.successes(len(names)),
-        sum((each.failure_reasons for each in logs), Counter()),
+        likelihood.simulator.memory_cache.successes(len(names)),
+        sum((each.simulator.failures.reasons for each in logs), Counter()),
     )
 
 

@@ -65,7 +65,7 @@ class Workshop:
         model = FunctionModel(self.module.f, ("a",), CHANNELS, 0.01, 20, **options)
         cache = SimulationCache(self.folder / "cache.sqlite")
         likelihood = FELikelihood(model, MEASURED, cache=cache, pool=pool, memory_rows=0)
-        likelihood.statistics(points)
+        likelihood.simulator.statistics(points)
         return likelihood
 
 
@@ -80,7 +80,9 @@ def workshop(tmp_path, monkeypatch):
 
 
 def true_values(workshop):
-    return FELikelihood(FunctionModel(workshop.module.f, ("a",), CHANNELS, 0.01, 20), MEASURED).statistics(POINTS)
+    return FELikelihood(FunctionModel(workshop.module.f, ("a",), CHANNELS, 0.01, 20), MEASURED).simulator.statistics(
+        POINTS
+    )
 
 
 HARMLESS = {
@@ -99,11 +101,11 @@ def test_rows_are_adopted_after_a_harmless_edit(workshop, texts, caplog):
     workshop.write(**texts)
     second = workshop.run()
     assert (first.simulations, second.simulations) == (300, 0)
-    assert second.verifications == 59
+    assert second.simulator.verifications == 59
     assert "up to 59 of them are simulated again" in caplog.text
     assert "59 stored simulations of this FunctionModel agree with new ones: all are used" in caplog.text
     third = workshop.run()  # the label is known now
-    assert (third.simulations, third.verifications) == (0, 2)
+    assert (third.simulations, third.simulator.verifications) == (0, 2)
 
 
 def test_an_unchanged_model_has_the_same_label_in_every_process(workshop):
@@ -136,13 +138,13 @@ def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
     workshop.write(**texts)
     second = workshop.run()
     assert "differ from new ones; they stay in the file and are not used" in caplog.text
-    np.testing.assert_array_equal(second.statistics(POINTS), true_values(workshop))
-    assert second.cache.info().simulations == 600
-    assert second.verifications <= 59
+    np.testing.assert_array_equal(second.simulator.statistics(POINTS), true_values(workshop))
+    assert second.simulator.cache.info().simulations == 600
+    assert second.simulator.verifications <= 59
     workshop.write(model=MODEL, helper=HELPER)  # back to the earlier code, whose rows are still there
     third = workshop.run()
-    assert (third.simulations, third.verifications) == (0, 2)
-    np.testing.assert_array_equal(third.statistics(POINTS), first.statistics(POINTS))
+    assert (third.simulations, third.simulator.verifications) == (0, 2)
+    np.testing.assert_array_equal(third.simulator.statistics(POINTS), first.simulator.statistics(POINTS))
 
 
 OPENED = {
@@ -168,14 +170,14 @@ def test_what_a_simulation_opens_belongs_to_the_label(workshop, what, isolated):
     (workshop.folder / name).write_text(before)
     points = POINTS[:20]
     first = workshop.run(points=points, isolated=isolated)
-    assert list(first._label.opened.items()) == [f"opened {name}"]
+    assert list(first.simulator._checked.label.opened.items()) == [f"opened {name}"]
     same = workshop.run(points=points, isolated=isolated)
-    assert (same.simulations, same.verifications) == (0, 2)
+    assert (same.simulations, same.simulator.verifications) == (0, 2)
     (workshop.folder / name).write_text(after)
     sys.modules.pop("late", None)
     label._opened.clear()  # as in a new process
     second = workshop.run(points=points, isolated=isolated)
-    assert second.verifications > 2 or second.simulations > 0
+    assert second.simulator.verifications > 2 or second.simulations > 0
 
 
 def test_workers_of_a_pool_tell_what_they_open(workshop):
@@ -184,10 +186,10 @@ def test_workers_of_a_pool_tell_what_they_open(workshop):
     )
     (workshop.folder / "k.txt").write_text("2.5")
     likelihood = workshop.run(pool=2)
-    likelihood.pool.close()
-    assert list(likelihood._label.opened.items()) == ["opened k.txt"]
+    likelihood.simulator.pool.close()
+    assert list(likelihood.simulator._checked.label.opened.items()) == ["opened k.txt"]
     alone = workshop.run()
-    assert (alone.simulations, alone.verifications) == (0, 2)
+    assert (alone.simulations, alone.simulator.verifications) == (0, 2)
 
 
 def test_variables_of_the_environment_that_the_code_names(workshop, monkeypatch):
@@ -199,7 +201,7 @@ def test_variables_of_the_environment_that_the_code_names(workshop, monkeypatch)
     workshop.run()
     monkeypatch.setenv("GAIN", "3.5")
     second = workshop.run()
-    np.testing.assert_array_equal(second.statistics(POINTS), true_values(workshop))
+    np.testing.assert_array_equal(second.simulator.statistics(POINTS), true_values(workshop))
 
 
 def test_a_program_that_was_compiled_again_is_verified(workshop):
@@ -211,8 +213,8 @@ def test_a_program_that_was_compiled_again_is_verified(workshop):
             ["sh", script], {"in.txt": "$a"}, "out.txt", ("a",), CHANNELS, 0.01, 20, time_limit=60.0
         )
         likelihood = FELikelihood(model, MEASURED, cache=workshop.folder / "cache.sqlite")
-        likelihood.statistics(POINTS[:10])
-        return likelihood.simulations, likelihood.verifications
+        likelihood.simulator.statistics(POINTS[:10])
+        return likelihood.simulations, likelihood.simulator.verifications
 
     assert run("# version 1") == (10, 0)
     assert run("# version 2") == (0, 10)
@@ -222,7 +224,7 @@ def test_a_program_that_was_compiled_again_is_verified(workshop):
 def test_versions_and_dependencies_are_declared(workshop):
     options = [{}, {"version": "2"}, {"depends_on": [3.0]}]
     assert [workshop.run(**each).simulations for each in options] == [300] * 3
-    assert [workshop.run(**each).verifications for each in options] == [2] * 3
+    assert [workshop.run(**each).simulator.verifications for each in options] == [2] * 3
 
 
 def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
@@ -290,18 +292,18 @@ def test_a_value_that_is_set_between_two_batches_is_an_error(workshop, monkeypat
     likelihood = workshop.run(points=POINTS[:10])
     sys.modules["helper"].E = 3.0
     with pytest.raises(ChangedModel, match=r"helper.E, and an earlier simulation gives another result"):
-        likelihood.statistics(POINTS[10:20])
-    assert likelihood.cache.info().simulations == 10
-    again = FELikelihood(likelihood.model, MEASURED, cache=likelihood.cache)
-    again.statistics(POINTS[:10])
-    assert again.cache.info().simulations == 20  # a generation of its own
+        likelihood.simulator.statistics(POINTS[10:20])
+    assert likelihood.simulator.cache.info().simulations == 10
+    again = FELikelihood(likelihood.model, MEASURED, cache=likelihood.simulator.cache)
+    again.simulator.statistics(POINTS[:10])
+    assert again.simulator.cache.info().simulations == 20  # a generation of its own
 
 
 def test_a_value_that_is_set_before_the_first_batch_belongs_to_the_label(workshop):
     likelihood = workshop.run(points=POINTS[:0])
     sys.modules["helper"].E = 3.0
-    likelihood.statistics(POINTS)
-    np.testing.assert_array_equal(workshop.run().statistics(POINTS), true_values(workshop))
+    likelihood.simulator.statistics(POINTS)
+    np.testing.assert_array_equal(workshop.run().simulator.statistics(POINTS), true_values(workshop))
 
 
 COUNTERS = {
@@ -317,11 +319,11 @@ def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
     workshop.write(helper=helper)
     likelihood = workshop.run(points=POINTS[:10])
     for start in range(10, 300, 10):
-        likelihood.statistics(POINTS[start : start + 10])
+        likelihood.simulator.statistics(POINTS[start : start + 10])
         workshop.module.f(POINTS[start] / 3.0)
-    assert (likelihood.simulations, likelihood.cache.info().simulations) == (300, 300)
-    assert likelihood.verifications <= 20
-    assert workshop.run().verifications == 2  # the label is that of the beginning
+    assert (likelihood.simulations, likelihood.simulator.cache.info().simulations) == (300, 300)
+    assert likelihood.simulator.verifications <= 20
+    assert workshop.run().simulator.verifications == 2  # the label is that of the beginning
 
 
 # labels ---------------------------------------------------------------------------------------------------------------
@@ -410,18 +412,18 @@ def earlier_file(path, misfit, version):
 @pytest.mark.parametrize("factor", [1.0, 1.01], ids=["same", "other"])
 def test_rows_of_an_earlier_release_are_adopted_if_they_agree(workshop, version, factor, caplog):
     reference = workshop.run()
-    true = reference.statistics(POINTS)
-    reference.cache.close()
+    true = reference.simulator.statistics(POINTS)
+    reference.simulator.cache.close()
     (workshop.folder / "cache.sqlite").unlink()
     earlier_file(workshop.folder / "cache.sqlite", true * factor, version)
     likelihood = workshop.run()
-    np.testing.assert_array_equal(likelihood.statistics(POINTS), true)
+    np.testing.assert_array_equal(likelihood.simulator.statistics(POINTS), true)
     assert "is of an earlier release: its simulations are kept" in caplog.text
     if factor == 1.0:
-        assert (likelihood.simulations, likelihood.verifications) == (0, 59)
+        assert (likelihood.simulations, likelihood.simulator.verifications) == (0, 59)
         assert "59 simulations of an earlier release agree" in caplog.text
     else:
         assert likelihood.simulations > 290
-    assert likelihood.cache.check_rows() == (likelihood.cache.info().simulations, 0)
+    assert likelihood.simulator.cache.check_rows() == (likelihood.simulator.cache.info().simulations, 0)
     again = workshop.run()
-    assert (again.simulations, again.verifications) == (0, 2)
+    assert (again.simulations, again.simulator.verifications) == (0, 2)

@@ -90,14 +90,14 @@ def test_another_run_simulates_nothing(path, thetas):
     first = likelihood_of(Line(), path)
     expected = likelihood_of(Line()).misfit(thetas)
     np.testing.assert_array_equal(first.misfit(thetas), expected)
-    assert (first.simulations, first.cache_hits, first.disk_hits) == (300, 0, 0)
+    assert (first.simulations, first.simulator.cache_hits, first.simulator.disk_hits) == (300, 0, 0)
     second = likelihood_of(Line(), path)
     np.testing.assert_array_equal(second.misfit(thetas), expected)
-    assert (second.simulations, second.cache_hits, second.disk_hits) == (0, 300, 300)
+    assert (second.simulations, second.simulator.cache_hits, second.simulator.disk_hits) == (0, 300, 300)
     np.testing.assert_array_equal(second.misfit(thetas), expected)
-    assert (second.simulations, second.cache_hits, second.disk_hits) == (0, 600, 300)
-    assert (second.cache.hits, second.cache.misses) == (300, 0)
-    assert second.model.runs == second.verifications == second.cache.info().verified == 2
+    assert (second.simulations, second.simulator.cache_hits, second.simulator.disk_hits) == (0, 600, 300)
+    assert (second.simulator.cache.hits, second.simulator.cache.misses) == (300, 0)
+    assert second.model.runs == second.simulator.verifications == second.simulator.cache.info().verified == 2
 
 
 def test_failures_are_cached_with_their_reasons(path, thetas):
@@ -105,11 +105,11 @@ def test_failures_are_cached_with_their_reasons(path, thetas):
     first.misfit(thetas)
     second.misfit(thetas)
     second.misfit(thetas)
-    assert first.failure_count > 20
-    assert second.model.runs == second.verifications == 2
-    assert second.failures == first.failures
-    assert second.failure_reasons == first.failure_reasons
-    assert second.cache.info().failures == first.failure_count
+    assert first.simulator.failures.count > 20
+    assert second.model.runs == second.simulator.verifications == 2
+    assert second.simulator.failures.records == first.simulator.failures.records
+    assert second.simulator.failures.reasons == first.simulator.failures.reasons
+    assert second.simulator.cache.info().failures == first.simulator.failures.count
 
 
 def test_duplicates_and_zeros_of_both_signs(path):
@@ -117,17 +117,17 @@ def test_duplicates_and_zeros_of_both_signs(path):
     likelihood_of(Line(), path).misfit(rows[[1, 2]])
     likelihood = likelihood_of(Line(), path)
     assert np.isnan(likelihood.misfit(rows)[4]).all()
-    assert (likelihood.simulations, likelihood.cache_hits, likelihood.disk_hits) == (0, 4, 4)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits, likelihood.simulator.disk_hits) == (0, 4, 4)
     likelihood.misfit(rows[:3])
-    assert (likelihood.cache_hits, likelihood.disk_hits) == (7, 4)
-    assert likelihood.cache.info().simulations == 2
+    assert (likelihood.simulator.cache_hits, likelihood.simulator.disk_hits) == (7, 4)
+    assert likelihood.simulator.cache.info().simulations == 2
 
 
 def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
     likelihood = likelihood_of(Line(), path, memory_rows=0)
     for _ in range(3):
         likelihood.misfit(thetas)
-    assert (likelihood.simulations, likelihood.disk_hits) == (300, 600)
+    assert (likelihood.simulations, likelihood.simulator.disk_hits) == (300, 600)
 
 
 def test_a_batch_needs_three_queries_and_one_write(path, thetas):
@@ -135,8 +135,8 @@ def test_a_batch_needs_three_queries_and_one_write(path, thetas):
     for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
         likelihood.misfit(thetas[:1] + shift)
     statements = []
-    likelihood.cache.file.connection().set_trace_callback(statements.append)
-    likelihood.chunk_size = 1000
+    likelihood.simulator.cache.file.connection().set_trace_callback(statements.append)
+    likelihood.simulator.chunk_size = 1000
     likelihood.misfit(thetas)
     kinds = [statement.split()[0] for statement in statements]
     assert kinds.count("SELECT") == 3  # of statistics, and of responses and failures where these are missing
@@ -152,7 +152,7 @@ def test_a_batch_of_several_queries(path, rng):
     likelihood_of(Line(), path).misfit(thetas[::2])
     likelihood = likelihood_of(Line(), path)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Line()).misfit(thetas))
-    assert (likelihood.simulations, likelihood.disk_hits) == (1172, 1173)
+    assert (likelihood.simulations, likelihood.simulator.disk_hits) == (1172, 1173)
 
 
 # what the key depends on ---------------------------------------------------------------------------------------------
@@ -183,10 +183,10 @@ def test_a_change_of_anything_the_misfit_depends_on_needs_a_simulation(path, cha
     oscillator(path).misfit(theta)
     changed = oscillator(path, **change)
     np.testing.assert_array_equal(changed.misfit(theta), oscillator(None, **change).misfit(theta))
-    assert (changed.simulations, changed.disk_hits) == (1, 0)
+    assert (changed.simulations, changed.simulator.disk_hits) == (1, 0)
     again = oscillator(path)
     again.misfit(theta)
-    assert (again.simulations, again.disk_hits) == (0, 1)
+    assert (again.simulations, again.simulator.disk_hits) == (0, 1)
 
 
 @pytest.mark.parametrize("change", [{"substeps": 2}, {"tolerance": 2e-8}, {"mesh": 22}, {"n_elements": 3}], ids=str)
@@ -197,7 +197,7 @@ def test_settings_of_the_integrator_are_part_of_the_key(path, change):
         model = RCColumn.lhpost(record, **settings)
         likelihood = FELikelihood(model, Measurements(model.channels, 0.01, np.zeros((2, 20))), cache=path)
         likelihood.misfit(theta)
-        assert (likelihood.simulations, likelihood.disk_hits) == (1, 0)
+        assert (likelihood.simulations, likelihood.simulator.disk_hits) == (1, 0)
 
 
 def test_other_code_of_the_library_is_verified_and_adopted(path, monkeypatch):
@@ -205,7 +205,7 @@ def test_other_code_of_the_library_is_verified_and_adopted(path, monkeypatch):
     monkeypatch.setattr(label, "sources_digest", lambda *patterns: b"other code")
     same = oscillator(path)
     same.misfit([[1.1, 0.9]])
-    assert (same.simulations, same.disk_hits, same.verifications) == (0, 1, 1)
+    assert (same.simulations, same.simulator.disk_hits, same.simulator.verifications) == (0, 1, 1)
 
 
 def test_noise_prior_and_display_units_change_nothing(path):
@@ -231,7 +231,7 @@ def test_a_model_that_changes_during_the_run_is_an_error(path, monkeypatch):
     likelihood.model.period = 0.7
     with pytest.raises(ValueError, match="changed since the likelihood was made"):
         likelihood.misfit([[1.1, 1.0]])
-    assert likelihood.cache.info().simulations == 1
+    assert likelihood.simulator.cache.info().simulations == 1
 
 
 def test_fingerprint_and_parameters_cannot_be_confused():
@@ -251,12 +251,14 @@ def test_failures_are_run_again_with_retry_failures(path):
     retried = likelihood_of(Line(2.5), SimulationCache(path, retry_failures=True))
     for _ in range(2):
         misfit = retried.misfit(steep)
-    assert (retried.model.runs - retried.verifications, retried.disk_hits) == (2, 1)
+    assert (retried.model.runs - retried.simulator.verifications, retried.simulator.disk_hits) == (2, 1)
     assert np.isfinite(misfit[:2]).all() and np.isnan(misfit[2]).all()
     after = likelihood_of(Line(2.5), path)  # a success replaces a failure
     np.testing.assert_array_equal(after.misfit(steep), misfit)
-    assert (after.simulations, after.failure_count) == (0, 1)
-    after.cache.store(after.fingerprint, np.array([[0.0, 0.5]]), 8, np.full((1, 2), np.nan), ["now it fails"], 0.1)
+    assert (after.simulations, after.simulator.failures.count) == (0, 1)
+    after.simulator.cache.store(
+        after.fingerprint, np.array([[0.0, 0.5]]), 8, np.full((1, 2), np.nan), ["now it fails"], 0.1
+    )
     assert np.isfinite(likelihood_of(Line(2.5), path).misfit(steep[:1])).all()  # a failure does not replace a success
 
 
@@ -281,7 +283,7 @@ def test_the_oldest_are_evicted(path, rng):
     assert (len(likelihood.model.sizes), cache.evictions) == (1, 0)
     likelihood.misfit(thetas[8:14])
     assert (cache.info().simulations, cache.evictions) == (10, 4)
-    known = SimulationCache(path).look_up(likelihood.simulation_key, thetas, 2, 8).known
+    known = SimulationCache(path).look_up(likelihood.simulator.simulation_key, thetas, 2, 8).known
     assert np.flatnonzero(known).tolist() == list(range(4, 14))
     likelihood.misfit(thetas)  # a batch larger than max_rows
     assert (cache.info().simulations, cache.evictions) == (10, 15)
@@ -301,16 +303,16 @@ def test_the_file_does_not_grow_beyond_its_bound(path, rng):
 def test_info_and_clear(path, thetas):
     likelihood = likelihood_of(Line(), path)
     likelihood.misfit(thetas)
-    info = likelihood.cache.info()
+    info = likelihood.simulator.cache.info()
     assert info.path == path
-    assert (info.simulations, info.failures) == (300, likelihood.failure_count)
-    assert info.seconds == pytest.approx(likelihood.seconds)
+    assert (info.simulations, info.failures) == (300, likelihood.simulator.failures.count)
+    assert info.seconds == pytest.approx(likelihood.simulator.seconds)
     assert (info.hits, info.misses, info.evictions, info.damaged, info.responses) == (0, 300, 0, 0, 0)
-    likelihood.cache.close()
+    likelihood.simulator.cache.close()
     full = path.stat().st_size
-    likelihood.cache.clear()
-    likelihood.cache.close()
-    assert likelihood.cache.info().simulations == 0
+    likelihood.simulator.cache.clear()
+    likelihood.simulator.cache.close()
+    assert likelihood.simulator.cache.info().simulations == 0
     assert path.stat().st_size < full
     again = likelihood_of(Line(), path)
     again.misfit(thetas)
@@ -321,15 +323,18 @@ def test_forget_deletes_the_simulations_of_one_model(path, thetas):
     keep, forgotten = oscillator(path), likelihood_of(Line(), SimulationCache(path, responses=True))
     keep.misfit([[1.1, 0.9]])
     forgotten.misfit(thetas)
-    stored = forgotten.cache.info()
+    stored = forgotten.simulator.cache.info()
     last = thetas[np.isfinite(forgotten.misfit(thetas)).all(axis=1)][-1]
     assert latest_stored(forgotten).tolist() == last.tolist()
-    assert forgotten.cache.forget(*forgotten.cache_keys) == stored.simulations - 1 + stored.responses + stored.failures
-    assert (forgotten.cache.info().simulations, forgotten.cache.info().responses) == (1, 0)
+    assert (
+        forgotten.simulator.cache.forget(*forgotten.simulator.cache_keys)
+        == stored.simulations - 1 + stored.responses + stored.failures
+    )
+    assert (forgotten.simulator.cache.info().simulations, forgotten.simulator.cache.info().responses) == (1, 0)
     assert latest_stored(forgotten) is None
     again = oscillator(path)
     again.misfit([[1.1, 0.9]])
-    assert again.disk_hits == 1
+    assert again.simulator.disk_hits == 1
 
 
 def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
@@ -339,14 +344,14 @@ def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
     assert SimulationCache(path).copy(tmp_path / "copy.sqlite") == 301
     other = likelihood_of(Line(), tmp_path / "other.sqlite")
     other.misfit(thetas[:50])
-    assert (other.cache.add(tmp_path / "copy.sqlite"), other.cache.add(path)) == (251, 0)
+    assert (other.simulator.cache.add(tmp_path / "copy.sqlite"), other.simulator.cache.add(path)) == (251, 0)
     again = likelihood_of(Line(), tmp_path / "other.sqlite")
     np.testing.assert_array_equal(again.misfit(thetas), first.misfit(thetas))
-    assert (again.simulations, again.verifications) == (0, 2)
+    assert (again.simulations, again.simulator.verifications) == (0, 2)
     with pytest.raises(ValueError, match="path of a new file"):
-        other.cache.copy(path)
+        other.simulator.cache.copy(path)
     with pytest.raises(ValueError, match="the cache itself"):
-        other.cache.add(tmp_path / "other.sqlite")
+        other.simulator.cache.add(tmp_path / "other.sqlite")
 
 
 @pytest.mark.parametrize("name", ["max_rows", "max_response_bytes"])
@@ -361,7 +366,7 @@ def test_invalid_bounds(path, name, value):
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
     for model in (Line(), Batched()):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
         np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
@@ -370,7 +375,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -384,7 +389,7 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypat
         likelihood.misfit(thetas)
     again = likelihood_of(Line(), path)
     again.misfit(thetas)
-    assert (likelihood.simulations, again.disk_hits, again.simulations) == (7, 7, 13)
+    assert (likelihood.simulations, again.simulator.disk_hits, again.simulations) == (7, 7, 13)
 
 
 class Pool:
@@ -405,7 +410,7 @@ class Pool:
     ids=str,
 )
 def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
     pool = Pool(**attributes)
     likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
     assert pool.sizes == sizes
@@ -426,7 +431,7 @@ def test_chunks_grow_step_by_step_with_the_speed(path, rng):
 
 
 def _simulate_some(likelihood, thetas, results):
-    results.put((likelihood.misfit(thetas), likelihood.simulations, likelihood.disk_hits))
+    results.put((likelihood.misfit(thetas), likelihood.simulations, likelihood.simulator.disk_hits))
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
@@ -447,7 +452,7 @@ def test_other_processes_share_the_file(path, thetas, method):
     assert (simulations, disk_hits) == (300, 0 if method == "fork" else 200)
     likelihood.misfit(thetas)  # the rows of the other process
     assert likelihood.simulations == 200
-    assert likelihood.disk_hits == 100
+    assert likelihood.simulator.disk_hits == 100
 
 
 def test_a_connection_does_not_go_through_a_fork(path, thetas):
@@ -455,13 +460,13 @@ def test_a_connection_does_not_go_through_a_fork(path, thetas):
         pytest.skip("NO fork ON THIS SYSTEM")
     likelihood = likelihood_of(Line(), path)
     likelihood.misfit(thetas)
-    assert likelihood.cache.file._connection is not None
+    assert likelihood.simulator.cache.file._connection is not None
     context = multiprocessing.get_context("fork")
-    process = context.Process(target=lambda: sys.exit(17 if likelihood.cache.file._connection is None else 1))
+    process = context.Process(target=lambda: sys.exit(17 if likelihood.simulator.cache.file._connection is None else 1))
     process.start()
     process.join(60)
     assert process.exitcode == 17
-    assert likelihood.cache.info().simulations == 300
+    assert likelihood.simulator.cache.info().simulations == 300
 
 
 def test_forks_while_threads_write(path, rng):
@@ -504,7 +509,7 @@ def test_threads_share_a_cache(path, rng):
         results = pool.map(lambda rows: likelihood.misfit(thetas[rows]), batches)
     for rows, misfit in zip(batches, results, strict=True):
         np.testing.assert_array_equal(misfit, expected[rows])
-    assert likelihood.cache.info().simulations == 60
+    assert likelihood.simulator.cache.info().simulations == 60
 
 
 def test_pickles_by_path(tmp_path, monkeypatch, thetas):
@@ -517,11 +522,15 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     copy = pickle.loads(data)
-    assert copy.cache.path == tmp_path / "relative.sqlite"
-    assert (copy.cache.max_rows, copy.cache.retry_failures, copy.cache.misses) == (1000, True, 0)
+    assert copy.simulator.cache.path == tmp_path / "relative.sqlite"
+    assert (copy.simulator.cache.max_rows, copy.simulator.cache.retry_failures, copy.simulator.cache.misses) == (
+        1000,
+        True,
+        0,
+    )
     copy.misfit(thetas)
-    runs = copy.model.runs - likelihood.model.runs - copy.verifications
-    assert runs == likelihood.failure_count > 0
+    runs = copy.model.runs - likelihood.model.runs - copy.simulator.verifications
+    assert runs == likelihood.simulator.failures.count > 0
 
 
 def test_the_key_is_the_same_in_another_process():
@@ -583,26 +592,26 @@ def test_responses_in_single_precision_are_replaced(path, rng):
     thetas = rng.uniform(0.1, 0.9, size=(6, 2))
     first = likelihood_of(Line(), SimulationCache(path, responses=True))
     expected = first.misfit(thetas)
-    connection = first.cache.file.connection()
+    connection = first.simulator.cache.file.connection()
     for key, data in connection.execute("SELECT key, response FROM responses").fetchall()[:4]:
         single = np.frombuffer(data).astype("<f4").tobytes()
         change = "UPDATE responses SET response = ?, size = ?, crc = ? WHERE key = ?"
         connection.execute(change, (single, len(single), zlib.crc32(key + single), key))
-    first.cache.close()
+    first.simulator.cache.close()
     second = likelihood_of(Line(), path)
     np.testing.assert_array_equal(second.misfit(thetas), expected)
     assert second.simulations == 0
     np.testing.assert_array_equal(second.simulate(thetas).response, simulate_batch(Line(), thetas).response)
-    assert (second.simulations, second.cache.damaged) == (4, 0)
+    assert (second.simulations, second.simulator.cache.damaged) == (4, 0)
     third = likelihood_of(Line(), path)
     third.simulate(thetas)
-    assert (third.simulations, third.cache.info().responses) == (0, 6)
+    assert (third.simulations, third.simulator.cache.info().responses) == (0, 6)
 
 
 def test_a_response_whose_misfit_overflows_is_a_failure(path):
     likelihood = likelihood_of(Line(), SimulationCache(path, responses=True))
     assert np.isnan(likelihood.misfit([[1e200, 0.0]])).all()
-    assert likelihood.failures[0]["reason"] == "the misfit of channel 'a' is not finite"
+    assert likelihood.simulator.failures.records[0]["reason"] == "the misfit of channel 'a' is not finite"
 
 
 # the ready-made posterior ---------------------------------------------------------------------------------------------

@@ -58,14 +58,14 @@ def test_a_change_of_the_noise_needs_no_simulation(rng):
     likelihood = likelihood_of(model)
     x = points(rng, 20)
     likelihood.log_likelihood(x)
-    assert (likelihood.simulations, likelihood.cache_hits) == (20, 0)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (20, 0)
     x[:, 2:] *= rng.uniform(0.5, 2.0, size=(20, 2))
     again = likelihood.log_likelihood(x)
-    assert (likelihood.simulations, likelihood.cache_hits, len(model.runs)) == (20, 20, 20)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits, len(model.runs)) == (20, 20, 20)
     np.testing.assert_array_equal(again, likelihood_of(Line(), memory_rows=0).log_likelihood(x))
     x[3, 0] = np.nextafter(x[3, 0], 9.0)
     likelihood.log_likelihood(x)
-    assert (likelihood.simulations, likelihood.cache_hits) == (21, 39)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (21, 39)
 
 
 def test_hits_are_rows_from_memory_only():
@@ -73,9 +73,9 @@ def test_hits_are_rows_from_memory_only():
     likelihood = likelihood_of(model)
     thetas = np.array([[0.0, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5]])
     likelihood.misfit(thetas)  # duplicates of the same batch
-    assert (likelihood.simulations, likelihood.cache_hits) == (2, 0)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (2, 0)
     first = likelihood.misfit(np.vstack([thetas, [[2.0, 0.5], [2.0, 0.5], [np.nan, 0.5]]]))
-    assert (likelihood.simulations, likelihood.cache_hits) == (3, 4)
+    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (3, 4)
     np.testing.assert_array_equal(first[:4], likelihood_of(Line()).misfit(thetas))
     np.testing.assert_array_equal(first[4], first[5])
     assert np.isnan(first[6]).all()
@@ -89,9 +89,9 @@ def test_failures_are_cached_and_recorded_once():
     for _ in range(3):
         assert np.isnan(likelihood.misfit([[0.0, 2.0], [0.0, 2.0]])).all()
     assert model.runs == [(0.0, 2.0)]
-    assert likelihood.failure_count == len(likelihood.failures) == 1
-    assert likelihood.failure_reasons == {"too steep": 1}
-    assert likelihood.cache_hits == 4
+    assert likelihood.simulator.failures.count == len(likelihood.simulator.failures.records) == 1
+    assert likelihood.simulator.failures.reasons == {"too steep": 1}
+    assert likelihood.simulator.cache_hits == 4
 
 
 def test_the_cache_is_bounded(rng):
@@ -106,7 +106,7 @@ def test_the_cache_is_bounded(rng):
     assert likelihood.simulations == 24
     likelihood.misfit(thetas[[5, 6]])
     assert likelihood.simulations == 25
-    assert len(likelihood.memory_cache) == 10
+    assert len(likelihood.simulator.memory_cache) == 10
 
 
 def test_without_a_cache():
@@ -115,7 +115,7 @@ def test_without_a_cache():
     for _ in range(2):
         likelihood.misfit([[0.0, 0.5], [0.0, 0.5]])
     assert len(model.runs) == likelihood.simulations == 2
-    assert likelihood.cache_hits == 0
+    assert likelihood.simulator.cache_hits == 0
 
 
 @pytest.mark.parametrize("rows", [-1, 2.5, None, True])
@@ -132,8 +132,8 @@ def test_the_cache_is_not_pickled(rng):
     likelihood.model.runs = []
     assert len(pickle.dumps(likelihood)) <= small + 300
     copy = pickle.loads(pickle.dumps(likelihood))
-    assert len(copy.memory_cache) == 0
-    assert copy.memory_cache.rows == 500
+    assert len(copy.simulator.memory_cache) == 0
+    assert copy.simulator.memory_cache.rows == 500
     np.testing.assert_array_equal(copy.log_likelihood(x), values)
     assert len(copy.model.runs) == 200
 
@@ -148,7 +148,7 @@ def test_threads_share_a_cache(rng):
             batches, pool.map(lambda rows: likelihood.log_likelihood(x[rows]), batches), strict=True
         ):
             np.testing.assert_array_equal(values, expected[rows])
-    assert len(likelihood.memory_cache) == 50
+    assert len(likelihood.simulator.memory_cache) == 50
 
 
 def test_the_least_recently_used_row_is_evicted():

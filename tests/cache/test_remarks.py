@@ -41,7 +41,7 @@ def test_warning_of_another_process_is_repeated_once(drift, expected, path, capl
     for _ in range(2):
         again = likelihood(path, drift)
         again.misfit(THETAS[:1])
-        assert (again.simulations, again.disk_hits) == (0, 1)
+        assert (again.simulations, again.simulator.disk_hits) == (0, 1)
     assert len(caplog.records) == expected
     if expected:
         assert f"simulations of this model in {path}: a bar strain of" in caplog.text
@@ -51,23 +51,23 @@ def test_warning_of_another_process_is_repeated_once(drift, expected, path, capl
 def test_a_model_that_has_warned_does_not_repeat_itself(path, caplog):
     first = likelihood(path)
     first.misfit(THETAS)
-    first.memory_cache.clear()
+    first.simulator.memory_cache.clear()
     first.misfit(THETAS)
-    assert first.disk_hits == 2 and len(caplog.records) == 1
+    assert first.simulator.disk_hits == 2 and len(caplog.records) == 1
 
 
 def test_a_model_that_expects_fracture_has_no_remark(path, caplog):
     pushed = likelihood(path)
     expect_fracture(pushed.model)
     pushed.misfit(THETAS)
-    assert pushed.cache.look_up_remark(pushed.model) == "" and not caplog.records
+    assert pushed.simulator.cache.look_up_remark(pushed.model) == "" and not caplog.records
 
 
 def test_forgotten_with_the_rows_of_the_model(path):
     first, other = likelihood(path), likelihood(path, 0.19)
     first.misfit(THETAS)
     other.misfit(THETAS)
-    assert first.cache.forget(*first.cache_keys) == 3  # two rows and the remark
-    assert first.cache.look_up_remark(first.model) == "" != other.cache.look_up_remark(other.model)
-    first.cache.clear()
-    assert other.cache.look_up_remark(other.model) == ""
+    assert first.simulator.cache.forget(*first.simulator.cache_keys) == 3  # two rows and the remark
+    assert first.simulator.cache.look_up_remark(first.model) == "" != other.simulator.cache.look_up_remark(other.model)
+    first.simulator.cache.clear()
+    assert other.simulator.cache.look_up_remark(other.model) == ""

@@ -95,10 +95,19 @@ def test_a_change_that_no_fingerprint_contains_is_an_error_that_says_what_to_do(
     row = next(theta for theta in thetas if f"offset = {theta[0]:.17g}, slope = {theta[1]:.17g}" in str(caught.value))
     old, new = (likelihood_of(Scaled(factor), None).misfit(row)[0, 0] for factor in (1.0, 1.01))
     assert f"channel 'a', sum of squared residuals: stored {old:.17g}, simulated again {new:.17g}" in str(caught.value)
-    assert "forget(*likelihood.cache_keys), or give the model a new version= (or depends_on=)" in str(caught.value)
-    assert (likelihood.simulations, likelihood.cache_hits, len(likelihood.memory_cache)) == (0, 0, 0)
-    assert (likelihood.verifications, likelihood.model.runs) == (2, 3)  # the row that differs is simulated twice
-    likelihood.cache.forget(*likelihood.cache_keys)
+    assert "forget(*likelihood.simulator.cache_keys), or give the model a new version= (or depends_on=)" in str(
+        caught.value
+    )
+    assert (likelihood.simulations, likelihood.simulator.cache_hits, len(likelihood.simulator.memory_cache)) == (
+        0,
+        0,
+        0,
+    )
+    assert (likelihood.simulator.verifications, likelihood.model.runs) == (
+        2,
+        3,
+    )  # the row that differs is simulated twice
+    likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys)
     np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(Scaled(1.01), None).misfit(thetas))
 
 
@@ -106,11 +115,16 @@ def test_the_same_model_is_verified_once(filled, thetas):
     likelihood = likelihood_of(Scaled(), filled)
     expected = likelihood_of(Scaled(), None).misfit(thetas)
     np.testing.assert_array_equal(likelihood.misfit(thetas[:1]), expected[:1])
-    assert likelihood.verifications == 2  # the requested row, and the one that was stored last
+    assert likelihood.simulator.verifications == 2  # the requested row, and the one that was stored last
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert likelihood.verifications == likelihood.cache.verified == likelihood.cache.info().verified == 2
-    assert (likelihood.simulations, likelihood.model.runs, likelihood.disk_hits) == (0, 2, 50)
-    assert likelihood.seconds > 0.0
+    assert (
+        likelihood.simulator.verifications
+        == likelihood.simulator.cache.verified
+        == likelihood.simulator.cache.info().verified
+        == 2
+    )
+    assert (likelihood.simulations, likelihood.model.runs, likelihood.simulator.disk_hits) == (0, 2, 50)
+    assert likelihood.simulator.seconds > 0.0
 
 
 def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(filled, thetas):
@@ -124,14 +138,14 @@ def test_the_row_that_was_stored_last_is_verified_even_if_it_is_not_requested(fi
 def test_a_difference_remains_an_error_for_all_rows(filled, thetas):
     """Also for those that are right: a client that tries each point alone must not go on with half of them."""
     other = likelihood_of(Scaled(2.0), SimulationCache(filled, verify=False))
-    other.cache.discard(thetas[-1:], *other.cache_keys)
+    other.simulator.cache.discard(thetas[-1:], *other.simulator.cache_keys)
     other.misfit(thetas[-1:])
     likelihood = likelihood_of(Scaled(), filled)
     runs = []
     for theta in thetas:
         with pytest.raises(StaleCache):
             likelihood.misfit(theta)
-        runs.append(likelihood.verifications)
+        runs.append(likelihood.simulator.verifications)
     assert set(runs) == {2}
     copy = pickle.loads(pickle.dumps(likelihood))
     with pytest.raises(StaleCache):
@@ -163,7 +177,7 @@ def test_samplers_stop(error, vectorize):
 def test_verification_can_be_turned_off(filled, thetas):
     likelihood = likelihood_of(Scaled(1.01), SimulationCache(filled, verify=False))
     likelihood.misfit(thetas)
-    assert (likelihood.verifications, likelihood.disk_hits, likelihood.model.runs) == (0, 50, 0)
+    assert (likelihood.simulator.verifications, likelihood.simulator.disk_hits, likelihood.model.runs) == (0, 50, 0)
 
 
 def test_a_stored_failure_that_succeeds_now_is_a_difference(path, thetas):
@@ -172,7 +186,7 @@ def test_a_stored_failure_that_succeeds_now_is_a_difference(path, thetas):
         likelihood_of(Scaled(), path).misfit(thetas)
     retried = likelihood_of(Scaled(), SimulationCache(path, retry_failures=True))
     assert np.isfinite(retried.misfit(thetas)).all()
-    assert (retried.verifications, retried.simulations) == (0, 50)
+    assert (retried.simulator.verifications, retried.simulations) == (0, 50)
 
 
 def test_a_stored_success_that_fails_now_is_a_difference(filled, thetas):
@@ -190,7 +204,7 @@ def test_failures_that_fail_again_verify_no_successful_row(path, thetas):
             likelihood_of(Scaled(1.01, limit=0.3), path).misfit(first)
     own = likelihood_of(Scaled(limit=0.3), path)
     own.misfit(thetas[failed])
-    assert own.verifications == 2
+    assert own.simulator.verifications == 2
 
 
 def test_failures_alone_leave_the_first_verification_to_successful_rows(path, thetas):
@@ -225,7 +239,7 @@ def test_stored_responses_are_verified(path, thetas):
     likelihood_of(Scaled(), path).simulate(thetas)
     same = likelihood_of(Scaled(), path, noise=AutoregressiveNoise(CHANNELS))
     same.misfit(thetas)
-    assert (same.simulations, same.verifications) == (0, 2)
+    assert (same.simulations, same.simulator.verifications) == (0, 2)
     with pytest.raises(StaleCache, match="sum of squared residuals"):
         likelihood_of(Scaled(1.01), path, noise=AutoregressiveNoise(CHANNELS)).simulate(thetas)
 
@@ -273,10 +287,10 @@ def test_compiled_models_are_compared_to_the_last_bit(path):
     assert response_tolerance(Scaled()) == 1e-9
     assert response_tolerance(type("Own", (LinearOscillator,), {})(model.record)) == 1e-9
     misfit = np.nextafter(likelihood.misfit([[1.1, 0.9]]), np.inf)
-    likelihood.cache.clear()
-    (stored,) = labels.labels_of(likelihood.cache.file, model)
+    likelihood.simulator.cache.clear()
+    (stored,) = labels.labels_of(likelihood.simulator.cache.file, model)
     place = stored.generation, stored.id
-    likelihood.cache.store(likelihood.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0, *place)
+    likelihood.simulator.cache.store(likelihood.simulator.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0, *place)
     labels._shared.clear()  # as in a new process
     with pytest.raises(StaleCache, match="channel 'displacement'"):
         oscillator(path).misfit([[1.1, 0.9]])
@@ -319,7 +333,7 @@ def test_one_of_every_thousand_rows_is_verified(path, rng):
     likelihood = likelihood_of(Scaled(), path, memory_rows=0)
     for start in range(0, 3500, 100):
         likelihood.misfit(thetas[start : start + 100])
-    assert likelihood.verifications == 2 + 3
+    assert likelihood.simulator.verifications == 2 + 3
     likelihood.model.factor = 2.0
     with pytest.raises(StaleCache, match="discard this run, which has used 3[0-9]00 rows"):
         for start in range(0, 1000, 100):
@@ -330,8 +344,8 @@ def test_verified_again_after_a_change(filled, thetas):
     likelihood = likelihood_of(Scaled(), filled, memory_rows=0)
     for _ in range(2):
         likelihood.misfit(thetas)
-    assert likelihood.verifications == 2
-    likelihood.model = Scaled(2.0)
+    assert likelihood.simulator.verifications == 2
+    likelihood.simulator.model = Scaled(2.0)
     with pytest.raises(StaleCache):
         likelihood.misfit(thetas)
 
@@ -340,9 +354,13 @@ def test_a_simulation_that_is_stopped_is_not_a_difference(filled, thetas, caplog
     """Another row is verified in its place; the first of them is the one that was stored last."""
     likelihood = likelihood_of(Scaled(fault=thetas[-1:, 0]), filled)
     likelihood.misfit(thetas)
-    assert (likelihood.verifications, likelihood.unverified, likelihood.cache.verified) == (2, 1, 2)
+    assert (
+        likelihood.simulator.verifications,
+        likelihood.simulator.unverified,
+        likelihood.simulator.cache.verified,
+    ) == (2, 1, 2)
     assert "1 of 3 stored simulations could not be verified" in caplog.text
-    assert likelihood.failure_count == 0
+    assert likelihood.simulator.failures.count == 0
 
 
 @pytest.mark.parametrize("after", ["seconds", "rows"])
@@ -365,9 +383,9 @@ def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
     for _ in range(5):
         likelihood.misfit(thetas)
     # three times four, and no more for a while after the first ones, which would complete the label
-    assert likelihood.verifications == 0
-    assert 3 * verification.MAX_ATTEMPTS <= likelihood.unverified <= 4 * verification.MAX_ATTEMPTS
-    assert likelihood.cache.verified == 0
+    assert likelihood.simulator.verifications == 0
+    assert 3 * verification.MAX_ATTEMPTS <= likelihood.simulator.unverified <= 4 * verification.MAX_ATTEMPTS
+    assert likelihood.simulator.cache.verified == 0
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert sum("used without verification" in text for text in warnings) == 3
 
@@ -379,12 +397,12 @@ def test_rows_that_the_same_likelihood_has_stored_are_not_verified(path, thetas)
     likelihood.misfit(thetas)
     derived = likelihood.with_noise(AutoregressiveNoise(CHANNELS))
     derived.misfit(thetas[:20])
-    assert (likelihood.verifications, derived.verifications) == (0, 0)
-    assert likelihood.disk_hits == 50
+    assert (likelihood.simulator.verifications, derived.simulator.verifications) == (0, 0)
+    assert likelihood.simulator.disk_hits == 50
     other = likelihood_of(Scaled(), path, memory_rows=0)
     other.misfit(thetas)
     other.with_noise(likelihood.noise).misfit(thetas)
-    assert (other.verifications, other.simulations) == (2, 0)
+    assert (other.simulator.verifications, other.simulations) == (2, 0)
 
 
 @pytest.mark.parametrize("of_library", [True, False])
@@ -394,7 +412,7 @@ def test_a_process_verifies_a_model_of_the_library_once(path, of_library):
     def misfit():
         likelihood = oscillator(path) if of_library else likelihood_of(Scaled(), path)
         likelihood.misfit([[1.0, 0.9], [1.1, 0.9], [1.2, 0.9]])
-        return likelihood.verifications
+        return likelihood.simulator.verifications
 
     misfit()
     labels._shared.clear()  # as in a new process
@@ -405,7 +423,7 @@ def test_a_file_that_replaces_another_one_is_verified(path):
     def misfit():
         likelihood = oscillator(path)
         likelihood.misfit([[1.0, 0.9], [1.1, 0.9], [1.2, 0.9]])
-        return likelihood.simulations, likelihood.verifications
+        return likelihood.simulations, likelihood.simulator.verifications
 
     assert [misfit(), misfit()] == [(3, 0), (0, 0)]
     other = path.with_name("other.sqlite")
@@ -426,17 +444,17 @@ def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, 
     for copy in copies:
         copy.misfit(thetas)
         copy.misfit(thetas)
-    assert [copy.verifications for copy in copies] == [2, 0, 0]
+    assert [copy.simulator.verifications for copy in copies] == [2, 0, 0]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
 def test_a_fork_while_another_thread_verifies_does_not_block(filled, thetas):
     likelihood = likelihood_of(Scaled(), filled)
-    with likelihood._verified_cache._trust.lock:
+    with likelihood.simulator._checked.rows._trust.lock:
         child = os.fork()
         if not child:
             likelihood.misfit(thetas)
-            os._exit(likelihood.verifications)
+            os._exit(likelihood.simulator.verifications)
         for _ in range(200):
             done, status = os.waitpid(child, os.WNOHANG)
             if done:
@@ -453,7 +471,7 @@ def test_twenty_likelihoods_of_one_model_are_verified_once(filled, thetas):
     likelihoods = [likelihood_of(model, filled) for _ in range(20)]
     for likelihood in likelihoods:
         likelihood.misfit(thetas)
-    assert model.runs == sum(likelihood.verifications for likelihood in likelihoods) == 2
+    assert model.runs == sum(likelihood.simulator.verifications for likelihood in likelihoods) == 2
     for likelihood in (likelihood_of(model, filled, noise=AutoregressiveNoise(CHANNELS)) for _ in range(20)):
         likelihood.misfit(thetas)
         likelihoods.append(likelihood)
@@ -461,7 +479,7 @@ def test_twenty_likelihoods_of_one_model_are_verified_once(filled, thetas):
     assert (model.runs, likelihoods[20].simulations) == (2 + 10, 10)
     for copy in pickle.loads(pickle.dumps(likelihoods)):
         copy.misfit(thetas)
-        assert copy.verifications == 0
+        assert copy.simulator.verifications == 0
     with pytest.raises(StaleCache):
         likelihood_of(Scaled(2.0), filled).misfit(thetas)
 
@@ -481,4 +499,4 @@ def test_another_state_of_the_model_is_verified_again(filled, thetas, what, tmp_
         options = {"tolerance": 1e-12}
     second = likelihood_of(model, SimulationCache(path, **options))
     second.misfit(thetas)
-    assert second.verifications == expected
+    assert second.simulator.verifications == expected

@@ -411,7 +411,7 @@ def test_killed_server_is_waited_for_and_nothing_is_lost(tmp_path, caplog):
         with Process("held line", first.port, tmp_path):
             misfit = run.result()
     np.testing.assert_array_equal(misfit, FELikelihood(line_model(), DATA).misfit(THETAS))
-    assert (likelihood.failure_count, likelihood.simulations) == (0, len(THETAS))
+    assert (likelihood.simulator.failures.count, likelihood.simulations) == (0, len(THETAS))
     assert "The request is repeated" in caplog.text and "answers again" in caplog.text
 
 
@@ -425,7 +425,7 @@ def test_one_of_two_servers_dies_for_good(tmp_path):
         dying.kill()
         misfit = run.result()
     np.testing.assert_array_equal(misfit, FELikelihood(line_model(), DATA).misfit(THETAS))
-    assert likelihood.failure_count == 0
+    assert likelihood.simulator.failures.count == 0
 
 
 def test_server_that_dies_for_good_is_counted_and_not_stored(tmp_path):
@@ -440,14 +440,16 @@ def test_server_that_dies_for_good_is_counted_and_not_stored(tmp_path):
         values = run.result()
     lost = np.isneginf(values)
     assert 0 < lost.sum() < 24
-    assert likelihood.failure_count == likelihood.transient_failure_count == lost.sum()
-    assert {failure["parameters"]["offset"] for failure in likelihood.failures} == set(THETAS[lost, 0])
-    assert all("(2 attempts)" in reason for reason in likelihood.failure_reasons)
+    assert likelihood.simulator.failures.count == likelihood.simulator.failures.transient == lost.sum()
+    assert {failure["parameters"]["offset"] for failure in likelihood.simulator.failures.records} == set(
+        THETAS[lost, 0]
+    )
+    assert all("(2 attempts)" in reason for reason in likelihood.simulator.failures.reasons)
 
     with Process("line") as again:  # at another port: the stored simulations are those of the same model
         later = FELikelihood(remote_line(again.url), DATA, cache=SimulationCache(cache))
         misfit = later.misfit(THETAS)
-        assert later.simulations == lost.sum() and later.disk_hits == 24 - lost.sum()
+        assert later.simulations == lost.sum() and later.simulator.disk_hits == 24 - lost.sum()
     np.testing.assert_array_equal(misfit, FELikelihood(line_model(), DATA).misfit(THETAS))
 
 

@@ -25,7 +25,9 @@ def finished(path, order=0, workers=WORKERS, **settings):
     """A run on two modes, with searches on parts of the record; `order` is the seed of the run lengths."""
     posterior, lengths = symmetric(), np.random.default_rng(order)
     likelihood = posterior.likelihood
-    likelihood.pool = pool = SimulatedPool(workers, lambda theta: lengths.exponential(), likelihood.model.n_steps)
+    likelihood.simulator.pool = pool = SimulatedPool(
+        workers, lambda theta: lengths.exponential(), likelihood.model.n_steps
+    )
     settings = {"seed": 5, "guide": posterior.guide(4), "asynchronous": True, **settings}
     backend = emcee.backends.HDFBackend(str(path))
     sampler = SMCSampler(N, 2, posterior, vectorize=True, backend=backend, **settings)
@@ -107,7 +109,9 @@ def test_pools(kind):
         map = staticmethod(map)
 
     with ThreadPoolExecutor(3) as threads:
-        posterior.likelihood.pool = as_executor({"threads": threads, "map only": MapOnly(), "none": None}[kind])
+        posterior.likelihood.simulator.pool = as_executor(
+            {"threads": threads, "map only": MapOnly(), "none": None}[kind]
+        )
         sampler = SMCSampler(
             N, 2, posterior, vectorize=True, seed=5, guide=posterior.guide(4), asynchronous=True, max_simulations=1000
         )
@@ -127,7 +131,7 @@ def test_what_cannot_be_asynchronous_is_refused():
     with pytest.raises(TypeError, match="asynchronous"), ThreadPoolExecutor(1) as pool:
         TMCMCSampler(N, 2, posterior, pool=pool, guide=guide, asynchronous=True)
     emulated = symmetric()
-    emulated.likelihood.response_memory.max_bytes = 1000
+    emulated.likelihood.simulator.response_memory.max_bytes = 1000
     sampler = SMCSampler(N, 2, emulated, vectorize=True, guide=emulated.guide(), asynchronous=True)
     with pytest.raises(ValueError, match="memory_bytes of 128000 or more"):
         sampler.run_mcmc(None, 0)

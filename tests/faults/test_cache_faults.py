@@ -61,7 +61,7 @@ def filled(path, thetas):
     """A cache of all points, closed."""
     likelihood = likelihood_of(path)
     likelihood.misfit(thetas)
-    likelihood.cache.close()
+    likelihood.simulator.cache.close()
     return path
 
 
@@ -176,7 +176,7 @@ def test_a_killed_writer_does_not_block_others(path):
 def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     whole, reference = cached_run.make(tmp_path / "whole.sqlite")
     whole.run_mcmc(None, cached_run.STEPS)
-    distinct = reference.likelihood.cache.info().simulations
+    distinct = reference.likelihood.simulator.cache.info().simulations
     assert reference.likelihood.model.runs == distinct > 300
 
     command = [sys.executable, "-m", "tests.faults.cached_run", str(path), "0.001"]
@@ -199,7 +199,7 @@ def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     again, replayed = cached_run.make(path)
     again.run_mcmc(None, cached_run.STEPS)
     most = 3 + again.evaluations // 1000  # two before the first row, and one of every thousand rows
-    assert replayed.likelihood.model.runs == replayed.likelihood.verifications <= most
+    assert replayed.likelihood.model.runs == replayed.likelihood.simulator.verifications <= most
     for other in (sampler, again):
         np.testing.assert_array_equal(other.get_chain(), whole.get_chain())
         np.testing.assert_array_equal(other.get_log_prob(), whole.get_log_prob())
@@ -239,7 +239,7 @@ def test_two_programs_on_one_cache(path, thetas, expected):
     third = likelihood_of(path)
     np.testing.assert_array_equal(third.misfit(thetas), expected)
     assert third.simulations == 0
-    assert third.cache.info().simulations == len(thetas)
+    assert third.simulator.cache.info().simulations == len(thetas)
 
 
 def test_another_program_that_holds_a_lock_on_the_file(path, thetas, expected, caplog, monkeypatch):
@@ -311,10 +311,10 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
     assert warnings_of(caplog, f"set aside as {aside.name}") == 1
     assert warnings_of(caplog, "simulations were salvaged") == 1
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert likelihood.simulations + likelihood.disk_hits == len(thetas)
+    assert likelihood.simulations + likelihood.simulator.disk_hits == len(thetas)
     again = likelihood_of(filled)
     again.misfit(thetas)
-    assert (again.simulations, again.disk_hits) == (0, len(thetas))
+    assert (again.simulations, again.simulator.disk_hits) == (0, len(thetas))
 
 
 @pytest.mark.parametrize("page", ["leaf", "index"])
@@ -330,7 +330,7 @@ def test_a_bad_page_loses_its_own_rows_only(filled, thetas, expected, caplog, pa
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     (message,) = (r.getMessage() for r in caplog.records if "simulations were salvaged" in r.getMessage())
     kept, lost = (int(word) for word in message.split() if word.isdigit())
-    assert kept == likelihood.disk_hits and kept + lost == len(thetas)
+    assert kept == likelihood.simulator.disk_hits and kept + lost == len(thetas)
     assert lost == 0 if page == "index" else 0 < lost < len(thetas)
 
 
@@ -342,7 +342,7 @@ def test_a_file_that_was_cut_off_keeps_its_first_rows(filled, thetas, expected, 
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     (message,) = (r.getMessage() for r in caplog.records if "simulations were salvaged" in r.getMessage())
     (kept,) = (int(word) for word in message.split() if word.isdigit())
-    assert 0 < kept == likelihood.disk_hits < len(thetas)
+    assert 0 < kept == likelihood.simulator.disk_hits < len(thetas)
     assert message.endswith("an unknown number were lost")
 
 
@@ -350,20 +350,20 @@ def test_a_file_that_was_cut_off_keeps_its_first_rows(filled, thetas, expected, 
 def test_a_file_that_is_damaged_during_the_run(filled, thetas, expected, caplog, damage):
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas[:50]), expected[:50])
-    likelihood.cache.close()  # as it happens before a fork
+    likelihood.simulator.cache.close()  # as it happens before a fork
     damage(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     assert warnings_of(caplog, "set aside as") == 1
     again = likelihood_of(filled)
     np.testing.assert_array_equal(again.misfit(thetas), expected)
-    assert again.disk_hits + likelihood.disk_hits >= len(thetas)
+    assert again.simulator.disk_hits + likelihood.simulator.disk_hits >= len(thetas)
 
 
 def test_another_file_that_takes_the_place_of_the_cache_during_the_run(filled, thetas, expected, caplog, tmp_path):
     """It is not changed, and the run continues without a cache."""
     likelihood = likelihood_of(filled, memory_rows=0)
     likelihood.misfit(thetas[:50])
-    likelihood.cache.close()
+    likelihood.simulator.cache.close()
     table_of_the_user(tmp_path / "floors.csv")
     data = (tmp_path / "floors.csv").read_bytes()
     (tmp_path / "floors.csv").replace(filled)
@@ -384,7 +384,7 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
         path.write_bytes(data)
         likelihood = likelihood_of(path)
         if attempt % 2:
-            likelihood.cache.close()
+            likelihood.simulator.cache.close()
         damaged = bytearray(data)
         place = int(rng.integers(100, len(data)))  # the first 100 bytes identify the file
         if how == "bytes":
@@ -398,7 +398,7 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
             file.write(damaged)
             file.truncate()
         np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-        served += likelihood.disk_hits
+        served += likelihood.simulator.disk_hits
         again = likelihood_of(path)
         np.testing.assert_array_equal(again.misfit(thetas), expected)
     assert how != "bytes" or served > 0
@@ -428,11 +428,11 @@ def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):
     connection.close()
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert (likelihood.simulations, likelihood.cache.damaged) == (1, 1)
+    assert (likelihood.simulations, likelihood.simulator.cache.damaged) == (1, 1)
     assert warnings_of(caplog, "damaged rows") == 1
     again = likelihood_of(filled)
     np.testing.assert_array_equal(again.misfit(thetas), expected)
-    assert (again.simulations, again.cache.damaged) == (0, 0)
+    assert (again.simulations, again.simulator.cache.damaged) == (0, 0)
     assert not list(filled.parent.glob("*.damaged-*"))
 
 
@@ -444,16 +444,16 @@ def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
     connection.close()
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert (likelihood.simulations, likelihood.cache.damaged) == (2, 2)
+    assert (likelihood.simulations, likelihood.simulator.cache.damaged) == (2, 2)
 
 
 def test_a_damaged_response_is_missing(path, thetas):
     likelihood = likelihood_of(SimulationCache(path, responses=True))
     likelihood.misfit([[1.0, 1.0]])
-    assert likelihood.cache.look_up_responses(MODEL, [[1.0, 1.0]])[0] is not None
-    likelihood.cache.file.connection().execute("UPDATE responses SET response = zeroblob(160)")
-    assert likelihood.cache.look_up_responses(MODEL, [[1.0, 1.0]]) == [None]
-    assert (likelihood.cache.damaged, likelihood.cache.info().responses) == (1, 0)
+    assert likelihood.simulator.cache.look_up_responses(MODEL, [[1.0, 1.0]])[0] is not None
+    likelihood.simulator.cache.file.connection().execute("UPDATE responses SET response = zeroblob(160)")
+    assert likelihood.simulator.cache.look_up_responses(MODEL, [[1.0, 1.0]]) == [None]
+    assert (likelihood.simulator.cache.damaged, likelihood.simulator.cache.info().responses) == (1, 0)
 
 
 def test_programs_that_find_a_damaged_file_at_once(filled):
@@ -504,16 +504,16 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
 def test_a_connection_to_the_damaged_file_does_not_affect_the_new_one(filled, thetas):
     """SQLite removes the log by its name when the last connection closes; it must not remove that of the new file."""
     first, second = SimulationCache(filled), SimulationCache(filled)
-    second.look_up(FINGERPRINT, thetas, 2, 8)
+    second.simulator.look_up(FINGERPRINT, thetas, 2, 8)
     first.file.set_aside("for a test")
     for number, cache in enumerate((first, second)):
         batch = batch_of(3, number)
         cache.store(FINGERPRINT, batch, 8, sums_of(batch), [""] * len(batch), 1.0)
     second.close()
     third = SimulationCache(filled)
-    assert third.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
+    assert third.simulator.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
     first.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
-    assert third.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+    assert third.simulator.look_up(FINGERPRINT, thetas, 2, 8).known.all()
     for cache in (first, third):
         cache.close()
     assert integrity(filled) == [("ok",)]
@@ -546,15 +546,15 @@ def test_a_full_disk_does_not_stop_the_run(path, thetas, expected, caplog, full,
     assert warnings_of(caplog, "cannot be written (database or disk is full)") == 1
     likelihood.misfit(thetas[:300])
     assert likelihood.simulations == 300
-    stored = likelihood.cache.info().simulations
+    stored = likelihood.simulator.cache.info().simulations
     assert stored < 300
     # space becomes available: the waiting rows are stored with the next ones
     full["full"] = False
-    likelihood.cache.file.close()
+    likelihood.simulator.cache.file.close()
     likelihood.misfit(thetas[300:310])
-    assert likelihood.cache.info().simulations == stored  # writing is not tried again before the pause ends
+    assert likelihood.simulator.cache.info().simulations == stored  # writing is not tried again before the pause ends
     monkeypatch.setattr(cache_file, "RETRY_SECONDS", 0.0)
-    likelihood.cache.file.retry_times["written"] = time.monotonic()
+    likelihood.simulator.cache.file.retry_times["written"] = time.monotonic()
     likelihood.misfit(thetas[310:320])
     again = likelihood_of(path)
     np.testing.assert_array_equal(again.misfit(thetas[:320]), expected[:320])
@@ -576,10 +576,10 @@ def test_a_really_full_disk(thetas, expected, caplog):
             np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
             assert likelihood.simulations == 400
             assert warnings_of(caplog, "cannot be") >= 1
-            likelihood.cache.file.close()
+            likelihood.simulator.cache.file.close()
             again = likelihood_of(Path(folder) / "cache.sqlite")
             np.testing.assert_array_equal(again.misfit(thetas), expected)
-            again.cache.file.close()
+            again.simulator.cache.file.close()
         finally:
             subprocess.run(["umount", folder], check=True)
 
@@ -622,7 +622,7 @@ def test_a_read_only_file(open_folder, thetas, expected, caplog, folder_mode):
     path = open_folder / "cache.sqlite"
     likelihood = likelihood_of(path)
     likelihood.misfit(thetas[:300])
-    likelihood.cache.close()  # the log is empty
+    likelihood.simulator.cache.close()  # the log is empty
     path.chmod(0o444)
     open_folder.chmod(folder_mode)
     before = sorted(open_folder.iterdir()), path.read_bytes()
@@ -631,13 +631,13 @@ def test_a_read_only_file(open_folder, thetas, expected, caplog, folder_mode):
         likelihood = likelihood_of(path)
         for _ in range(2):
             np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-        assert (likelihood.simulations, likelihood.disk_hits) == (100, 300)
+        assert (likelihood.simulations, likelihood.simulator.disk_hits) == (100, 300)
         assert warnings_of(caplog, "is read-only") == 1
         assert warnings_of(caplog, "cannot be") == 0
         with pytest.raises(OSError, match="cannot be used"):
-            likelihood.cache.clear()
+            likelihood.simulator.cache.clear()
         np.testing.assert_array_equal(likelihood_of(path).misfit(thetas[:300]), expected[:300])
-        likelihood.cache.close()
+        likelihood.simulator.cache.close()
 
     as_somebody(run)
     assert path.read_bytes() == before[1]
@@ -651,7 +651,7 @@ def test_a_folder_that_becomes_read_only_during_the_run(open_folder, thetas, exp
     def run():
         likelihood = likelihood_of(path)
         np.testing.assert_array_equal(likelihood.misfit(thetas[:200]), expected[:200])
-        likelihood.cache.close()  # as it happens before a fork
+        likelihood.simulator.cache.close()  # as it happens before a fork
         ready.set()
         assert go.wait(30)
         for start in range(200, 400, 50):
@@ -799,7 +799,7 @@ def test_a_link_leads_to_one_cache(tmp_path, thetas):
     likelihood = likelihood_of(real)
     likelihood.misfit(thetas)
     assert likelihood.simulations == 0
-    likelihood.cache.close()
+    likelihood.simulator.cache.close()
     zeros(real)
     SimulationCache(link)
     assert link.is_symlink() and list(real.parent.glob("*.damaged-1"))
@@ -818,7 +818,7 @@ def test_a_file_that_is_not_accessible_after_unpickling(path, thetas, expected, 
     """A worker on another machine continues without the file."""
     likelihood = likelihood_of(path)
     data = pickle.dumps(likelihood)
-    likelihood.cache.close()
+    likelihood.simulator.cache.close()
     path.unlink()
     path.mkdir()
     copy = pickle.loads(data)

@@ -298,7 +298,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
                 done.update(queue.collect())
             assert set(done) == set(short)
             waiting = queue.submit([[0.96, 0.1, 0.5], [0.97, 0.1, 0.5], [0.98, 0.1, 0.5], [0.99, 0.1, 0.5]])
-        stored, key = posterior.likelihood.cache, posterior.likelihood.simulation_key
+        stored, key = posterior.likelihood.simulator.cache, posterior.likelihood.simulator.simulation_key
         (tmp_path / "go").touch()  # the queue is closed: what runs is cached, what waits is cancelled
         stop = time.monotonic() + 60.0
         while not stored.are_stored([key], np.array([[0.95, 0.1]]))[0]:

@@ -59,11 +59,11 @@ def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
     batch = again.simulate(thetas)
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
-    assert 10 < again.failure_count == sum(map(bool, batch.reasons))
+    assert 10 < again.simulator.failures.count == sum(map(bool, batch.reasons))
     known = stored.failures + stored.responses
     assert stored.simulations <= known < 300
-    assert again.simulations == again.model.runs - again.verifications == 300 - known
-    np.testing.assert_array_equal(again.statistics(thetas), whole.statistics(thetas))
+    assert again.simulations == again.model.runs - again.simulator.verifications == 300 - known
+    np.testing.assert_array_equal(again.simulator.statistics(thetas), whole.simulator.statistics(thetas))
     assert again.simulations == 300 - known
 
 
@@ -118,14 +118,14 @@ def test_a_point_that_kills_its_worker_fails_alone(tmp_path):
         fine = np.setdiff1d(np.arange(12), [3, 8])
         np.testing.assert_array_equal(batch.response[fine], [line(theta) for theta in thetas[fine]])
         assert np.isnan(batch.response[[3, 8]]).all()
-        assert likelihood.failure_reasons == {"the worker process died (signal 11)": 2}
-        assert (likelihood.simulations, likelihood.cache.info().simulations) == (12, 10)
+        assert likelihood.simulator.failures.reasons == {"the worker process died (signal 11)": 2}
+        assert (likelihood.simulations, likelihood.simulator.cache.info().simulations) == (12, 10)
         again = likelihood.simulate(thetas)  # neither the responses nor the failures are repeated
         np.testing.assert_array_equal(again.response, batch.response)
-        assert np.isfinite(likelihood.statistics(thetas)[fine]).all()
+        assert np.isfinite(likelihood.simulator.statistics(thetas)[fine]).all()
         assert likelihood.simulations == 12
     finally:
-        likelihood.pool.close()
+        likelihood.simulator.pool.close()
 
 
 def test_points_of_killed_workers_are_run_again(tmp_path):
@@ -138,7 +138,7 @@ def test_points_of_killed_workers_are_run_again(tmp_path):
     try:
         batch = likelihood.simulate(thetas)
     finally:
-        likelihood.pool.close()
+        likelihood.simulator.pool.close()
     assert batch.reasons == [""] * 8
-    assert (likelihood.simulations, likelihood.failure_count) == (8, 0)
+    assert (likelihood.simulations, likelihood.simulator.failures.count) == (8, 0)
     np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])

@@ -89,18 +89,22 @@ def test_a_fault_is_simulated_again_in_a_later_run_and_an_answer_is_not(name, ki
     first = likelihood_of(kind(error), tmp_path / "cache.sqlite")
     for _ in range(2):  # the run itself does not repeat it
         assert np.isnan(first.misfit(THETAS)).any(axis=1).tolist() == [False, True, False]
-    assert (first.simulations, first.failure_count, first.transient_failure_count) == (3, 1, int(transient))
-    (failure,) = first.failures
+    assert (first.simulations, first.simulator.failures.count, first.simulator.failures.transient) == (
+        3,
+        1,
+        int(transient),
+    )
+    (failure,) = first.simulator.failures.records
     assert failure["parameters"] == {"offset": 0.4, "slope": 0.1}
     assert str(error) in failure["reason"]
     assert failure.get("transient", False) == transient
-    assert first.cache.info().simulations == 3 - transient
+    assert first.simulator.cache.info().simulations == 3 - transient
 
     later = likelihood_of(kind(None if transient else error), tmp_path / "cache.sqlite")
     values = later.misfit(THETAS)
     assert np.isfinite(values).all() == transient
     assert later.simulations == int(transient)
-    assert later.failure_count == int(not transient)
+    assert later.simulator.failures.count == int(not transient)
     again = likelihood_of(kind(None if transient else error), tmp_path / "cache.sqlite")
     np.testing.assert_array_equal(again.misfit(THETAS), values)
     assert again.simulations == 0
@@ -112,8 +116,10 @@ def test_a_failure_of_the_model_is_not_repeated_for_other_measurements(responses
     likelihood_of(Faulty(ANSWERS["refused"]), cache).misfit(THETAS)
     other = likelihood_of(Faulty(ANSWERS["refused"]), cache, data=1.0)
     assert np.isnan(other.misfit(THETAS)[1]).all()
-    assert other.model.runs - other.verifications == other.simulations == (0 if responses else 2)
-    assert other.failures == [{"parameters": {"offset": 0.4, "slope": 0.1}, "reason": "no convergence at step 3"}]
+    assert other.model.runs - other.simulator.verifications == other.simulations == (0 if responses else 2)
+    assert other.simulator.failures.records == [
+        {"parameters": {"offset": 0.4, "slope": 0.1}, "reason": "no convergence at step 3"}
+    ]
     retried = likelihood_of(Faulty(), SimulationCache(cache.path, retry_failures=True), data=2.0)
     assert np.isfinite(retried.misfit(THETAS)).all()
 
@@ -130,7 +136,7 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
     cache = SimulationCache(tmp_path / "cache.sqlite")
     first = likelihood_of(Faulty(), cache, data=1e200)
     assert np.isnan(first.misfit(THETAS)).all()
-    assert first.failure_reasons == {"the misfit of channel 'a' is not finite": 3}
+    assert first.simulator.failures.reasons == {"the misfit of channel 'a' is not finite": 3}
     other = likelihood_of(Faulty(), cache)
     assert np.isfinite(other.misfit(THETAS)).all()
     far = misfit_batch(Faulty(), THETAS, np.full((1, N_STEPS), 100.0), statistic=_undefined)
@@ -153,7 +159,7 @@ def test_a_simulation_stopped_at_a_time_limit(tmp_path):
     def runs(model):
         likelihood = likelihood_of(model, path)
         failed = bool(np.isnan(likelihood.misfit(THETAS[1:2])).all())
-        assert likelihood.failure_count == likelihood.transient_failure_count == failed
+        assert likelihood.simulator.failures.count == likelihood.simulator.failures.transient == failed
         return likelihood.simulations, failed
 
     assert runs(stopped(5.0)) == (1, True)
@@ -191,8 +197,8 @@ def test_a_function_that_is_stopped_is_run_again_with_a_longer_limit(tmp_path):
     x = np.array([[0.3, 0.1]])
     short = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.005), tmp_path / "c.sqlite")
     assert np.isnan(short.misfit(x)).all()
-    assert short.failure_reasons == {"stopped at the time limit of 0.005 s": 1}
-    longer = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=60.0), short.cache)
+    assert short.simulator.failures.reasons == {"stopped at the time limit of 0.005 s": 1}
+    longer = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=60.0), short.simulator.cache)
     assert np.isfinite(longer.misfit(x)).all()
 
 
@@ -208,13 +214,13 @@ def test_a_worker_that_dies_is_not_an_answer(what, pool, tmp_path):
     x = np.array([[getattr(bad, what) + 0.5, 0.1], [0.3, 0.1]])
     first = likelihood_of(model, tmp_path / "cache.sqlite", pool=pool)
     for n in (1, 2):
-        likelihood = first if n == 1 else likelihood_of(model, tmp_path / "cache.sqlite", pool=first.pool)
+        likelihood = first if n == 1 else likelihood_of(model, tmp_path / "cache.sqlite", pool=first.simulator.pool)
         assert np.isnan(likelihood.misfit(x)).all(axis=1).tolist() == [True, False]
         assert likelihood.simulations == 3 - n
-        assert likelihood.transient_failure_count == 1
-        assert likelihood.failures[0]["parameters"]["offset"] == x[0, 0]
+        assert likelihood.simulator.failures.transient == 1
+        assert likelihood.simulator.failures.records[0]["parameters"]["offset"] == x[0, 0]
     if pool is not None:
-        first.pool.close()
+        first.simulator.pool.close()
 
 
 @pytest.mark.parametrize(
@@ -262,7 +268,7 @@ def test_a_program_without_its_temporary_folder(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
         assert np.isnan(likelihood.misfit(THETAS[:1])).all()
-    assert "No such file or directory" in likelihood.failures[0]["reason"]
+    assert "No such file or directory" in likelihood.simulator.failures.records[0]["reason"]
     assert np.isfinite(likelihood_of(program(), tmp_path / "cache.sqlite").misfit(THETAS[:1])).all()
 
 

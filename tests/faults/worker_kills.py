@@ -89,11 +89,11 @@ def main() -> None:
                 done.set()
                 killer.join()
             report, failed = posterior.report(), np.isneginf(values)
-            pool = posterior.likelihood.pool
-            later = posterior_of(model, pool=pool, cache=posterior.likelihood.cache)
+            pool = posterior.likelihood.simulator.pool
+            later = posterior_of(model, pool=pool, cache=posterior.likelihood.simulator.cache)
             equal = np.array_equal(later(x), expected)
             pool.close()
-            posterior.likelihood.cache.close()
+            posterior.likelihood.simulator.cache.close()
         wrong = int(np.sum(values[~failed] != expected[~failed]))
         print(
             f"{name}: {len(kills)} kills, {failed.sum()} of {len(x)} points failed, {report['transient_failures']} of "

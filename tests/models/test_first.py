@@ -86,9 +86,9 @@ def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
     assert (part.log_likelihood(x) != whole.log_likelihood(x)).all()
     assert (part.simulations, whole.simulations) == (2, 2)
     assert part.fingerprint == expected.fingerprint != whole.fingerprint
-    assert whole.cache.info().simulations == 4
+    assert whole.simulator.cache.info().simulations == 4
     if pool is not None:
-        whole.pool.close()
+        whole.simulator.pool.close()
 
 
 class Building:

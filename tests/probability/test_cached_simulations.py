@@ -113,7 +113,7 @@ def test_responses_and_then_log_likelihoods(model, correlated, rng):
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
     assert np.isfinite(batch.response[:, 0, 0]).any()
-    assert likelihood.failure_count == sum(map(bool, batch.reasons))
+    assert likelihood.simulator.failures.count == sum(map(bool, batch.reasons))
     assert_same_log_likelihood(likelihood, thetas, 6)
 
 
@@ -127,7 +127,7 @@ def test_duplicates_and_rows_that_are_not_finite():
     assert np.isnan(batch.response[[1, 5, 6]]).all()
     reasons = ["", "the parameters are not finite", "", "", "", "too steep after 2 s", "too steep after 2 s"]
     assert batch.reasons == reasons
-    assert likelihood.failure_reasons == {"too steep": 1}
+    assert likelihood.simulator.failures.reasons == {"too steep": 1}
     assert likelihood.simulate(thetas[1:2]).reasons == reasons[1:2]
     assert likelihood.simulate(thetas[3]).response.shape == (1, 2, 8)
     empty = likelihood.simulate(np.empty((0, 2)))
@@ -140,12 +140,12 @@ def test_a_response_is_simulated_again_and_a_failure_is_not(thetas):
     likelihood = likelihood_of(Line())
     likelihood.misfit(thetas)
     failed = np.isnan(likelihood.misfit(thetas)).any(axis=1)
-    assert 0 < failed.sum() == likelihood.failure_count
-    runs, hits = likelihood.simulations, likelihood.cache_hits
+    assert 0 < failed.sum() == likelihood.simulator.failures.count
+    runs, hits = likelihood.simulations, likelihood.simulator.cache_hits
     batch = likelihood.simulate(thetas)
     assert likelihood.simulations == runs + (~failed).sum() == likelihood.model.runs
-    assert likelihood.cache_hits == hits + failed.sum()
-    assert likelihood.failure_count == failed.sum()
+    assert likelihood.simulator.cache_hits == hits + failed.sum()
+    assert likelihood.simulator.failures.count == failed.sum()
     assert [bool(reason) for reason in batch.reasons] == failed.tolist()
     assert np.isnan(batch.response[failed]).all()
     assert np.isfinite(batch.response[~failed]).all()
@@ -154,7 +154,7 @@ def test_a_response_is_simulated_again_and_a_failure_is_not(thetas):
 def test_without_a_memory_cache(thetas):
     likelihood = likelihood_of(Line(), memory_rows=0, memory_bytes=0)
     batch = likelihood.simulate(thetas)
-    assert sum(map(bool, batch.reasons)) == likelihood.failure_count
+    assert sum(map(bool, batch.reasons)) == likelihood.simulator.failures.count
     likelihood.misfit(thetas)
     assert likelihood.simulations == 80
 
@@ -168,7 +168,7 @@ def test_responses_are_simulated_once(thetas):
     np.testing.assert_array_equal(again.response, expected.response)
     assert again.reasons == expected.reasons
     assert likelihood.simulations == likelihood.model.runs == 40
-    assert (likelihood.cache_hits, likelihood.disk_hits) == (30, 0)
+    assert (likelihood.simulator.cache_hits, likelihood.simulator.disk_hits) == (30, 0)
     assert_same_log_likelihood(likelihood, thetas, 40)
 
 
@@ -202,7 +202,7 @@ def test_likelihoods_of_one_model_share_responses(thetas):
     np.testing.assert_array_equal(again.simulate(thetas).response, expected.response)
     for one in (other, third, again):
         assert_same_log_likelihood(one, thetas, 0)
-        assert one.failures == likelihood.failures
+        assert one.simulator.failures.records == likelihood.simulator.failures.records
     assert len({run for run in likelihood.model.log if run[0] == 8}) == 40
 
 
@@ -212,7 +212,7 @@ def test_responses_in_memory_are_bounded(thetas, caplog):
     size = 2 * 8 * 8 + 250
     likelihood = likelihood_of(Line(), memory_bytes=10 * size)
     expected = likelihood.simulate(good).response
-    memory = likelihood.response_memory
+    memory = likelihood.simulator.response_memory
     assert (len(memory), memory.dropped) == (10, len(good) - 10)
     assert len([record for record in caplog.records if "dropped from memory" in record.message]) == 1
     np.testing.assert_array_equal(likelihood.simulate(good[-10:]).response, expected[-10:])
@@ -229,7 +229,7 @@ def test_responses_are_not_pickled(thetas):
     likelihood.simulate(np.column_stack([np.arange(1000.0), np.full(1000, 0.5)]))
     copy = pickle.loads(pickle.dumps(likelihood))
     assert len(pickle.dumps(likelihood)) < small + 300  # 1000 responses have 128 000 bytes
-    assert (len(copy.response_memory), copy.response_memory.max_bytes) == (0, 2**28)
+    assert (len(copy.simulator.response_memory), copy.simulator.response_memory.max_bytes) == (0, 2**28)
 
 
 @pytest.mark.parametrize("model", [Line, Batched])
@@ -237,19 +237,19 @@ def test_responses_are_not_pickled(thetas):
 def test_the_disk_cache_has_the_rows_of_statistics(model, responses, path, thetas):
     first = likelihood_of(model(), cache=SimulationCache(path, responses=responses))
     batch = first.simulate(thetas)
-    assert first.cache.info().simulations == 40
-    assert first.cache.info().responses == 40 - first.failure_count
+    assert first.simulator.cache.info().simulations == 40
+    assert first.simulator.cache.info().responses == 40 - first.simulator.failures.count
     assert_same_log_likelihood(first, thetas, 40)
     second = likelihood_of(model(), cache=path)
     assert_same_log_likelihood(second, thetas, 0)
-    assert second.failures == first.failures
+    assert second.simulator.failures.records == first.simulator.failures.records
     third = likelihood_of(model(), cache=SimulationCache(path, responses=responses))
     again = third.simulate(thetas)
     np.testing.assert_array_equal(again.response, batch.response)
     assert again.reasons == batch.reasons
-    assert third.simulations == third.model.runs - third.verifications == 0
-    assert third.disk_hits == third.cache_hits == 40
-    assert third.failure_count == first.failure_count
+    assert third.simulations == third.model.runs - third.simulator.verifications == 0
+    assert third.simulator.disk_hits == third.simulator.cache_hits == 40
+    assert third.simulator.failures.count == first.simulator.failures.count
     assert_same_log_likelihood(third, thetas, third.simulations)
 
 
@@ -259,10 +259,10 @@ def test_statistics_from_stored_responses(path, thetas):
     first.simulate(thetas)
     second = likelihood_of(Line(), AutoregressiveNoise(Line.channels), cache=path)
     assert_same_log_likelihood(second, thetas, 0)
-    assert second.disk_hits == second.cache_hits == 40
-    assert second.failures == first.failures and first.failure_count > 0
+    assert second.simulator.disk_hits == second.simulator.cache_hits == 40
+    assert second.simulator.failures.records == first.simulator.failures.records and first.simulator.failures.count > 0
     third = likelihood_of(Line(), AutoregressiveNoise(Line.channels), cache=path)
-    first.cache.file.connection().execute("DELETE FROM responses")
+    first.simulator.cache.file.connection().execute("DELETE FROM responses")
     assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
 
 
@@ -296,7 +296,7 @@ def test_a_damaged_response_is_simulated_again(path, thetas):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -308,15 +308,15 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkey
     first.model.runs = 0
     with pytest.raises(KeyboardInterrupt):
         first.simulate(thetas)
-    assert first.cache.info().simulations == first.simulations == 25
+    assert first.simulator.cache.info().simulations == first.simulations == 25
     second = likelihood_of(Interrupted(), cache=path)
     second.misfit(thetas[:25])
-    assert second.model.runs == second.verifications == 2
+    assert second.model.runs == second.simulator.verifications == 2
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
     expected = likelihood_of(Line()).simulate(thetas)
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
     batch = likelihood_of(Line(), cache=path).simulate(thetas)
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
@@ -335,20 +335,20 @@ def test_too_many_failures(thetas):
 @pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
 def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
     """Failures of an earlier run must not stop a run that has simulated little itself."""
-    monkeypatch.setattr("fe_likelihoods.probability.new_simulations._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
     thetas = np.concatenate([thetas, thetas + [10.0, 0.4], thetas + [20.0, 0.4]])
     new = np.column_stack([np.arange(40.0), np.full(40, 0.5)])
     first = likelihood_of(Line(), cache=None if source == "recalled" else path)
     batch = first.simulate(thetas)
-    assert 30 < first.failure_count < 0.5 * len(thetas)
-    second = likelihood_of(Line(), cache=first.cache, max_failure_share=0.5)
+    assert 30 < first.simulator.failures.count < 0.5 * len(thetas)
+    second = likelihood_of(Line(), cache=first.simulator.cache, max_failure_share=0.5)
     if source == "recalled":
-        second.recall(thetas, first.statistics(thetas), batch.reasons)
-    request = second.simulate if source == "disk, responses" else second.statistics
+        second.simulator.recall(thetas, first.simulator.statistics(thetas), batch.reasons)
+    request = second.simulate if source == "disk, responses" else second.simulator.statistics
     request(np.concatenate([thetas, new[:25]]))
     request(new)
-    assert second.failure_count == first.failure_count
-    assert second.statistics(new).shape == (40, 2)
+    assert second.simulator.failures.count == first.simulator.failures.count
+    assert second.simulator.statistics(new).shape == (40, 2)
 
 
 def test_a_pool_changes_nothing(thetas):
@@ -361,22 +361,22 @@ def test_a_pool_changes_nothing(thetas):
         assert likelihood.model.runs == 0  # all in the workers
         assert_same_log_likelihood(likelihood, thetas, 40)
     finally:
-        likelihood.pool.close()
+        likelihood.simulator.pool.close()
 
 
 def test_known_statistics_are_recalled_without_a_simulation(thetas):
     first = likelihood_of(Line())
-    batch, statistics = first.simulate(thetas), first.statistics(thetas)
+    batch, statistics = first.simulate(thetas), first.simulator.statistics(thetas)
     second = likelihood_of(Line())
     rows = np.r_[0, 0, 1:40]
-    second.recall(thetas[rows], statistics[rows], [batch.reasons[row] for row in rows])
+    second.simulator.recall(thetas[rows], statistics[rows], [batch.reasons[row] for row in rows])
     assert_same_log_likelihood(second, thetas, 0)
     assert second.simulations == 0
-    assert second.failures == first.failures
-    second.recall(thetas, np.zeros_like(statistics), batch.reasons)  # cached rows are not changed
-    np.testing.assert_array_equal(second.statistics(thetas), statistics)
-    assert second.failure_count == first.failure_count
+    assert second.simulator.failures.records == first.simulator.failures.records
+    second.simulator.recall(thetas, np.zeros_like(statistics), batch.reasons)  # cached rows are not changed
+    np.testing.assert_array_equal(second.simulator.statistics(thetas), statistics)
+    assert second.simulator.failures.count == first.simulator.failures.count
     with pytest.raises(ValueError, match=r"statistics of shape \(40, 2\) and 40 reasons; got \(40, 2\) and 39"):
-        second.recall(thetas, statistics, batch.reasons[1:])
+        second.simulator.recall(thetas, statistics, batch.reasons[1:])
     with pytest.raises(ValueError, match="for the same noise"):
-        second.recall(thetas, statistics[:, :1], batch.reasons)
+        second.simulator.recall(thetas, statistics[:, :1], batch.reasons)

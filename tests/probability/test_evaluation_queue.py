@@ -99,11 +99,19 @@ def test_values_are_those_of_single_points_on_every_pool(make, tmp_path):
     synchronous = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "other.sqlite")
     np.testing.assert_array_equal(synchronous(x), expected)
     assert synchronous.report()["failure_reasons"] == posterior.report()["failure_reasons"]
-    assert synchronous.likelihood.cache.info().simulations == posterior.likelihood.cache.info().simulations == 36
+    assert (
+        synchronous.likelihood.simulator.cache.info().simulations
+        == posterior.likelihood.simulator.cache.info().simulations
+        == 36
+    )
     again = posterior_of(Treacherous(), top=1.2, pool=pool, cache=tmp_path / "cache.sqlite")
     with again.evaluation_queue() as queue:
         np.testing.assert_array_equal(collect(queue, queue.submit(x)), expected)  # from the disk
-    assert (again.likelihood.simulations, again.likelihood.disk_hits, again.likelihood.verifications) == (0, 37, 2)
+    assert (
+        again.likelihood.simulations,
+        again.likelihood.simulator.disk_hits,
+        again.likelihood.simulator.verifications,
+    ) == (0, 37, 2)
     for end in ("terminate", "shutdown", "close"):
         if hasattr(pool, end):
             getattr(pool, end)()
@@ -118,7 +126,7 @@ def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path):
     expected = posterior_of(Treacherous())(x)
     with LocalPool(2) as pool:
         posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
-        thetas, key = x[:, :2], posterior.likelihood.simulation_key
+        thetas, key = x[:, :2], posterior.likelihood.simulator.simulation_key
         stored = SimulationCache(path)
         if asynchronous:
             with posterior.evaluation_queue() as queue:
@@ -281,7 +289,7 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path):
             with pytest.raises(RuntimeError, match="the queue is closed"):
                 call()
         (tmp_path / "go").touch()
-        stored, key = SimulationCache(path), posterior.likelihood.simulation_key
+        stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
         wait_until(lambda: stored.are_stored([key], LONG[:1, :2]).all())
         assert not stored.are_stored([key], SHORT[:, :2]).any()
         assert posterior.likelihood.simulations == 1
@@ -302,7 +310,7 @@ def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
     path = tmp_path / "cache.sqlite"
     with LocalPool(2) as pool:
         posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
-        stored, key = SimulationCache(path), posterior.likelihood.simulation_key
+        stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
 
         def interrupt():
             wait_until(lambda: stored.are_stored([key], SHORT[:, :2]).all())
@@ -355,7 +363,7 @@ def test_a_killed_process_loses_what_runs_and_the_last_second(kind, tmp_path):
     script.write_text(KILLED)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     posterior = posterior_of(Gated(tmp_path), cache=tmp_path / "cache.sqlite")
-    stored, key = SimulationCache(tmp_path / "cache.sqlite"), posterior.likelihood.simulation_key
+    stored, key = SimulationCache(tmp_path / "cache.sqlite"), posterior.likelihood.simulator.simulation_key
     with subprocess.Popen([sys.executable, script, str(tmp_path), kind], env=environment) as process:
         try:
             wait_until(lambda: process.poll() is not None or stored.are_stored([key], SHORT[:, :2]).all())
@@ -363,7 +371,7 @@ def test_a_killed_process_loses_what_runs_and_the_last_second(kind, tmp_path):
             process.kill()
     (tmp_path / "go").touch()
     posterior(np.concatenate([LONG[:1], SHORT]))
-    assert (posterior.likelihood.simulations, posterior.likelihood.disk_hits) == (1, len(SHORT))
+    assert (posterior.likelihood.simulations, posterior.likelihood.simulator.disk_hits) == (1, len(SHORT))
 
 
 def test_wrong_shapes_are_refused():

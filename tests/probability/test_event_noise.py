@@ -151,7 +151,7 @@ def test_first_part_cache_and_guide(model, measured, tmp_path):
     point = [1.0, 1.0, 0.3, 0.01, 0.5, 0.02]
     value = likelihood(point)
     again = FELikelihood(model, measured, noise="per event", cache=cache)
-    assert again(point) == value and again.disk_hits == 1
+    assert again(point) == value and again.simulator.disk_hits == 1
     assert FELikelihood(model, measured, cache=cache).fingerprint != again.fingerprint
     part = likelihood.first(0.5)  # within the first event
     only = FELikelihood(model.first(0.5), measured["EQ1"].trim(0.0, 0.5), GaussianNoise(model.channels))

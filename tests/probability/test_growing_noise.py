@@ -160,7 +160,7 @@ def test_calibrated_parameters_have_uniform_ranks(rng):
         measured = measured_of(specimen, share, rng, (theta,))
         for growth, found in ranks.items():
             likelihood = FELikelihood(specimen, measured, noise_of(specimen, growth=growth))
-            statistics = np.repeat(likelihood.statistics(axes[0][:, None]), len(axes[1]), axis=0)
+            statistics = np.repeat(likelihood.simulator.statistics(axes[0][:, None]), len(axes[1]), axis=0)
             shares = np.tile(axes[1][:, None], (len(axes[0]), 1))
             values = likelihood.noise.log_likelihood(statistics, specimen.n_steps, shares)
             weights = np.exp(values - values.max()).reshape(len(axes[0]), len(axes[1]))

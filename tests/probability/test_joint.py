@@ -121,7 +121,8 @@ def test_caches_of_the_parts_are_used(pieces, tmp_path, rng):
     points = points_of(with_cache(), rng)
     expected, again = with_cache()(points), with_cache()
     np.testing.assert_array_equal(again(points), expected)
-    assert again.simulations == 0 and again.disk_hits == again.cache_hits == 2 * len(points)
+    report = again.report()
+    assert report["simulations"] == 0 and report["disk_hits"] == report["cache_hits"] == 2 * len(points)
 
 
 def test_fingerprints(pieces, rng):

@@ -212,8 +212,11 @@ def test_cache_pool_and_coarse_posterior_are_kept(full, tmp_path):
     posterior.log_prob([1.0, 1.0, 0.5, 0.01])
     marginal = posterior.marginal()
     marginal.log_prob([1.0, 1.0])
-    assert (marginal.likelihood.simulations, marginal.likelihood.disk_hits) == (0, 1)
-    assert marginal.likelihood.max_failure_share == 0.5 and marginal.coarse.parameter_names == ["stiffness", "damping"]
+    assert (marginal.likelihood.simulations, marginal.likelihood.simulator.disk_hits) == (0, 1)
+    assert marginal.likelihood.simulator.failures.max_share == 0.5 and marginal.coarse.parameter_names == [
+        "stiffness",
+        "damping",
+    ]
 
 
 def test_problems_with_the_noise_integrated_out():

@@ -206,7 +206,7 @@ def test_likelihood_with_gaps(rng, tmp_path, noise, own):
     x = x[:, : likelihood.ndim]
     x[0, 1] = 4.0
     values = likelihood.log_likelihood(x)
-    assert values[0] == -np.inf and np.isfinite(values[1:]).all() and likelihood.failure_count == 1
+    assert values[0] == -np.inf and np.isfinite(values[1:]).all() and likelihood.simulator.failures.count == 1
     for row, value in zip(x[1:], values[1:], strict=True):
         residuals = likelihood.residuals(row)
         np.testing.assert_array_equal(np.isnan(residuals), ~there)
@@ -238,10 +238,10 @@ def test_cached_rows_are_compared_with_gaps(rng, tmp_path, noise, jitter, stale)
     again = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
     if stale:
         # the counter is part of the label, so that a new generation begins
-        assert not np.any(again.statistics(thetas)[:, 0] == first[:, 0])
+        assert not np.any(again.simulator.statistics(thetas)[:, 0] == first[:, 0])
     else:
-        again.statistics(thetas)
-        assert again.disk_hits == 4 and again.verifications > 0
+        again.simulator.statistics(thetas)
+        assert again.simulator.disk_hits == 4 and again.simulator.verifications > 0
 
 
 class Unaware:
@@ -276,7 +276,7 @@ def test_a_response_that_is_not_finite_fails_also_where_no_sample_is(rng):
     for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS)):
         likelihood = FELikelihood(model, measured(rng, there), noise)
         assert likelihood.log_likelihood([1.0, 1.0, *([0.1] * (likelihood.ndim - 2))]) == -np.inf
-        assert "not finite" in likelihood.failures[0]["reason"]
+        assert "not finite" in likelihood.simulator.failures.records[0]["reason"]
 
 
 # guides ---------------------------------------------------------------------------------------------------------------

@@ -228,12 +228,14 @@ def test_the_cache_separates_statistics(tmp_path, rng, responses):
         for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS), SharedGaussianNoise(CHANNELS, [1, 1])):
             model = Line()
             likelihood = FELikelihood(model, measurements, noise, cache=cache)
-            statistics = likelihood.statistics(thetas)
+            statistics = likelihood.simulator.statistics(thetas)
             white = not isinstance(noise, AutoregressiveNoise)
             assert statistics.shape == (6, 2 if white else 6)
             assert np.array_equal(expected.setdefault(white, statistics), statistics)
             known = round_ or isinstance(noise, SharedGaussianNoise) or (responses and not white)
-            assert (model.runs - likelihood.verifications, likelihood.disk_hits) == ((0, 6) if known else (6, 0))
+            assert (model.runs - likelihood.simulator.verifications, likelihood.simulator.disk_hits) == (
+                (0, 6) if known else (6, 0)
+            )
     np.testing.assert_array_equal(expected[True], expected[False][:, :2])
     assert cache.damaged == 0
 
@@ -342,7 +344,7 @@ def test_coverage_of_each_noise_for_correlated_errors(rng, period):
     for _ in range(N_DATA):
         values = clean + sigma * autoregressive(rng, (1, STEPS), RHO)
         likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values), autoregressive_noise)
-        statistics = likelihood.statistics(grid[:, None])
+        statistics = likelihood.simulator.statistics(grid[:, None])
         misfit = statistics[:, :1]
         residuals = likelihood.residuals(grid[[np.argmin(misfit)]])
         effective = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))

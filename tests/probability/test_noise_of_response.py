@@ -222,7 +222,7 @@ def test_calibrated_parameters_have_uniform_ranks(rng):
             fitted = noise.with_measurements(Measurements(channel, DT, simulated))
             errors = draw(fitted, theta[1:], simulated, rng)
             likelihood = FELikelihood(model, Measurements(channel, DT, simulated + errors), noise)
-            statistics = likelihood.statistics(axes[0][:, None])
+            statistics = likelihood.simulator.statistics(axes[0][:, None])
             repeated = np.repeat(statistics, len(grid), axis=0), n, np.tile(grid, (len(statistics), 1))
             values = fitted.log_likelihood(*repeated)
             weights = np.exp(np.array(values) - np.max(values)).reshape([len(axis) for axis in axes[:d]])
@@ -345,7 +345,7 @@ def test_caches_pools_pickles_and_joint_likelihoods(kind, rng, tmp_path):
     expected = likelihood(rows)
     again = likelihood_of(kind, values, cache=SimulationCache(tmp_path / "cache"))
     np.testing.assert_array_equal(again(rows), expected)
-    assert again.simulations == 0 and again.disk_hits == 6
+    assert again.simulations == 0 and again.simulator.disk_hits == 6
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(likelihood))(rows), expected)
     white = again.with_noise(GaussianNoise(CHANNELS))
     assert white.fingerprint != likelihood.fingerprint and white.density_parts() != likelihood.density_parts()

@@ -320,9 +320,9 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     x = np.array([[offset, 0.1, 0.5, 1.0] for offset in (*BAD, 0.5)])
     with warnings.catch_warnings(), caplog.at_level(logging.WARNING), ThreadPool(max(threads, 1)) as pool:
         warnings.simplefilter("error")
-        posterior.likelihood.pool = pool if threads else None
+        posterior.likelihood.simulator.pool = pool if threads else None
         values = posterior(x)
-    posterior.likelihood.pool = None
+    posterior.likelihood.simulator.pool = None
     assert np.isneginf(values[:-1]).all()
     assert np.isfinite(values[-1])
     report = posterior.report()
@@ -408,9 +408,9 @@ def test_nan_from_a_noise_is_a_failure():
     likelihood = FELikelihood(model, measurements, noise=BadNoise())
     assert likelihood.parameter_names == ("offset", "slope", "scale")
     assert likelihood.log_likelihood([0.5, 0.1, np.nan]) == -np.inf
-    assert likelihood.failures == []
+    assert likelihood.simulator.failures.records == []
     assert likelihood.log_likelihood([0.5, 0.1, 1.0]) == -np.inf
-    assert likelihood.failures[0]["reason"] == "the log-likelihood of the noise is nan"
+    assert likelihood.simulator.failures.records[0]["reason"] == "the log-likelihood of the noise is nan"
 
 
 # number of simulations ------------------------------------------------------------------------------------------------
@@ -443,7 +443,7 @@ def test_the_likelihood_does_not_simulate_impossible_points():
     assert np.isneginf(likelihood.log_likelihood(x)).all()
     assert np.isnan(likelihood.misfit(x[2:, :2])).all()
     assert model.runs == []
-    assert likelihood.failure_count == 0
+    assert likelihood.simulator.failures.count == 0
 
 
 def test_equal_structural_parameters_are_simulated_once():

@@ -56,7 +56,7 @@ def log_evidence(noise, axes, measured):
     likelihood = FELikelihood(MODEL, measured, noise)
     factors = np.linspace(0.7, 1.3, 61)
     grid = np.stack([each.ravel() for each in np.meshgrid(*axes, indexing="ij")], axis=1)
-    statistics = likelihood.statistics(factors[:, None])
+    statistics = likelihood.simulator.statistics(factors[:, None])
     values = [likelihood.noise.log_likelihood(np.tile(one, (len(grid), 1)), N, grid) for one in statistics]
     return logsumexp(values) - np.log(np.size(values))
 

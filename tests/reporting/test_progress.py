@@ -196,7 +196,7 @@ def test_the_bar_moves_within_a_batch(bars):
     assert any(0 < n < 32 for n in counts)  # within the first batch
     assert int(shown[-1][2]["failures"]) == posterior.report()["failure_count"] > 0
     assert int(shown[-1][2]["simulations"]) == posterior.report()["simulations"]
-    assert posterior.likelihood.when_simulated is None
+    assert posterior.likelihood.simulator.when_simulated is None
 
 
 def test_figures_of_a_bar_are_those_since_it_began(bars):

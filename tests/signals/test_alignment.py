@@ -207,7 +207,7 @@ def test_shift_without_interpolation_is_exact(rng):
     kept = np.flatnonzero(np.isfinite(values[8:-8])) + 8
     for steps in (-5, 0, 3, 5):
         misfit = np.square(simulated[kept - steps] - values[kept]).sum()
-        statistics = likelihood.statistics([1.1, 0.9])
+        statistics = likelihood.simulator.statistics([1.1, 0.9])
         zero, one = (likelihood.log_likelihood([1.1, 0.9, sigma, 0.002, steps * DT]) for sigma in (0.1, 0.2))
         expected = -0.5 * misfit * (1.0 / 0.01 - 1.0 / 0.04) + len(kept) * np.log(2.0)
         assert zero - one == pytest.approx(expected, rel=1e-10)

@@ -303,9 +303,9 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
     x = posterior.sample_prior(7, 2)
     values = posterior(x)
     copy = pickle.loads(pickle.dumps(posterior))
-    assert copy.likelihood.pool is None
+    assert copy.likelihood.simulator.pool is None
     np.testing.assert_array_equal(copy(x), values)
-    posterior.likelihood.pool.close()
+    posterior.likelihood.simulator.pool.close()
 
 
 def test_as_the_pool_of_a_sampler(seed):

@@ -127,7 +127,9 @@ def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True,
             message = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
             return Outcome(failed=message, seconds=time.perf_counter() - start)
     report, verdict = posterior.report(), sampler.verdict
-    in_this_process = posterior.likelihood.pool is None and not getattr(posterior.likelihood.model, "isolated", False)
+    in_this_process = posterior.likelihood.simulator.pool is None and not getattr(
+        posterior.likelihood.model, "isolated", False
+    )
     samples = sampler.get_chain(flat=True)
     return Outcome(
         log_evidence=float(sampler.log_evidence),

@@ -1,0 +1,214 @@
+"""Results of earlier simulations: statistics in memory, on disk, then responses in memory, on disk, then failures.
+
+From a response, which is cached in double precision, the statistics are computed; they have the same bits as those of a
+new simulation.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..cache.comparison import VerifyingRun
+from ..cache.guard import EarlierPoint
+from ..cache.memory import MemoryCache, ResponseMemory
+from ..cache.verification import StaleCache
+from ..simulation.model import SimulationBatch, misfit_of_responses
+from .checked_model import CheckedModel
+from .failures import FailureLog
+
+__all__ = ["KnownSimulations", "Requested", "most_responses"]
+
+_RESPONSE_VALUES = 2**23  # responses held at once where they are cached: 64 MiB
+
+
+class Requested(NamedTuple):
+    """Distinct simulations that were requested, with arrays that are filled in.
+
+    Attributes
+    ----------
+    keys : list of n bytes
+        See `distinct_keys`.
+    thetas : (n, n_structural) float
+        Structural parameters.
+    misfit : (n, n_numbers) float
+        Statistics of the residuals; NaN where they are not known.
+    known : (n,) bool
+        Whether the statistics are known, those of failures included.
+    reasons : list of n str
+        Reasons of failures.
+    response : (n, n_channels, n_steps) float, optional
+        Responses, if they were requested.
+    cached, on_disk : (n,) bool
+        Whether no simulation was needed, and whether the result came from the disk.
+    """
+
+    keys: list[bytes]
+    thetas: np.ndarray
+    misfit: np.ndarray
+    known: np.ndarray
+    reasons: list[str]
+    response: np.ndarray | None
+    cached: np.ndarray
+    on_disk: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        keys: list[bytes],
+        n_structural: int,
+        misfit: np.ndarray,
+        known: np.ndarray,
+        response: np.ndarray | None = None,
+    ) -> "Requested":
+        """A request of which the statistics are in memory where `known`."""
+        n = len(keys)
+        thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, n_structural).copy()
+        return cls(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
+
+
+class KnownSimulations:
+    """Results of one model in memory and on disk.
+
+    Parameters
+    ----------
+    key : str
+        Declared identity of the statistics, under which they are stored on disk.
+    memory : MemoryCache
+        Statistics in memory.
+    responses : ResponseMemory
+        Responses in memory.
+    checked : CheckedModel
+        Has the rows on disk.
+    failures : FailureLog
+        Failures that are found are recorded there.
+    """
+
+    def __init__(
+        self, key: str, memory: MemoryCache, responses: ResponseMemory, checked: CheckedModel, failures: FailureLog
+    ) -> None:
+        self.memory, self.responses = memory, responses
+        self._key, self._checked, self._failures = key, checked, failures
+        self._has_repeated_remark = False
+
+    def clear(self) -> None:
+        """Forget what is in memory, because it may be of another model."""
+        self.memory.clear()
+        self.responses.clear()
+
+    def earlier_points(self, run: VerifyingRun) -> list[EarlierPoint]:
+        """A successful simulation that is in memory, if there is one, to be run again."""
+        thetas = self.memory.successes(len(run.model.parameter_names))[:1]
+        statistics, _ = self.memory.look_up([theta.tobytes() for theta in thetas], run.n_numbers)
+        return list(map(EarlierPoint, thetas, statistics))
+
+    def fill(self, requested: Requested, run: VerifyingRun) -> None:
+        """Fill in what is known; some rows of the disk may be simulated again for verification."""
+        self._fill_statistics(requested, run)
+        failed = requested.known & ~np.isfinite(requested.misfit).all(axis=1)
+        # a failure needs no response
+        requested.cached[:] = requested.known if requested.response is None else failed
+        self._name_failures(requested, np.flatnonzero(failed), run)
+        left = np.flatnonzero(~requested.cached)
+        size = most_responses(run)
+        for start in range(0, len(left), size):
+            self._fill_responses(requested, left[start : start + size], run)
+        self._fill_failures(requested, np.flatnonzero(~requested.cached & ~requested.known), run)
+
+    def _fill_statistics(self, requested: Requested, run: VerifyingRun) -> None:
+        """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
+        new = np.flatnonzero(~requested.known)
+        if self._checked.rows is None or not len(new):
+            return
+        stored = self._verified(self._checked.rows.look_up, self._key, requested.thetas[new], run)
+        rows = new[stored.known]
+        requested.misfit[rows] = stored.misfit[stored.known]
+        requested.known[rows] = requested.on_disk[rows] = True
+        for row, reason in zip(new, stored.reasons, strict=True):
+            requested.reasons[row] = reason
+        self._note(requested, rows, run)
+
+    def _verified(self, look_up: Callable, *arguments: Any) -> Any:
+        """Rows from the disk, of which some are simulated again; if these differ, the caches in memory are emptied."""
+        try:
+            return look_up(*arguments)
+        except StaleCache:
+            self.clear()
+            raise
+
+    def _fill_responses(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
+        """Fill in rows whose responses are cached, and their statistics where these are not known."""
+        model, stored_rows = run.model, self._checked.rows
+        outcomes: list[np.ndarray | str | None] = [None] * len(rows)
+        keys = [requested.keys[row] for row in rows]
+        if len(self.responses):
+            outcomes = self.responses.look_up(model.fingerprint, keys)
+        left = [place for place, outcome in enumerate(outcomes) if outcome is None]
+        if stored_rows is not None and left:
+            stored = self._verified(stored_rows.look_up_responses, requested.thetas[rows[left]], run)
+            found = [(place, response) for place, response in zip(left, stored, strict=True) if response is not None]
+            for place, response in found:
+                outcomes[place] = response
+                requested.on_disk[rows[place]] = True
+            if requested.response is not None and found:
+                found_keys = [keys[place] for place, _ in found]
+                self.responses.store(model.fingerprint, found_keys, [response for _, response in found])
+        places = [place for place, outcome in enumerate(outcomes) if outcome is not None]
+        if not places:
+            return
+        rows, outcomes = rows[places], [outcomes[place] for place in places]
+        nothing = np.full((len(model.channels), model.n_steps), np.nan)
+        reasons = [outcome if isinstance(outcome, str) else "" for outcome in outcomes]
+        response = np.array([nothing if isinstance(outcome, str) else outcome for outcome in outcomes])
+        if requested.response is not None:
+            requested.response[rows] = response
+        new = np.flatnonzero(~requested.known[rows])
+        if len(new):
+            batch = SimulationBatch(response[new], [reasons[place] for place in new])
+            misfit, reasons_of_new = misfit_of_responses(model, batch, run.measured, run.statistic)
+            requested.misfit[rows[new]], requested.known[rows[new]] = misfit, True
+            for row, reason in zip(rows[new], reasons_of_new, strict=True):
+                requested.reasons[row] = reason
+                if reason and requested.response is not None:
+                    requested.response[row] = np.nan
+            self._note(requested, rows[new], run)
+            if stored_rows is not None:
+                stored_rows.store(self._key, requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run)
+        requested.cached[rows] = True
+
+    def _fill_failures(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
+        """Fill in rows whose simulation is known to fail for any measurements."""
+        if self._checked.rows is None or not len(rows):
+            return
+        reasons = self._verified(self._checked.rows.look_up_failures, requested.thetas[rows], run)
+        for row, reason in zip(rows, reasons, strict=True):
+            requested.reasons[row] = reason
+        rows = rows[[bool(reason) for reason in reasons]]
+        requested.known[rows] = requested.cached[rows] = requested.on_disk[rows] = True
+        self._note(requested, rows, run)
+
+    def _note(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
+        """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
+        if not len(rows):
+            return
+        self._checked.has_results = True
+        if not self._has_repeated_remark:
+            self._has_repeated_remark = True
+            if self._checked.rows is not None:
+                self._checked.rows.cache.repeat_remark(run.model)
+        self._failures.count_outcomes(requested.thetas[rows], [requested.reasons[row] for row in rows])
+        self.memory.store([requested.keys[row] for row in rows], requested.misfit[rows])
+
+    def _name_failures(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
+        """Fill in reasons of failures of which only the statistics were cached."""
+        rows = [row for row in rows if not requested.reasons[row]]
+        if not rows or requested.response is None:
+            return
+        outcomes = self.responses.look_up(run.model.fingerprint, [requested.keys[row] for row in rows])
+        for row, outcome in zip(rows, outcomes, strict=True):
+            requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
+
+
+def most_responses(run: VerifyingRun) -> int:
+    """Number of responses that are held at once where they are cached."""
+    return max(1, _RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))

@@ -1,0 +1,125 @@
+"""Simulations that were requested and have not ended, one by one and in groups.
+
+A request that is not waited for only fills the caches of a simulator: when it has ended, `Simulator.simulate` returns
+its responses without a simulation. So nothing depends on it but the time.
+"""
+
+from collections.abc import Hashable
+from concurrent.futures import Future
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..cache.memory import distinct_keys
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["RunningRequests", "RunningSimulation", "Simulated", "take_all"]
+
+
+class Simulated(NamedTuple):
+    """Result of one simulation: its statistics, the reason of a failure, and its response if it was requested."""
+
+    misfit: np.ndarray
+    reason: str
+    response: np.ndarray | None
+
+
+class RunningSimulation:
+    """A simulation that was requested of a `Simulator`.
+
+    Attributes
+    ----------
+    key : bytes
+        Of the structural parameters, see `distinct_keys`.
+    theta : (n_structural,) float
+        Structural parameters.
+    responses : bool
+        Whether its response was requested.
+    future : Future or None
+        Of the pool; None if it waits to be run in this process, or as one of a batch.
+    users : set of SimpleQueue
+        Queues of the requests that wait for it.
+    received : bool
+        Whether it has ended and was counted and cached, or was cancelled.
+    result : Simulated or None
+        Set when it was received.
+    error : BaseException or None
+        What went wrong instead, for which no simulation can be blamed.
+    """
+
+    __slots__ = ("error", "future", "key", "received", "responses", "result", "theta", "users")
+
+    def __init__(self, key: bytes, theta: np.ndarray, responses: bool) -> None:
+        self.key, self.theta, self.responses = key, theta, responses
+        self.future: Future | None = None
+        self.users: set[SimpleQueue] = set()
+        self.received = False
+        self.result: Simulated | None = None
+        self.error: BaseException | None = None
+
+
+def take_all(arrived: SimpleQueue, wait: bool) -> list:
+    """All items of a queue; with `wait`, at least one."""
+    items = [arrived.get()] if wait else []
+    try:
+        while True:
+            items.append(arrived.get_nowait())
+    except Empty:
+        return items
+
+
+class RunningRequests:
+    """Groups of simulations for responses, each of which is waited for as a whole.
+
+    Without a pool to which single simulations can be submitted, nothing is simulated here, and all requests have ended.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        It must cache the responses in memory until they are used.
+    """
+
+    def __init__(self, simulator: "Simulator") -> None:
+        self._simulator = simulator
+        self._arrived: SimpleQueue = SimpleQueue()
+        self._left: dict[Hashable, set[RunningSimulation]] = {}  # by name of the request
+
+    def __contains__(self, name: Hashable) -> bool:
+        return name in self._left
+
+    def begin(self, name: Hashable, thetas: np.ndarray) -> None:
+        """Begin to simulate structural parameters (n, n_structural), unless their responses are cached."""
+        self._left[name] = set()
+        if not self._simulator.streams:
+            return
+        keys, distinct = distinct_keys(thetas)
+        first = [distinct.index(place) for place in range(len(keys))]
+        new = np.flatnonzero(~self._simulator.has_responses(keys))
+        if len(new):
+            wanted = [keys[place] for place in new], thetas[first][new]
+            self._left[name].update(self._simulator.start(*wanted, True, self._arrived))
+
+    def wait(self) -> list[Hashable]:
+        """Wait until a request has ended; returns the names of all that have, in the order in which they began.
+
+        A simulation whose process was lost counts as ended: `Simulator.simulate` runs it again.
+        """
+        while not (ended := [name for name, left in self._left.items() if not left]):
+            arrived = take_all(self._arrived, wait=True)
+            self._simulator.receive(arrived)
+            for left in self._left.values():
+                left.difference_update(arrived)
+        for name in ended:
+            del self._left[name]
+        return ended
+
+    def close(self) -> None:
+        """Cancel what was not started; what runs is cached if it ends while others are waited for."""
+        left = [running for group in self._left.values() for running in group]
+        self._left.clear()
+        if left:
+            self._simulator.leave(left, self._arrived, running=False)
+        self._simulator.flush()
