@@ -7,14 +7,11 @@ its responses without a simulation. So nothing depends on it but the time.
 from collections.abc import Hashable
 from concurrent.futures import Future
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..cache.memory import distinct_keys
-
-if TYPE_CHECKING:
-    from .simulator import Simulator
 
 __all__ = ["RunningRequests", "RunningSimulation", "Simulated", "take_all"]
 
@@ -82,7 +79,7 @@ class RunningRequests:
         It must cache the responses in memory until they are used.
     """
 
-    def __init__(self, simulator: "Simulator") -> None:
+    def __init__(self, simulator: Any) -> None:
         self._simulator = simulator
         self._arrived: SimpleQueue = SimpleQueue()
         self._left: dict[Hashable, set[RunningSimulation]] = {}  # by name of the request

@@ -229,7 +229,9 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
         warnings.simplefilter("ignore")
         sampler.run_mcmc(None, 0)  # the step of the limited run is replaced
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.log_evidence == whole.log_evidence
-    assert len(set(calls)) == len(calls) == 2 * sampler.simulations == posterior.likelihood.simulations
+    # the list of calls is a value of the model that changes: earlier points are run again, to see whether it matters
+    distinct = len(calls) - posterior.report()["verifications"]
+    assert len(set(calls)) == distinct == 2 * sampler.simulations == posterior.likelihood.simulations
     assert whole.simulations < sampler.simulations < whole.simulations + 50
 
 

@@ -177,7 +177,8 @@ def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     whole, reference = cached_run.make(tmp_path / "whole.sqlite")
     whole.run_mcmc(None, cached_run.STEPS)
     distinct = reference.likelihood.simulator.cache.info().simulations
-    assert reference.likelihood.model.runs == distinct > 300
+    # the model counts its runs, which is a change of a value: earlier points are run again, to see whether it matters
+    assert reference.likelihood.model.runs - reference.report()["verifications"] == distinct > 300
 
     command = [sys.executable, "-m", "tests.faults.cached_run", str(path), "0.001"]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:

@@ -454,4 +454,4 @@ def test_parts_of_a_batch_that_fail_do_not_end_a_run_that_goes_on(tmp_path):
     posterior.stop = None
     again = sampler(posterior)
     again.run_mcmc(None, 1)
-    assert again.simulator.failures.count > 0
+    assert again.failure_count > 0
