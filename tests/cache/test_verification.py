@@ -290,7 +290,9 @@ def test_compiled_models_are_compared_to_the_last_bit(path):
     likelihood.simulator.cache.clear()
     (stored,) = labels.labels_of(likelihood.simulator.cache.file, model)
     place = stored.generation, stored.id
-    likelihood.simulator.cache.store(likelihood.simulator.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0, *place)
+    likelihood.simulator.cache.store(
+        likelihood.simulator.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0, *place
+    )
     labels._shared.clear()  # as in a new process
     with pytest.raises(StaleCache, match="channel 'displacement'"):
         oscillator(path).misfit([[1.1, 0.9]])

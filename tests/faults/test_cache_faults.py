@@ -505,16 +505,16 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
 def test_a_connection_to_the_damaged_file_does_not_affect_the_new_one(filled, thetas):
     """SQLite removes the log by its name when the last connection closes; it must not remove that of the new file."""
     first, second = SimulationCache(filled), SimulationCache(filled)
-    second.simulator.look_up(FINGERPRINT, thetas, 2, 8)
+    second.look_up(FINGERPRINT, thetas, 2, 8)
     first.file.set_aside("for a test")
     for number, cache in enumerate((first, second)):
         batch = batch_of(3, number)
         cache.store(FINGERPRINT, batch, 8, sums_of(batch), [""] * len(batch), 1.0)
     second.close()
     third = SimulationCache(filled)
-    assert third.simulator.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
+    assert third.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
     first.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
-    assert third.simulator.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+    assert third.look_up(FINGERPRINT, thetas, 2, 8).known.all()
     for cache in (first, third):
         cache.close()
     assert integrity(filled) == [("ok",)]

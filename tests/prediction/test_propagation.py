@@ -319,7 +319,7 @@ def test_failures_are_counted_and_left_out(rng, caplog):
     peaks = quiet(Line(fails=True), samples, quantity=peak("a"))
     assert np.allclose(peaks.values, quiet(Line(), samples[good], quantity=peak("a")).values)
     endless = quiet(Line(), samples, quantity=lambda response: np.inf if response[0, 0] < 0.9 else response[0, 0])
-    assert endless.simulator.failures.reasons == {"the quantity is not finite": p.n_failed} and len(endless.values) == good.sum()
+    assert endless.failure_reasons == {"the quantity is not finite": p.n_failed} and len(endless.values) == good.sum()
     noisy = np.hstack([samples, np.tile(NOISE, (300, 1))])
     assert np.array_equal(quiet(with_noise(Line(fails=True)), noisy, noise=True).failed, p.failed)
 

@@ -234,7 +234,9 @@ def test_cached_rows_are_compared_with_gaps(rng, tmp_path, noise, jitter, stale)
 
     model = FunctionModel(unsteady, ["size", "speed"], CHANNELS, 0.02, 60, version="1")
     thetas = rng.uniform(0.5, 1.5, (4, 2))
-    first = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db")).simulator.statistics(thetas)
+    first = FELikelihood(
+        model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db")
+    ).simulator.statistics(thetas)
     again = FELikelihood(model, data, noise(CHANNELS), cache=SimulationCache(tmp_path / "cache.db"))
     if stale:
         # the counter is part of the label, so that a new generation begins
