@@ -2,7 +2,9 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,12 +15,10 @@ from ..simulation.label import ModelLabel
 from ..simulation.model import (
     Model,
     SimulationBatch,
-    misfit_batch,
     misfit_of_responses,
-    sent_simulation,
     simulate_batch,
 )
-from ..simulation.opened import Observed, Opened, observing, unpack
+from ..simulation.opened import Opened, observing
 from ..simulation.residual_statistics import Statistic, needs_response
 from ..simulation.user_code import is_of_user
 from .file import CacheFile
@@ -33,7 +33,7 @@ __all__ = [
     "difference_of",
     "is_transient",
     "largest_difference",
-    "observed_batch",
+    "observed",
     "response_tolerance",
     "row_of_response",
     "simulate_again",
@@ -96,62 +96,34 @@ class Simulated(NamedTuple):
 # new simulations ------------------------------------------------------------------------------------------------------
 
 
-def observed_batch(
-    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel
-) -> tuple[np.ndarray, list[str], Opened | None]:
-    """Statistics (n, n_numbers) and reasons of simulations, and what they opened; None for nothing new."""
-    if not label.observes:
-        return *misfit_batch(run.model, thetas, run.measured, run.pool, run.statistic), None
-    if run.pool is None:
-        with observing() as observer:
-            misfit, reasons = misfit_batch(run.model, thetas, run.measured, None, run.statistic)
-        return misfit, reasons, observer.result(label.known)
-    function = Observed(sent_simulation(run.model, run.measured, run.statistic))
-    return _in_pool(run, function, thetas, (run.n_numbers,))
-
-
-def _observed_responses(
-    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None
-) -> tuple[SimulationBatch, Opened | None]:
-    """Responses of simulations, and what they opened."""
+@contextmanager
+def observed(label: ModelLabel | None, pool: Any, complete: Callable[[Opened | None], None]) -> Iterator[None]:
+    """Pass on what the simulations of a block open, in this process or in workers, if the label asks for it."""
     if label is None or not label.observes:
-        return simulate_batch(run.model, thetas, run.pool), None
-    if run.pool is None:
-        with observing() as observer:
-            batch = simulate_batch(run.model, thetas)
-        return batch, observer.result(label.known)
-    shape = len(run.model.channels), run.model.n_steps
-    responses, reasons, opened = _in_pool(run, Observed(sent_simulation(run.model)), thetas, shape)
-    return SimulationBatch(responses, reasons), opened
-
-
-def _in_pool(
-    run: VerifyingRun, function: Observed, thetas: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, list[str], Opened]:
-    values, reasons, opened = np.full((len(thetas), *shape), np.nan), [], Opened({})
-    for row, outcome in zip(values, run.pool.map(function, list(thetas)), strict=True):
-        (result, reason), found = unpack(outcome)
-        reasons.append(reason)
-        opened = opened if found is None else opened | found
-        if result is not None:
-            row[...] = result
-    return values, reasons, opened
+        yield
+        return
+    with observing() as observer:
+        yield
+    complete(observer.result(label.known) if pool is None else Opened(observer.noted))
 
 
 def simulate_again(
-    run: VerifyingRun, thetas: np.ndarray, label: ModelLabel | None = None
-) -> tuple[list[Simulated], Opened | None]:
-    """New simulations, and what they opened if the label of the model is given."""
-    rows, opened = [], None
+    run: VerifyingRun,
+    thetas: np.ndarray,
+    label: ModelLabel | None = None,
+    complete: Callable[[Opened | None], None] | None = None,
+) -> list[Simulated]:
+    """New simulations; what they open is passed to the function `complete`, if the label of the model is given."""
+    rows = []
     size = max(1, RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))
     for start in range(0, len(thetas), size):
-        batch, found = _observed_responses(run, thetas[start : start + size], label)
-        opened = found if opened is None or found is None else opened | found
+        with observed(label, run.pool, complete):
+            batch = simulate_batch(run.model, thetas[start : start + size], run.pool)
         misfit, reasons = misfit_of_responses(run.model, batch, run.measured, run.statistic)
         with np.errstate(over="ignore", invalid="ignore"):
             norms = np.linalg.norm(batch.response, axis=2)
         rows += map(Simulated, misfit, reasons, norms)
-    return rows, opened
+    return rows
 
 
 class Repetition:
@@ -181,8 +153,7 @@ class Repetition:
         left = {key: row.theta for key, row in zip(keys, rows, strict=True) if key not in self.found}
         if left:
             start, label, thetas = time.perf_counter(), self.trust.label, list(left.values())
-            new, opened = simulate_again(run, np.array(thetas), label)
-            self.trust.complete(self.file, opened)
+            new = simulate_again(run, np.array(thetas), label, partial(self.trust.complete, self.file))
             if run.pool is None and label.observes:
                 label.has_changed_itself(label.changed(run.model))
             self.seconds += time.perf_counter() - start

@@ -173,7 +173,7 @@ class ModelGuard:
         tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
 
         def same(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
-            new, _ = simulate_again(run, thetas)
+            new = simulate_again(run, thetas)
             self.compared += len(thetas)
             return all(
                 is_transient(other.reason) or (not other.reason and not difference_of(one, other, run, tolerance))

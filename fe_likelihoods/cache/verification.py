@@ -458,7 +458,7 @@ class VerifiedCache:
     def _scatter(self, theta: np.ndarray, earlier: Simulated, run: VerifyingRun) -> str:
         """Advice for a model whose new simulations differ among themselves, after one more; empty if they agree."""
         start = time.perf_counter()
-        (new,), _ = simulate_again(run, theta[None])
+        (new,) = simulate_again(run, theta[None])
         self._again.seconds += time.perf_counter() - start
         if is_transient(new.reason) or (earlier.reason and new.reason):
             return ""

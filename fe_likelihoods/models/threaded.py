@@ -64,11 +64,7 @@ class ThreadedModel(BuiltInModel):
         thetas = check_thetas(thetas, self.parameter_names)
         measured = check_measured(measured, self.channels, self.n_steps)
         _ = self._prepared  # computed here, so that not every thread computes it
-
-        def misfit(theta: np.ndarray) -> np.ndarray:
-            return np.square(self._respond(theta) - measured).sum(axis=1)
-
-        return MisfitBatch(*map_threads(misfit, thetas, (len(self.channels),)))
+        return MisfitBatch(*map_threads(self._respond, thetas, (len(self.channels),), measured))
 
     def _prepare(self) -> Any:
         raise NotImplementedError

@@ -121,13 +121,13 @@ class Posterior:
 
     def __call__(self, x: Any) -> np.ndarray | float:
         """Same as `log_prob`."""
-        return self.log_prob(x)
+        log_prior, log_likelihood = self._evaluate(x)
+        return log_prior + log_likelihood
 
     def log_prob(self, x: Any) -> np.ndarray | float:
         """Log-prior plus log-likelihood: the posterior density up to the evidence."""
-        points, log_prior, log_likelihood = self._evaluate(x)
-        total = log_prior + log_likelihood
-        return total if points.ndim == 2 else float(total[0])
+        log_prior, log_likelihood = self._evaluate(x)
+        return log_prior + log_likelihood
 
     def log_prior(self, x: Any) -> np.ndarray | float:
         """Normalised log-density of the prior: -inf outside its support and where x is NaN."""
@@ -135,8 +135,7 @@ class Posterior:
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
         """Log-likelihood; -inf outside the support of the prior, where nothing is simulated."""
-        points, _, log_likelihood = self._evaluate(x)
-        return log_likelihood if points.ndim == 2 else float(log_likelihood[0])
+        return self._evaluate(x)[1]
 
     def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
         """`log_likelihood` with -1e100 instead of -inf, for clients that reject infinite values.
@@ -437,15 +436,17 @@ class Posterior:
         table = html_table((*header[:1], "prior", *header[2:], "nominal"), shown)
         return html_object(f"Posterior of {self.ndim} parameters", lines, table)
 
-    def _evaluate(self, x: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points in the given shape, and log-prior (n,) and log-likelihood (n,) of their rows."""
+    def _evaluate(self, x: Any) -> tuple[np.ndarray | float, np.ndarray | float]:
+        """Log-prior and log-likelihood of one point, or (n,) of n points; nothing is simulated outside the support."""
         points = as_points(x, self.prior.names)
-        log_prior = np.atleast_1d(self.prior.logpdf(points))
-        log_likelihood = np.full(len(log_prior), -np.inf)
+        log_prior = self.prior.logpdf(points)
+        if points.ndim == 1:
+            return log_prior, self.likelihood.log_likelihood(points) if log_prior > -np.inf else -np.inf
+        log_likelihood = np.full(len(points), -np.inf)
         inside = log_prior > -np.inf
         if inside.any():
-            log_likelihood[inside] = self.likelihood.log_likelihood(np.atleast_2d(points)[inside])
-        return points, log_prior, log_likelihood
+            log_likelihood[inside] = self.likelihood.log_likelihood(points[inside])
+        return log_prior, log_likelihood
 
 
 def _family(distribution: str) -> str:

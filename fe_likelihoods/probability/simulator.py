@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun, observed_batch
+from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import FinishedRows, MemoryCache, ResponseMemory, RowBuffer, distinct_keys
 from ..cache.simulation_cache import SimulationCache
 from ..signals.channels import Measurements
@@ -30,11 +30,12 @@ from ..simulation.model import (
     Model,
     SimulationBatch,
     has_batch_method,
+    misfit_batch,
     misfit_of_responses,
     sent_simulation,
     simulate_batch,
 )
-from ..simulation.opened import Observed, observing, unpack
+from ..simulation.opened import Observed, unpack
 from ..simulation.residual_statistics import Statistic, statistic_width
 from .checked_model import CheckedModel, opened_cache
 from .failures import FailureLog
@@ -511,11 +512,26 @@ class Simulator:
         TooManyFailures, ChangedModel
             As for `statistics`.
         """
-        if not self.streams:
-            return self._run_first(list(waiting))
-        ended = take_all(arrived, wait=True)
-        self.receive(ended)
-        return ended
+        if self.streams:
+            ended = take_all(arrived, wait=True)
+            self.receive(ended)
+            return ended
+        self._check_before()
+        waiting = list(waiting)
+        smallest, largest = self._chunk_limits(len(waiting), waiting[0].responses)
+        chosen = waiting[: max(smallest, min(largest, self.chunk_size))]
+        thetas, start = np.array([each.theta for each in chosen]), time.perf_counter()
+        with observed(self._checked.label, self.pool, self._checked.complete):
+            if self._runs_responses(chosen[0].responses):
+                values, reasons = simulate_batch(self.model, thetas, self.pool)
+            else:
+                values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
+        self._record(chosen, thetas, values, reasons, time.perf_counter() - start)
+        self.flush()
+        # the size grows by steps: the first simulations may be failures that took no time
+        seconds = time.perf_counter() - start
+        self.chunk_size = min(4 * len(chosen), 1 + int(_SECONDS_PER_CHUNK * len(chosen) / seconds))
+        return chosen
 
     def receive(self, ended: Sequence[RunningSimulation]) -> None:
         """Count and cache simulations that have ended in the pool, and record failures; sets `result` or `error`.
@@ -605,27 +621,6 @@ class Simulator:
 
     def _runs_responses(self, responses: bool) -> bool:
         return responses or (self.cache is not None and self.cache.responses)
-
-    def _run_first(self, waiting: list[RunningSimulation]) -> list[RunningSimulation]:
-        """Run the first of the waiting simulations, as many as are written to the disk together."""
-        self._check_before()
-        smallest, largest = self._chunk_limits(len(waiting), waiting[0].responses)
-        chosen = waiting[: max(smallest, min(largest, self.chunk_size))]
-        thetas, start = np.array([each.theta for each in chosen]), time.perf_counter()
-        if self._runs_responses(chosen[0].responses):
-            with observing() as observer:
-                values, reasons = simulate_batch(self.model, thetas, self.pool)
-            if self._checked.label.observes and self.pool is None:
-                self._checked.complete(observer.result(self._checked.label.known))
-        else:
-            values, reasons, opened = observed_batch(self._run, thetas, self._checked.label)
-            self._checked.complete(opened)
-        self._record(chosen, thetas, values, reasons, time.perf_counter() - start)
-        self.flush()
-        # the size grows by steps: the first simulations may be failures that took no time
-        seconds = time.perf_counter() - start
-        self.chunk_size = min(4 * len(chosen), 1 + int(_SECONDS_PER_CHUNK * len(chosen) / seconds))
-        return chosen
 
     def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
         """Smallest (all workers are busy) and largest number of simulations, of n, between two writes or reports."""

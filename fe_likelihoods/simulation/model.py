@@ -11,7 +11,8 @@ has a wrong shape, becomes a reason in words and a row of NaN, and does not affe
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import cycle
 from typing import Any, NamedTuple, Protocol
@@ -21,6 +22,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of
+from .opened import Observed, note, unpack
 from .residual_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 
 __all__ = [
@@ -219,11 +221,9 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     SimulationBatch
     """
     shape = (len(model.channels), model.n_steps)
-    whole = getattr(model, "simulate_batch", None) if pool is None else None
-    if whole is not None:
-        batch = _run_whole(model, partial(whole, thetas), (len(thetas), *shape))
-        if batch is not None:
-            return SimulationBatch(*batch)
+    if pool is None and getattr(model, "simulate_batch", None) is not None:
+        with _one_by_one_if_it_fails(model):
+            return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
     return SimulationBatch(*_run_each(_response, model, thetas, shape, pool))
 
 
@@ -254,16 +254,15 @@ def misfit_batch(
     """
     reduce = sums_of_squares if statistic is None else statistic
     shape = (statistic_width(measured, statistic),)
-    own = pool is None and statistic is None and not isinstance(measured, Comparison)
-    whole = getattr(model, "misfit_batch", None) if own else None
-    if whole is not None:
-        whole = partial(whole, thetas, measured)
-    elif pool is None and hasattr(model, "simulate_batch"):
-        whole = partial(_misfit_from_responses, model, thetas, measured, reduce)
-    if whole is not None:
-        batch = _run_whole(model, whole, (len(thetas), *shape))
-        if batch is not None:
-            return MisfitBatch(*batch)
+    own = (
+        statistic is None and not isinstance(measured, Comparison) and getattr(model, "misfit_batch", None) is not None
+    )
+    if pool is None and (own or hasattr(model, "simulate_batch")):
+        with _one_by_one_if_it_fails(model):
+            batch = (
+                model.misfit_batch(thetas, measured) if own else _misfit_from_responses(model, thetas, measured, reduce)
+            )
+            return MisfitBatch(*_checked_batch(model, batch, (len(thetas), *shape)))
     return MisfitBatch(*_run_each(partial(_misfit, measured, reduce), model, thetas, shape, pool))
 
 
@@ -413,7 +412,11 @@ def _run_each(
     if pool is None:
         outcomes = [_attempt(run, model, theta) for theta in thetas]
     else:
-        outcomes = list(pool.map(partial(_attempt, run, model), list(thetas)))
+        outcomes = []
+        for outcome in pool.map(Observed(partial(_attempt, run, model)), list(thetas)):
+            result, opened = unpack(outcome)
+            outcomes.append(result)
+            note(opened)
     values = np.full((len(thetas), *shape), np.nan)
     for row, (result, _) in zip(values, outcomes, strict=True):
         if result is not None:
@@ -421,21 +424,12 @@ def _run_each(
     return values, [reason for _, reason in outcomes]
 
 
-def _run_whole(
-    model: Model, method: Callable[[], tuple], shape: tuple[int, ...]
-) -> tuple[np.ndarray, list[str]] | None:
-    """Results of a model's own batch method, or None if it failed as a whole and the sets must be run one by one."""
+@contextmanager
+def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
+    """A line in the log if a model's own batch method fails: one bad set of parameters must not make others fail."""
     try:
-        values, reasons = method()
-        if np.iscomplexobj(values):
-            raise ValueError("expected real numbers, got complex ones")
-        values = np.array(values, dtype=float)
-        reasons = [reason if isinstance(reason, str) else str(reason) for reason in reasons]
-        if values.shape != shape or len(reasons) != shape[0]:
-            raise ValueError(
-                f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
-            )
-    except BaseException as error:  # one bad parameter set must not make the others fail
+        yield
+    except BaseException as error:
         raise_if_it_ends_the_run(error)
         logger.warning(
             "A batch method of %s failed; its parameter sets are run one by one: %s: %s",
@@ -443,7 +437,19 @@ def _run_whole(
             type(error).__name__,
             error,
         )
-        return None
+
+
+def _checked_batch(model: Model, batch: tuple, shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
+    """What a model's own batch method returned, with NaN in the rows that failed; ValueError for a wrong shape."""
+    values, reasons = batch
+    if np.iscomplexobj(values):
+        raise ValueError("expected real numbers, got complex ones")
+    values = np.array(values, dtype=float)
+    reasons = [reason if isinstance(reason, str) else str(reason) for reason in reasons]
+    if values.shape != shape or len(reasons) != shape[0]:
+        raise ValueError(
+            f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"
+        )
     for row in np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))):
         reasons[row] = reasons[row] or not_finite(model, values[row])
     values[[bool(reason) for reason in reasons]] = np.nan

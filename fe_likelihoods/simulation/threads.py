@@ -16,18 +16,23 @@ __all__ = ["map_threads", "run_on_threads"]
 
 
 def map_threads(
-    run: Callable[[np.ndarray], np.ndarray], thetas: np.ndarray, shape: tuple[int, ...]
+    run: Callable[[np.ndarray], np.ndarray],
+    thetas: np.ndarray,
+    shape: tuple[int, ...],
+    measured: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[str]]:
     """Results of many simulations, on as many threads as numba uses.
 
     Parameters
     ----------
     run : callable
-        Takes one row of `thetas` and returns an array of `shape`, or raises `SimulationFailed`.
+        Takes one row of `thetas` and returns a response, or raises `SimulationFailed`.
     thetas : (n, n_parameters) float
         Parameter sets.
     shape : tuple of int
         Shape of one result.
+    measured : (n_channels, n_steps) float, optional
+        Measured response [SI]: results are the sums of squared residuals (n_channels,) instead of responses.
 
     Returns
     -------
@@ -42,13 +47,18 @@ def map_threads(
     def one(i: int) -> None:
         try:
             values = run(thetas[i])
+            if measured is not None:
+                values = np.square(values - measured).sum(axis=1)
             if np.iscomplexobj(values):  # the assignment would keep the real part
                 raise ValueError("expected real numbers, got complex ones")
             out[i] = values
         except SimulationFailed as failure:
             reasons[i] = failure.reason
 
-    run_on_threads(one, range(len(thetas)))
+    if len(thetas) == 1:
+        one(0)
+    else:
+        run_on_threads(one, range(len(thetas)))
     return out, reasons
 
 

@@ -243,7 +243,7 @@ def test_pickle(Sampler, make_backend):
             assert sampler.pool is pool
         sampler.pool = None
         copy = pickle.loads(pickle.dumps(sampler))
-        assert copy.simulator.pool is None
+        assert copy.pool is None
         assert np.array_equal(copy.get_chain(), sampler.get_chain())
         if isinstance(sampler.backend, emcee.backends.HDFBackend):
             return  # both would write to the same file
