@@ -9,7 +9,7 @@ first column. The rows are explained in `benchmarks.measured_transfer`.
 
 import numpy as np
 
-from fe_likelihoods import ModulatedNoise, dissipated_energy, peak, propagate
+from fe_likelihoods import GaussianNoise, dissipated_energy, peak, propagate
 
 from . import tested_column
 from .measured_transfer import Case, Fit, calibrate, ratios_of, score_case, skipped, stored_responses, within
@@ -70,10 +70,12 @@ def _growth(test: Specimen, fit: Fit) -> float:
     return float(np.polyfit(*np.transpose(sizes), 1)[0])
 
 
-def _noise(test: Specimen) -> ModulatedNoise:
+def _noise(test: Specimen) -> GaussianNoise:
     """Shares of the level of the force at a drift of 1 %."""
     model = test.model
-    return ModulatedNoise(model.channels, window=_WINDOW, sensor=[SENSOR], deformation=0.01 * model.height)
+    return GaussianNoise(
+        model.channels, level="response", window=_WINDOW, sensor=[SENSOR], deformation=0.01 * model.height
+    )
 
 
 def _numbers(test: Specimen, part: slice, kept: slice) -> dict:

@@ -13,10 +13,10 @@ import numpy as np
 from fe_likelihoods import (
     BridgeDeck,
     Channel,
+    GaussianNoise,
     LinearStructure,
     LogNormal,
     Measurements,
-    ModulatedNoise,
     Record,
     ShearFrame,
     Steel,
@@ -63,7 +63,7 @@ def coupon(repeats: int = 1) -> list[Row]:
     prior = {name: TruncatedNormal(1.0, each) for name, each in sd.items()}
     (name,) = (channel.name for channel in model.channels)
     later = slice(half, None)
-    noise = ModulatedNoise(whole.channels, window=20 * model.dt, sensor=[1.5 * _MPA], deformation=0.01)
+    noise = GaussianNoise(whole.channels, level="response", window=20 * model.dt, sensor=[1.5 * _MPA], deformation=0.01)
     case = Case(
         "coupon, second half",
         whole,
@@ -101,7 +101,7 @@ def frame(repeats: int = 1) -> list[Row]:
 
     used = ("floor1", "floor3")
     model, measured = structure(used, "shaking 1"), data.select(used).trim(*_SHAKINGS["shaking 1"])
-    noise = ModulatedNoise(model.channels, window=0.5, sensor=[sensor] * len(used))
+    noise = GaussianNoise(model.channels, level="response", window=0.5, sensor=[sensor] * len(used))
     prior = {f"stiffness_{i}": LogNormal(1.0, 0.5) for i in (1, 2, 3)}
     prior |= {f"damping_{i}": LogNormal(0.01, 1.0) for i in (1, 2, 3)}
     rows, scored = [], []
@@ -136,7 +136,7 @@ def meloland(repeats: int = 1) -> list[Row]:
 
     weak, strong = structure(*_MELOLAND_PARTS["weak"]), structure(*_MELOLAND_PARTS["strong"])
     prior = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
-    noise = ModulatedNoise([channel], window=1.0, sensor=[0.002])
+    noise = GaussianNoise([channel], level="response", window=1.0, sensor=[0.002])
     rows, scored = [], []
     for seed in range(1, repeats + 1):
         fit, modulated = (calibrate(*weak, prior, 1.0, seed, noise=each) for each in (None, noise))

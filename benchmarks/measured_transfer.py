@@ -4,12 +4,12 @@ A model is calibrated with one measured event, or the first part of a test, and 
 made in several ways:
 
 * "SI": noise with a standard deviation in the unit of the channel, as `GaussianNoise` has it;
-* "relative": the same standard deviations as shares of the level of the predicted response (`RelativeNoise`), one level
-  for the whole motion; "window": the level within a window around each sample. All three have the same posterior of
-  the structure, because a share is a standard deviation divided by a constant, and the
-  prior of the share is that of the standard deviation divided by the same constant;
-* "modulated": shares of the level of the simulated response (`ModulatedNoise` with its default settings, and with the
-  imposed deformation of a test that has one), calibrated with this noise: another posterior of the structure;
+* "relative": the same standard deviations as shares of the level of the predicted response (``level="measured"``), one
+  level for the whole motion; "window": the level within a window around each sample. All three have the same posterior
+  of the structure, because a share is a standard deviation divided by a constant, and its prior is divided by the same
+  constant;
+* "modulated": shares of the level of the simulated response (``level="response"`` with its default settings, and with
+  the imposed deformation of a test that has one), calibrated with this noise: another posterior of the structure;
 * "relative, model" and "modulated, model", for numbers such as peaks: with errors that have the spectrum of the
   response in the place of errors that are independent from sample to sample (``noise="model"``);
 * "ratios", for numbers: the response without noise, times the ratio of measured to fitted value in the
@@ -34,10 +34,8 @@ from fe_likelihoods import (
     GaussianNoise,
     HalfNormal,
     Measurements,
-    ModulatedNoise,
     Posterior,
     QuantityScores,
-    RelativeNoise,
     SimulationCache,
     propagate,
     share_within,
@@ -70,7 +68,7 @@ class Case(NamedTuple):
         The samples that are scored.
     numbers : mapping of str to ChannelQuantity
         Numbers that are scored, such as the peak in this part.
-    noise : ModulatedNoise
+    noise : GaussianNoise
         Noise of the calibrated channels; the calibration with this kind of noise has the same settings, except for the
         deformation of another specimen.
     """
@@ -80,7 +78,7 @@ class Case(NamedTuple):
     measured: Measurements
     part: slice
     numbers: Mapping[str, ChannelQuantity]
-    noise: ModulatedNoise
+    noise: GaussianNoise
 
 
 class Fit(NamedTuple):
@@ -91,7 +89,7 @@ class Fit(NamedTuple):
     structure : ndarray, shape (n, n_parameters)
         Parameters of the structure.
     sigma : ndarray, shape (n, n_channels)
-        Standard deviations of the errors [SI]; with `ModulatedNoise` their shares of the level [-].
+        Standard deviations of the errors [SI]; with ``level="response"`` their shares of the level [-].
     model : Model
         The model of the calibration.
     measured : Measurements
@@ -131,7 +129,7 @@ def calibrate(
     scale: float,
     seed: int,
     *,
-    noise: ModulatedNoise | None = None,
+    noise: GaussianNoise | None = None,
     walkers: int = 300,
     draws: int = 200,
 ) -> Fit:
@@ -171,7 +169,7 @@ def score_case(
     case : Case
         What is predicted. Channels that were not calibrated have the mean noise of those that were.
     fit, modulated : Fit
-        The calibrations with white noise and with `ModulatedNoise`.
+        The calibrations with white noise and with ``level="response"``.
     ratios : mapping of str to float
         Ratios of measured to fitted numbers in the calibration.
     seed : int
@@ -179,7 +177,10 @@ def score_case(
     """
     levels = np.sqrt(np.nanmean(np.square(fit.measured.values), axis=1))
     shares, sensor, channels = np.minimum(fit.sigma / levels, 0.99), case.noise.sensor, case.model.channels
-    relative, window = (RelativeNoise.of(fit.measured, window=w, sensor=sensor) for w in (None, case.noise.window))
+    relative, window = (
+        GaussianNoise(fit.measured.channels, level="measured", window=w, sensor=sensor)
+        for w in (None, case.noise.window)
+    )
     kinds = {
         "SI": (GaussianNoise(fit.model.channels), fit.structure, fit.sigma),
         "relative": (relative, fit.structure, shares),

@@ -7,7 +7,8 @@
   medians over the events, CRPS, interval score and width as multiples of the root mean square of the measured channel.
 * "Meloland": the evidence for the earthquake of 1979 (channel 7). There is no second event.
 
-The likelihood of `RelativeNoise` is not a normalised density, so that its evidence is approximate; the others are.
+The likelihood of shares of the measured channel is not a normalised density, so that its evidence is approximate; the
+others are.
 
 The data are no part of this project: set FE_SHARED to a folder with the downloads from https://www.strongmotioncenter.org
 (``*ce89324p.zip`` and ``*ce01336p.zip``) in ``measured``. Without them one row says so.
@@ -22,7 +23,6 @@ import numpy as np
 
 from fe_likelihoods import (
     AutoregressiveNoise,
-    BandNoise,
     BridgeDeck,
     FELikelihood,
     GaussianNoise,
@@ -30,11 +30,9 @@ from fe_likelihoods import (
     HistoryScores,
     LinearStructure,
     Measurements,
-    ModulatedNoise,
     Noise,
     Posterior,
     Record,
-    RelativeNoise,
     Uniform,
     propagate,
     read_v2,
@@ -59,12 +57,16 @@ _WALKERS, _STEPS = 150, 600
 NOISES: dict[str, Callable[[Measurements], Noise]] = {
     "white": lambda measured: GaussianNoise(measured.channels, sensor=_floor(measured)),
     "autoregressive": lambda measured: AutoregressiveNoise(measured.channels, sensor=_floor(measured)),
-    "relative": lambda measured: RelativeNoise.of(measured, window=_WINDOW, sensor=_floor(measured)),
+    "relative": lambda measured: GaussianNoise(
+        measured.channels, level="measured", window=_WINDOW, sensor=_floor(measured)
+    ),
     "modulated": lambda measured: _modulated(measured, 0.25),
     "modulated, half": lambda measured: _modulated(measured, 0.5),
     "modulated, envelope": lambda measured: _modulated(measured, 1.0),
-    "bands, shares": lambda measured: BandNoise(measured.channels, _EDGES, sensor=_floor(measured)),
-    "bands, SI": lambda measured: BandNoise(measured.channels, _EDGES, relative=False, sensor=_floor(measured)),
+    "bands, shares": lambda measured: GaussianNoise(
+        measured.channels, groups=_EDGES, level="response", sensor=_floor(measured)
+    ),
+    "bands, SI": lambda measured: GaussianNoise(measured.channels, groups=_EDGES, sensor=_floor(measured)),
 }
 _MADE_WITH = {  # parameters of the noises that make synthetic data
     "white": [0.3],
@@ -88,8 +90,8 @@ def _floor(measured: Measurements) -> list[float]:
     return [_SENSOR] * measured.n_channels
 
 
-def _modulated(measured: Measurements, local: float) -> ModulatedNoise:
-    return ModulatedNoise(measured.channels, window=_WINDOW, sensor=_floor(measured), local=local)
+def _modulated(measured: Measurements, local: float) -> GaussianNoise:
+    return GaussianNoise(measured.channels, level="response", window=_WINDOW, sensor=_floor(measured), local=local)
 
 
 def _prior_of(name: str) -> Uniform | HalfNormal:
@@ -129,7 +131,7 @@ def _synthetic(seed: int) -> list[Row]:
     rows = []
     for truth, parameters in _MADE_WITH.items():
         noise = NOISES[truth](Measurements(model.channels, model.dt, response))
-        if isinstance(noise, RelativeNoise):
+        if noise.level == "measured":
             noise = replace(noise, window=None)  # one level, as in its likelihood
         drawn = sample_noise(noise, np.array([parameters]), 1, model.dt)
         measured = Measurements(model.channels, model.dt, response + drawn.draw(0, model.n_steps, rng, response))

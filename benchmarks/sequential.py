@@ -11,6 +11,7 @@ import numpy as np
 from fe_likelihoods import (
     Events,
     FELikelihood,
+    GaussianNoise,
     HalfNormal,
     Measurements,
     Posterior,
@@ -49,7 +50,7 @@ def sequential(repeats: int = 3, walkers: int = 500) -> list[Row]:
     }
 
     def run(data: dict, prior: dict, seed: int) -> SMCSampler:
-        likelihood = FELikelihood(column, data, noise="per event")
+        likelihood = FELikelihood(column, data, noise=GaussianNoise(column.channels, groups="event"))
         levels = {name: sigmas[name] for name in likelihood.parameter_names[len(names) :]}
         posterior = Posterior(likelihood, Prior(prior | levels))
         sampler = SMCSampler(walkers, posterior.ndim, posterior, vectorize=True, seed=seed)

@@ -19,12 +19,12 @@ from fe_likelihoods import (
     BridgeDeck,
     EventRatios,
     FELikelihood,
+    GaussianNoise,
     HalfNormal,
     LinearStructure,
     Measurements,
     Posterior,
     Record,
-    RelativeNoise,
 )
 from fe_likelihoods.models.linear_system import respond_structure
 from samplers import SMCSampler
@@ -220,7 +220,7 @@ def test_the_amplitude_dependent_posterior_of_one_event_is_that_of_its_linear_mo
     model = LinearStructure(BridgeDeck("ch7"), supports)
     (response,) = model.simulate([4.0, 0.08, 0.7])
     measured = Measurements(model.channels, 0.02, [response + 0.2 * response.std() * rng.standard_normal(200)])
-    likelihood = FELikelihood(model, measured, RelativeNoise.of(measured))
+    likelihood = FELikelihood(model, measured, GaussianNoise(measured.channels, level="measured"))
     spread = np.exp([0.005, 0.02, 0.01, 0.02] * rng.standard_normal((100, 4)))  # stands for posterior samples
     posterior = Posterior(likelihood, transfer._PRIOR | {"share_ch7": HalfNormal(1.0)})
     linear = transfer._Fit(posterior, np.array([4.0, 0.08, 0.7, 0.2]) * spread, 0.0, 0.0)

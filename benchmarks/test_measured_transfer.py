@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from benchmarks import measured_columns, measured_tests, measured_transfer, strain_penetration, tested_column
-from fe_likelihoods import Channel, FunctionModel, LogNormal, Measurements, ModulatedNoise, arias_intensity, peak
+from fe_likelihoods import Channel, FunctionModel, GaussianNoise, LogNormal, Measurements, arias_intensity, peak
 
 BENCHMARKS = (
     measured_columns.columns,
@@ -92,7 +92,7 @@ def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(
     numbers = {"peak": peak("top"), "energy": arias_intensity("top")}
     ratios = measured_transfer.ratios_of(fit, strong[0], numbers)
     assert ratios["energy"] == pytest.approx(1.0 + 0.25**2, abs=0.03)  # the measured energy contains the errors
-    noise = ModulatedNoise(channels, window=1.0, sensor=[1e-3])
+    noise = GaussianNoise(channels, level="response", window=1.0, sensor=[1e-3])
     modulated = measured_transfer.calibrate(*strong, {"gain": LogNormal(1.0, 0.5)}, 5.0, 1, noise=noise, walkers=100)
     case = measured_transfer.Case("weak", *weak, slice(None), numbers, noise)
     runs = 0

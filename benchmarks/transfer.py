@@ -54,7 +54,6 @@ from fe_likelihoods import (
     Prior,
     QuantityScores,
     Record,
-    RelativeNoise,
     StoredPosterior,
     Uniform,
     Varying,
@@ -258,7 +257,7 @@ def _calibrate(records: dict[int, Record], noise: str, seed: int) -> _Fit:
     """Posterior of one event, with noise in SI units ("white", "effective samples") or as a share of the response."""
     model, measured = _model_and_measurements(records)
     if noise == "relative":
-        kind = RelativeNoise.of(measured, window=_WINDOW, sensor=(_SENSOR,))
+        kind = GaussianNoise(measured.channels, level="measured", window=_WINDOW, sensor=(_SENSOR,))
         prior = _PRIOR | {"share_ch7": HalfNormal(1.0)}
     else:
         kind, prior = GaussianNoise(model.channels), _PRIOR | {"sigma_ch7": HalfNormal(1.0)}

@@ -22,14 +22,9 @@ from .models.steel_coupon import SteelCoupon
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
-from .noise.bands import BandNoise
-from .noise.events import EventNoise
-from .noise.gaussian import GaussianNoise, Noise, SharedGaussianNoise
-from .noise.marginal import MarginalNoise
-from .noise.modulated import ModulatedNoise
-from .noise.relative import RelativeNoise
+from .noise.gaussian import GaussianNoise
+from .noise.protocol import Noise
 from .noise.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
-from .noise.time_shifts import TimeShiftNoise
 from .plots.damage import plot_damage
 from .plots.histories import plot_histories, plot_loop
 from .plots.materials import plot_material, plot_moment_curvature
@@ -99,7 +94,6 @@ __all__ = [
     "Alignment",
     "AutoregressiveNoise",
     "AveragedPrediction",
-    "BandNoise",
     "BarBuckling",
     "Bars",
     "Bearing",
@@ -116,7 +110,6 @@ __all__ = [
     "DisplacementHistory",
     "Distribution",
     "EquivalentLinear",
-    "EventNoise",
     "EventRatios",
     "EventWindow",
     "Events",
@@ -142,7 +135,6 @@ __all__ = [
     "LocalPool",
     "LogNormal",
     "LowCycleFatigue",
-    "MarginalNoise",
     "MaterialCurve",
     "MeasuredData",
     "MeasuredHistory",
@@ -152,7 +144,6 @@ __all__ = [
     "Mode",
     "ModeSearch",
     "Model",
-    "ModulatedNoise",
     "MomentCurvature",
     "MultivariateDistribution",
     "MultivariateNormal",
@@ -169,13 +160,11 @@ __all__ = [
     "QuantityScores",
     "RCColumn",
     "Record",
-    "RelativeNoise",
     "ResidualChecks",
     "ResponseEmulator",
     "ResponseGuide",
     "ResponseSpectrum",
     "Rubber",
-    "SharedGaussianNoise",
     "ShearFlexuralBeam",
     "ShearFrame",
     "SimulationCache",
@@ -184,7 +173,6 @@ __all__ = [
     "Steel",
     "SteelCoupon",
     "StoredPosterior",
-    "TimeShiftNoise",
     "TooManyFailures",
     "TransientReason",
     "TruncatedMultivariateNormal",

@@ -34,7 +34,7 @@ import numpy as np
 from .cache.simulation_cache import SimulationCache
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .noise.autoregressive import AutoregressiveNoise
-from .noise.gaussian import GaussianNoise, SharedGaussianNoise
+from .noise.gaussian import GaussianNoise
 from .probability.likelihood import FELikelihood
 from .probability.posterior import Posterior
 from .probability.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
@@ -164,14 +164,14 @@ def bridge_column_measurements(
     return Measurements(model.channels, record.dt, values, description)
 
 
-def _make_noise(noise: Any, channels: Sequence[Channel], measurements: Measurements) -> Any:
+def _make_noise(noise: Any, channels: Sequence[Channel]) -> Any:
     """Return the noise with a name, or the noise that was given; raise ValueError for an unknown name."""
     if not isinstance(noise, str):
         return noise
     if noise == "per channel":
         return GaussianNoise(channels)
     if noise == "shared":
-        return SharedGaussianNoise.of(measurements.select([channel.name for channel in channels]))
+        return GaussianNoise(channels, groups="all")
     if noise == "autoregressive":
         return AutoregressiveNoise(channels)
     raise ValueError(
@@ -260,10 +260,10 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    law = _make_noise("per channel" if noise == "marginal" else noise, model.channels, measurements)
+    law = _make_noise("per channel" if noise == "marginal" else noise, model.channels)
     likelihood = FELikelihood(model, measurements, law, cache=cache)
     sensors = [channel.name for channel in model.channels if channel.name not in BRIDGE_COLUMN_NOISE]
-    rms = SharedGaussianNoise.of(measurements.select(sensors)).scales if sensors else ()
+    rms = measurements.select(sensors).root_mean_squares if sensors else ()
     prior = bridge_column_prior(law.parameter_names, dict(zip(sensors, rms, strict=True)))
     coarse = None
     intensity = np.cumsum(record.acceleration**2)
@@ -273,7 +273,7 @@ def bridge_column(
     if end > record.dt and early:
         cheap = replace(model, loading=record.trim(0.0, end), **_COARSE_TOLERANCES)
         coarse = Posterior(
-            FELikelihood(cheap, measurements.trim(0.0, end), law, cache=likelihood.simulator.cache), prior
+            FELikelihood(cheap, measurements.trim(0.0, end), likelihood.noise, cache=likelihood.simulator.cache), prior
         )
     posterior = Posterior(likelihood, prior, coarse)
     return posterior.marginal() if noise == "marginal" else posterior
@@ -443,8 +443,8 @@ def isolated_bridge(
     model = IsolatedBridge(
         record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
     )
-    law = _make_noise("shared" if noise == "marginal" else noise, model.channels, measurements)
-    rms = SharedGaussianNoise.of(measurements).scales
+    law = _make_noise("shared" if noise == "marginal" else noise, model.channels)
+    rms = measurements.root_mean_squares
     scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
     sigmas = {name: scales[name] for name in law.parameter_names if name in scales}
     prior = isolated_bridge_prior(model.parameter_names, sigmas).distributions | correlation_priors(

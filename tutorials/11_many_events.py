@@ -44,6 +44,7 @@ from fe_likelihoods import (
     EquivalentLinear,
     EventRatios,
     FELikelihood,
+    GaussianNoise,
     HalfNormal,
     HierarchicalPosterior,
     Hierarchy,
@@ -53,7 +54,6 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
-    RelativeNoise,
     StoredPosterior,
     Uniform,
     Varying,
@@ -161,7 +161,7 @@ new_measured = {name: measure(100 + k, supports) for k, (name, supports) in enum
 # ----------------
 #
 # The model is linear: frequency and damping; the share of the ends in the stiffness is taken as known. The noise is a
-# share of the response, because the error of a model grows with the response (`RelativeNoise`).
+# share of the response, because the error of a model grows with the response (``level="measured"``).
 
 MODEL_PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
 PEAK = peak("deck")
@@ -170,7 +170,7 @@ PEAK = peak("deck")
 def calibrate(supports: tuple[Record, ...], data: Measurements, share: float | None) -> tuple[Posterior, SMCSampler]:
     """Posterior of the linear deck for one event, and the sampler that has run; the share of the ends may be known."""
     model = LinearStructure(BridgeDeck("deck", share=share), supports)
-    noise = RelativeNoise.of(data, window=1.0, sensor=(SENSOR,))
+    noise = GaussianNoise(data.channels, level="measured", window=1.0, sensor=(SENSOR,))
     prior = {name: MODEL_PRIOR[name] for name in model.parameter_names}
     posterior = Posterior(FELikelihood(model, data, noise), prior | {"share_deck": HalfNormal(1.0)})
     sampler = SMCSampler(WALKERS, posterior.ndim, posterior, vectorize=True, seed=args.seed)
@@ -310,7 +310,7 @@ def joint(amplitude: bool) -> tuple[Posterior, SMCSampler]:
     for number, (name, supports) in enumerate([(name, events[name]) for name in chosen], start=1):
         parts = BridgeDeck("deck", share=TRUTH["share"])
         model = LinearStructure(EquivalentLinear(parts, REFERENCE) if amplitude else parts, supports)
-        noise = RelativeNoise.of(measured[name], window=1.0, sensor=(SENSOR,))
+        noise = GaussianNoise(measured[name].channels, level="measured", window=1.0, sensor=(SENSOR,))
         likelihoods[f"E{number}"] = FELikelihood(model, measured[name], noise)
     own = {"softening": Uniform(0.0, 0.6), "damping_growth": Uniform(0.0, 1.0)} if amplitude else {}
     prior = {name: MODEL_PRIOR[name] for name in ("frequency", "damping")} | {"share_deck": HalfNormal(1.0)}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..prediction.model_error import follows_response
+from ..noise.protocol import follows_response
 from ..prediction.prediction import Prediction
 from ..probability.posterior import Posterior
 from ..reporting.other_events import OtherEvent, describe_event

@@ -24,15 +24,9 @@ _TERMS = (
         r"see the failures that log_prob_fn reports \(posterior\.report\(\) for a posterior of fe_likelihoods\)",
         "see the first failure in the messages above",
     ),
-    (r"ModulatedNoise, BandNoise and RelativeNoise scale", '"modulated", "bands" and "relative" of [noise] scale'),
-    (r"Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" or "bands" in [noise]'),
-    (r"Calibrate with fewer samples or BandNoise", 'Use fewer samples, or set kind = "bands" in [noise]'),
+    (r"Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" in [noise]'),
     (
-        r"Calibrate with (a smaller local=, such as 0\.25 or 0, )?RelativeNoise or GaussianNoise",
-        'Set a smaller local, such as 0.25 or 0, or kind = "relative" or "per channel" in [noise]',
-    ),
-    (
-        r'Predict peaks with noise="model"',
+        r'Predict peaks of the structure with noise="model"',
         'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
     ),
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .priors import parse_prior
-from .schema import EVENT, FREE_SECTIONS, MODELS, NOISES, PARTS, SECTIONS, Key, did_you_mean, read_keys
+from .schema import EVENT, FREE_SECTIONS, MODELS, PARTS, SECTIONS, Key, did_you_mean, read_keys
 
 __all__ = ["Job", "parse_job", "read_job"]
 
@@ -26,14 +26,10 @@ class Job:
         Folder that files in it are relative to.
     kind : str
         Kind of the model, a key of `fe_likelihoods.command.schema.MODELS`.
-    model, record, measurements, sampler, budget, prediction : dict
+    model, record, measurements, noise, sampler, budget, prediction : dict
         Keys of the sections.
     priors : dict of str to str
         Distributions as text, by parameter.
-    noise : str
-        Kind of the noise, a key of `fe_likelihoods.command.schema.NOISES`.
-    noise_options : dict
-        The other keys of its section.
     events : dict of str to dict
         Keys of the events to predict, by name.
     event : str
@@ -50,8 +46,7 @@ class Job:
     record: dict[str, Any]
     measurements: dict[str, Any]
     priors: dict[str, str]
-    noise: str
-    noise_options: dict[str, Any]
+    noise: dict[str, Any]
     sampler: dict[str, Any]
     budget: dict[str, Any]
     prediction: dict[str, Any]
@@ -142,31 +137,7 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         except ValueError as error:
             raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
     events = _read_events(content.get("events", {}), file.name)
-    options = values.pop("noise")
-    noise = _noise_kind(options, file.name)
-    return Job(
-        file, text, folder, kind, model, priors=priors, noise=noise, noise_options=options, events=events, **values
-    )
-
-
-def _noise_kind(given: dict[str, Any], file: str) -> str:
-    """The kind of the noise, which is taken out of the keys of its section; these are checked."""
-    noise = given.pop("kind", "per channel")
-    if noise not in NOISES:
-        raise ValueError(f"{file}: [noise] kind: unknown noise {noise!r}; {did_you_mean(noise, tuple(NOISES))}")
-    found = NOISES[noise]
-    for key in given:
-        if key not in found.keys:
-            others = ", ".join(f'"{name}"' for name, each in NOISES.items() if key in each.keys)
-            raise ValueError(
-                f'{file}: [noise] {key}: the kind "{noise}" has no such key; it is for {others}: leave it out, or give '
-                "one of these kinds"
-            )
-    needed = (*found.required, *(("sensor",) if noise == "bands" and given.get("shares", True) else ()))
-    if missing := [key for key in needed if key not in given]:
-        meaning = next(key.meaning for key in SECTIONS["noise"] if key.name == missing[0])
-        raise ValueError(f'{file}: [noise] {missing[0]}: the kind "{noise}" needs this key; it is {meaning}')
-    return noise
+    return Job(file, text, folder, kind, model, priors=priors, events=events, **values)
 
 
 def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:

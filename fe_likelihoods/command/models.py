@@ -14,7 +14,6 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..models.external import UserModel
-from ..noise.gaussian import SharedGaussianNoise
 from ..probability.distributions import Distribution, HalfNormal, Uniform
 from ..probability.likelihood import FELikelihood
 from ..probability.parameters import channels_of_deviations
@@ -82,11 +81,11 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
         raise ValueError(
             f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
         )
-    law = _located(job, "noise", lambda: make_noise(job, model, measured))
+    law = _located(job, "noise", lambda: make_noise(job, model))
     likelihood = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
     priors, assumed = _make_priors(job, likelihood)
     posterior = Posterior(likelihood, priors)
-    posterior = posterior.marginal() if job.noise == "marginal" else posterior
+    posterior = _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior
     return Problem(posterior, record, assumed, _truth(job, posterior, record))
 
 
@@ -317,5 +316,5 @@ def _default_prior(name: str, channel: Channel | None, measured: Measurements) -
         return Uniform(-1.0, 1.0)
     if channel is None:
         return HalfNormal(NOISE_SCALE)
-    rms = SharedGaussianNoise.of(measured.select([channel.name])).scales[0]
+    rms = measured.select([channel.name]).root_mean_squares[0]
     return HalfNormal(float(f"{NOISE_SCALE * rms:.3g}") if math.isfinite(rms) and rms > 0.0 else 1.0)

@@ -3,11 +3,8 @@
 from typing import Any
 
 from ..noise.autoregressive import AutoregressiveNoise
-from ..noise.bands import BandNoise
-from ..noise.gaussian import GaussianNoise, SharedGaussianNoise
-from ..noise.modulated import ModulatedNoise
-from ..noise.relative import RelativeNoise
-from ..signals.channels import Channel, Measurements
+from ..noise.gaussian import GaussianNoise
+from ..signals.channels import Channel
 from ..simulation.model import Model
 from .job import Job
 from .schema import did_you_mean, read_quantity
@@ -15,35 +12,30 @@ from .schema import did_you_mean, read_quantity
 __all__ = ["make_noise"]
 
 
-def make_noise(job: Job, model: Model, measured: Measurements) -> Any:
+def make_noise(job: Job, model: Model) -> Any:
     """The noise of a file, for `FELikelihood`.
 
     Parameters
     ----------
     job : Job
     model : Model
-    measured : Measurements
 
     Raises
     ------
     ValueError
         If a value is wrong for the noise; the message names the key where one is to blame.
     """
-    given = dict(job.noise_options)
+    given = {name: value for name, value in job.noise.items() if name not in ("kind", "marginal")}
+    kind = job.noise.get("kind", "gaussian")
+    if kind not in ("gaussian", "autoregressive"):
+        raise ValueError(f"kind: unknown noise {kind!r}; {did_you_mean(kind, ('gaussian', 'autoregressive'))}")
     if "sensor" in given:
         given["sensor"] = _sensor(job, given["sensor"], model.channels)
-    measured = measured.select([channel.name for channel in model.channels])
-    if job.noise == "per event":
-        return "per event"
-    if job.noise == "shared":
-        return SharedGaussianNoise.of(measured, **given)
-    if job.noise == "relative":
-        return RelativeNoise.of(measured, **given)
-    if job.noise == "modulated":
-        return ModulatedNoise(model.channels, **given)
-    if job.noise == "bands":
-        return BandNoise(model.channels, given.pop("edges"), relative=given.pop("shares", True), **given)
-    return (AutoregressiveNoise if job.noise == "autoregressive" else GaussianNoise)(model.channels, **given)
+    if kind == "gaussian":
+        return GaussianNoise(model.channels, **given)
+    if more := [name for name in given if name != "sensor"]:
+        raise ValueError(f'{more[0]}: the kind "autoregressive" has no such key: leave it out, or leave kind out')
+    return AutoregressiveNoise(model.channels, **given)
 
 
 def _sensor(job: Job, given: dict[str, Any], channels: tuple[Channel, ...]) -> dict[str, float]:

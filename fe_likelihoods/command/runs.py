@@ -318,7 +318,7 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
     samples, n = sampler.get_chain(flat=True, discard=discarded(job)), job.prediction.get("draws", DRAWS)
     rows = np.unique(np.linspace(0, len(samples) - 1, min(n, len(samples))).round().astype(int))
     drawn = samples[rows]
-    return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise == "marginal" else drawn
+    return problem.posterior.draw_noise(drawn, job.sampler.get("seed", 1)) if job.noise.get("marginal") else drawn
 
 
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:

@@ -16,11 +16,9 @@ __all__ = [
     "EVENT",
     "FREE_SECTIONS",
     "MODELS",
-    "NOISES",
     "PARTS",
     "SECTIONS",
     "Key",
-    "NoiseKind",
     "did_you_mean",
     "read_keys",
     "read_quantity",
@@ -238,16 +236,35 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("missing", "numbers", "numbers that stand for missing samples"),
     ),
     "noise": (
-        Key("kind", "text", "see the table of kinds; per channel (white) by default"),
+        Key(
+            "kind",
+            "text",
+            '"gaussian" (the default), or "autoregressive", each error depends on the one before, with a correlation '
+            "per channel; takes sensor only",
+        ),
+        Key(
+            "groups",
+            "text or numbers",
+            'what has a level: "channel" (the default), "all" for one level in root mean squares of the measured '
+            'channels, "event" for each channel and event, or frequencies between bands [Hz], ascending, for each '
+            "channel and band, so that errors are correlated in time",
+        ),
+        Key(
+            "level",
+            "text",
+            'what a level is: "si" (the default), a standard deviation in the unit of the channel; "measured", a share '
+            "of the root mean square of the measured channel, in predictions of the simulated response; "
+            '"response", a share of the level of the simulated response, which follows it in time or per band',
+        ),
         Key("sensor", "table of quantities", "channel = known standard deviation of the noise of its sensor"),
-        Key("window", "time", "modulated, relative: length of the window in which the level of the response is taken"),
+        Key("window", "time", 'level "response" or "measured": length of the window in which the level is taken'),
         Key(
             "local",
             "number",
-            "modulated: 0 to 1 (0.25); 1: the noise follows the response in each window, 0: one level for the record",
+            'level "response": 0 to 1 (0.25); 1: the noise follows the response in each window, 0: one level for the '
+            "record",
         ),
-        Key("edges", "numbers", "bands: frequencies between the bands [Hz], ascending"),
-        Key("shares", "yes or no", "bands: levels as shares of the simulated response (yes), or in SI units"),
+        Key("marginal", "yes or no", "integrate the levels out (no); for levels in SI units without bands and sensor"),
     ),
     "sampler": (
         Key("kind", "text", '"smc" (the default), "tmcmc" or "emcee"'),
@@ -279,38 +296,6 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 }
 """Keys of the sections besides ``[model]`` and ``[priors]``."""
 
-
-class NoiseKind(NamedTuple):
-    """A kind of the noise: what it is, and the keys of ``[noise]`` that it takes and needs."""
-
-    meaning: str
-    keys: tuple[str, ...] = ()
-    required: tuple[str, ...] = ()
-
-
-NOISES = {
-    "per channel": NoiseKind("white, one level per channel in its unit (the default)", ("sensor",)),
-    "autoregressive": NoiseKind("each error depends on the one before, with a correlation per channel", ("sensor",)),
-    "shared": NoiseKind("white, one level for all channels as a share of their root mean squares", ("sensor",)),
-    "per event": NoiseKind("white, a level per channel and event of a data set with several"),
-    "marginal": NoiseKind("white, the levels integrated out"),
-    "relative": NoiseKind(
-        "white, one level per channel: a share of the root mean square of the measurements. In predictions it is the "
-        "same share of the simulated response, or, with window, of the response in each window",
-        ("sensor", "window"),
-    ),
-    "modulated": NoiseKind(
-        "white, a share of the level of the simulated response, which follows it in time",
-        ("sensor", "window", "local"),
-        ("sensor", "window"),
-    ),
-    "bands": NoiseKind(
-        "a level per channel and band of frequency, so that errors are correlated in time; shares need the sensor",
-        ("sensor", "edges", "shares"),
-        ("edges",),
-    ),
-}
-"""Kinds of the noise."""
 
 EVENT: tuple[Key, ...] = (
     *(key for key in SECTIONS["record"] if key.name != "every"),
@@ -361,6 +346,10 @@ _KINDS = {
     "yes or no": (lambda value: isinstance(value, bool), "true or false"),
     "texts": (_all(_is_text, list), 'a list of texts, such as ["a", "b"]'),
     "numbers": (_all(_is_number, list), "a list of numbers, such as [1.0, 2.0]"),
+    "text or numbers": (
+        lambda value: _is_text(value) or _all(_is_number, list)(value),
+        "a text in quotes, or a list of numbers, such as [1.0, 5.0]",
+    ),
     "whole numbers": (_all(_is_whole, list), "a list of whole numbers, such as [1, 2]"),
     "table of texts": (_all(_is_text, dict), 'texts by name, such as {top = "abc"}'),
     "table of quantities": (

@@ -68,6 +68,6 @@ def check_quadratic(statistic: Callable[[np.ndarray], np.ndarray], residuals: np
     if not np.allclose(direct, combined, rtol=_TOLERANCE, atol=_TOLERANCE * np.abs(direct).max()):
         raise ValueError(
             f"the statistic {statistic!r} of the noise is not quadratic in the residuals, so the posterior cannot be "
-            "emulated from responses: use GaussianNoise, SharedGaussianNoise, AutoregressiveNoise, or a sampler "
+            "emulated from responses: use GaussianNoise, AutoregressiveNoise, or a sampler "
             "without a guide"
         )

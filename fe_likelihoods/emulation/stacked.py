@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..noise.protocol import noise_title
 from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch
 from ..simulation.residual_statistics import needs_response
@@ -119,8 +120,8 @@ class StackedLikelihood:
                 )
             if needs_response(statistic := getattr(likelihood.noise, "statistic", None) or sums_of_squares):
                 raise ValueError(
-                    f"the level of {type(likelihood.noise).__name__} depends on the response, so the posterior cannot "
-                    "be emulated from residuals: sample without a guide, or use GaussianNoise"
+                    f"the level of {noise_title(likelihood.noise)} depends on the response, so the posterior cannot "
+                    'be emulated from residuals: sample without a guide, or use level="si"'
                 )
             own, width = len(likelihood.model.parameter_names), len(statistic(likelihood.measured))
             rows, sums = channels + len(likelihood.measured), numbers + width

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..noise.protocol import noise_title
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.residual_statistics import needs_response
@@ -200,9 +201,9 @@ class ResponseTarget:
         self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
         if needs_response(self.statistic):
             raise ValueError(
-                f"the level of {type(self.noise).__name__} depends on the response, so the posterior cannot be "
-                "emulated from residuals: sample without a guide, or use GaussianNoise, SharedGaussianNoise, "
-                "AutoregressiveNoise or BandNoise(relative=False)"
+                f"the level of {noise_title(self.noise)} depends on the response, so the posterior cannot be "
+                'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", with bands of '
+                "frequency or without, or AutoregressiveNoise"
             )
         if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
             self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)

@@ -3,20 +3,21 @@
 The equations are on the page ``docs/theory/noise.rst``.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
 from ..signals.channels import Channel
-from .gaussian import HALF_LOG_TWO_PI, PerChannel, Statistic, options_repr, set_channels, total_deviations, weighted
+from .gaussian import HALF_LOG_TWO_PI
+from .options import PerChannel, checked_channels, sensor_levels, shown, weighted
 from .residuals import lag_one_sums
 from .sample_counts import SampleCounts
 
 __all__ = ["AutoregressiveNoise"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AutoregressiveNoise:
     """Stationary first-order autoregressive Gaussian noise, with unknown standard deviation and lag-one correlation.
 
@@ -61,15 +62,16 @@ class AutoregressiveNoise:
     .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
     """
 
-    channels: tuple[Channel, ...]
-    sensor: tuple[float, ...] | None
+    channels: Sequence[Channel]
+    _: KW_ONLY
+    sensor: PerChannel = None
 
-    def __init__(self, channels: Sequence[Channel], *, sensor: PerChannel = None) -> None:
-        set_channels(self, channels, sensor)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", checked_channels(self, self.channels))
+        object.__setattr__(self, "sensor", sensor_levels(self, self.channels, self.sensor))
 
     def __repr__(self) -> str:
-        named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"AutoregressiveNoise({', '.join(named + options_repr(self.sensor))})"
+        return f"AutoregressiveNoise({shown(self.channels, {'sensor': self.sensor})})"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -78,7 +80,7 @@ class AutoregressiveNoise:
         return tuple(f"sigma_{name}" for name in names) + tuple(f"rho_{name}" for name in names)
 
     @property
-    def statistic(self) -> Statistic:
+    def statistic(self) -> Callable[[np.ndarray], np.ndarray]:
         """Statistic of the residuals: `fe_likelihoods.noise.residuals.lag_one_sums`."""
         return lag_one_sums
 
@@ -150,9 +152,11 @@ class AutoregressiveNoise:
         Returns
         -------
         (n, n_channels) float
-            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+            [SI unit of the channel]; NaN for a negative parameter.
         """
-        return total_deviations(np.asarray(parameters, dtype=float)[..., : len(self.channels)], self.sensor)
+        sigma = np.asarray(parameters, dtype=float)[..., : len(self.channels)]
+        with np.errstate(invalid="ignore"):
+            return np.where(sigma >= 0.0, np.hypot(sigma, 0.0 if self.sensor is None else self.sensor), np.nan)
 
     def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
         """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .protocol import noise_title
+
 __all__ = ["SampleNoise", "sample_noise"]
 
 
@@ -74,7 +76,7 @@ def sample_noise(
     Parameters
     ----------
     noise : Noise
-        With a method ``standard_deviations``, see `fe_likelihoods.noise.gaussian.Noise`.
+        With a method ``standard_deviations``, see `fe_likelihoods.Noise`.
     parameters : (n, n_noise) float
         Parameters of the noise.
     n_channels : int
@@ -96,7 +98,7 @@ def sample_noise(
     """
     if not hasattr(noise, "standard_deviations"):
         raise ValueError(
-            f"{type(noise).__name__} cannot be drawn from: give it a method standard_deviations(parameters (n, "
+            f"{noise_title(noise)} cannot be drawn from: give it a method standard_deviations(parameters (n, "
             "n_parameters)) that returns (n, n_channels) in SI units"
         )
     deviations = np.asarray(noise.standard_deviations(parameters), dtype=float)

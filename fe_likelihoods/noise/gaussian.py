@@ -1,462 +1,807 @@
-"""Probability models of the error, the difference between a measured and a simulated response.
+r"""Gaussian noise: levels per channel, event or band of frequency, in SI units or as shares of a signal.
 
-The errors are Gaussian and independent between channels. The likelihood then needs only a few sums of the residuals
-per channel (sufficient statistics): for white noise the sum of squares J, for an autoregressive error two more. A noise
-takes these sums instead of the response, so a change of its own parameters needs no simulation. Equations and sources
-are on the page ``docs/theory/noise.rst``.
+The errors, differences between a measured and a simulated response, are Gaussian and independent between channels. The
+likelihood then needs only a few sums of the residuals per channel (sufficient statistics,
+`fe_likelihoods.noise.groups`) instead of the response, so a change of a noise parameter needs no simulation. All
+combinations of `groups` and `level` have the standard deviation
 
-Which noise to take:
+.. math:: \sigma^2 = s^2 + (a\, l)^2
 
-========================================================  ==============================================================
-``GaussianNoise(channels)``                               Independent errors: synthetic data, thinned measurements.
-``AutoregressiveNoise(channels)``                         Correlated errors, with an unknown lag-one correlation per
-                                                          channel.
-``GaussianNoise(channels, effective_samples=n_eff)``      Correlated errors without more parameters; `n_eff` is
-                                                          estimated from residuals.
-``SharedGaussianNoise.of(measurements)``                  One unknown standard deviation for all channels.
-``ModulatedNoise(channels, window=1.0, sensor=...)``      Shares of the level of the simulated response in time, for
-                                                          predictions of weaker or stronger motions and of other tests.
-``BandNoise(channels, (1.0, 5.0), sensor=...)``           Errors that are correlated in time: shares of the response in
-                                                          bands of frequency, for predictions of other motions.
-``RelativeNoise.of(measurements)``                        Standard deviations that are shares of the response levels.
-``...Noise(channels, sensor={"top": 0.02})``              Known sensor noise in addition to the unknown model error.
-========================================================  ==============================================================
+of a sample, or of a coefficient of its cosine transform: the known noise :math:`s` of the sensor, an unknown parameter
+:math:`a`, and a reference :math:`l`, which is one (``level="si"``), the level of the measured channel (``"measured"``)
+or the level of the simulated response (``"response"``).
 
-Real measurements differ from a model by more than the noise of a sensor, and the differences are correlated in time.
-White noise counts the n samples of a channel as n independent observations, which makes the posterior too narrow. The
-module `fe_likelihoods.noise.residuals` has checks of this assumption and estimates the effective number of
-samples. `AutoregressiveNoise` is in `fe_likelihoods.noise.autoregressive`, `RelativeNoise` in
-`fe_likelihoods.noise.relative`.
+Real measurements differ from a model by more than sensor noise, and the differences are correlated in time. White noise
+counts the n samples of a channel as n independent observations, which makes the posterior too narrow:
+`fe_likelihoods.noise.residuals` has checks of this assumption and estimates the effective number of samples. Equations
+and sources are on the page ``docs/theory/noise.rst``.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from ..signals.channels import Channel, Measurements
+from ..signals.events import EventWindow, events_of, find_events
+from .groups import BandSums, EventSums, GroupSums, Layout, PartSums, split_sums, stretches
+from .levels import Excited, excited_parts, local_level, squared_levels
+from .options import (
+    PerChannel,
+    as_number,
+    checked_channels,
+    numbers,
+    only_if,
+    per_channel,
+    sensor_levels,
+    shown,
+    weighted,
+)
 from .sample_counts import SampleCounts, samples_per_channel
 
-__all__ = [
-    "GaussianNoise",
-    "Noise",
-    "SharedGaussianNoise",
-    "as_number",
-    "noise_channels",
-    "noise_of_part",
-    "noise_statistic",
-    "noise_time_shifts",
-    "noise_under",
-    "remark_on_gaps",
-    "numbers",
-    "options_repr",
-    "set_channels",
-    "set_effective",
-    "total_deviations",
-    "weighted",
-]
+__all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
 
-PerChannel = Mapping[str, float] | Sequence[float] | None
-Statistic = Callable[..., np.ndarray]
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
+_PARTS = 3  # parts of a window, in steps of which it moves
+_ROUND_OFF = 1e-6  # of a step
+_LOCAL, _GROWTH = 0.25, 0.25  # see docs/theory/noise.rst
+_LARGEST_GAP = 0.05  # part of the samples of a channel
+_RESPONSE = 'level="response" without bands'
+_SHARES = 'level="measured" or "response", without bands'
 
 
-class Noise(Protocol):
-    """What a likelihood needs of a noise.
-
-    Two members are required, `parameter_names` and `log_likelihood`. A noise may also have:
-
-    * ``channels``, the measured channels in the order of the statistics; checked against those of the model.
-    * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
-      (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it these are all.
-      Residuals of missing samples are NaN; a statistic without a rule for them is refused with such measurements. A
-      statistic with an attribute ``of_response`` that is true also takes the response at the samples, as a second
-      argument.
-    * ``time_shifts``, the largest unknown time shifts of channels [s] by name, with the statistics of
-      `fe_likelihoods.noise.time_shifts.TimeShiftNoise`.
-    * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
-      errors (n, n_channels) [SI]; needed for predictions with noise.
-    * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
-      standard deviations (n_channels, n_steps) of the errors of a simulated response; used in predictions in place of
-      ``standard_deviations`` where the noise depends on the response.
-    * ``response_errors(parameters, response, normal, dt, sensor)``, which returns the errors (n_channels, n_steps) made
-      of standard normal numbers of that shape, with ``sensor=False`` without the noise of the sensors; for errors that
-      are correlated in time and depend on the response.
-    * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
-      measured samples, for checks of residuals and for the log-likelihood in blocks of time.
-    * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
-      depends on their number or times. A likelihood calls it with its own measurements.
-    * ``under(model, first)``, which returns the noise under the excitation of a model whose response begins at the step
-      ``first``; called by a likelihood with its model, and by a prediction with the model under the predicted record.
-    * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
-      predictions with autoregressive noise.
-    * ``with_channels(channels, weights)`` with the weights (n_others, n_channels) of its channels in each of others,
-      which returns the noise of these for predictions, and the weights (n_others_noise, n_noise) of its parameters in
-      theirs; for predictions of channels that were not measured.
-    * ``remark_on_gaps()``, which returns a sentence on gaps in the measurements that make predictions doubtful, empty
-      if there are none. A likelihood warns with it, and predictions with noise have it among their remarks.
-    """
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters of the noise."""
-
-    def log_likelihood(
-        self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
-    ) -> np.ndarray:
-        """Log-likelihood (n,) of statistics (n, n_numbers) of the residuals at parameters (n, n_noise).
-
-        The number of samples is that of every channel; measurements with missing samples have `SampleCounts`. The value
-        is -inf where a parameter is impossible, also for statistics of zero.
-        """
+def _positive(x: float) -> bool:
+    return 0.0 < x < math.inf
 
 
-def noise_channels(noise: Noise, default: Sequence[Channel]) -> tuple[Channel, ...]:
-    """Channels of a noise; `default` where the noise does not specify them."""
-    return tuple(getattr(noise, "channels", default))
+def _part(x: float) -> bool:
+    return 0.0 <= x <= 1.0
 
 
-def noise_statistic(noise: Noise) -> Statistic | None:
-    """Statistic of the residuals that a noise needs, None for the sums of squares."""
-    return getattr(noise, "statistic", None)
+def _finite(x: float) -> bool:
+    return 0.0 <= x < math.inf
 
 
-def noise_time_shifts(noise: Noise) -> Mapping[str, float] | None:
-    """Largest unknown time shifts of channels [s] of a noise with such parameters, None for others."""
-    return getattr(noise, "time_shifts", None)
-
-
-def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
-    """Noise of a part of the measurements: the same, unless it has a method ``with_measurements``."""
-    return noise.with_measurements(measurements) if hasattr(noise, "with_measurements") else noise
-
-
-def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
-    """Noise under the excitation of a model: the same, unless it has a method ``under``."""
-    return noise.under(model, first) if hasattr(noise, "under") else noise
-
-
-def remark_on_gaps(noise: Noise) -> str:
-    """What a noise says of gaps in its measurements; empty if nothing, or without a method ``remark_on_gaps``."""
-    return noise.remark_on_gaps() if hasattr(noise, "remark_on_gaps") else ""
-
-
-def as_number(noise: Any, what: str, value: Any, unit: str) -> float:
-    """A number that a user gave for a noise; ValueError in words for anything else, such as a text with a unit."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"{type(noise).__name__}: {what} must be a number {unit}; got {value!r}: give the number alone; "
-            'to_si(0.02, "g") converts other units'
-        ) from None
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GaussianNoise:
-    r"""Independent white Gaussian noise with one unknown standard deviation per channel.
+    r"""Gaussian noise with one unknown level per channel, or per event or band of frequency of each channel.
 
     Parameters
     ----------
     channels : sequence of Channel
-        The measured channels, in the order of the sums of squared residuals.
+        The measured channels, in the order of the model.
+    groups : {"channel", "all", "event"} or sequence of float
+        What has a level of its own: each channel; all channels together; each channel in each event of a model whose
+        excitation is `fe_likelihoods.Events`; or each channel in each band of frequency, given by the ascending
+        frequencies between the bands [Hz], the last one below half the sampling frequency: ``(1, 5)`` makes the three
+        bands below 1 Hz, from 1 to 5 Hz, and above.
+    level : {"si", "measured", "response"}
+        What a level is: a standard deviation in the SI unit of the channel; a share of the root mean square of the
+        measured channel; or a share of the level of the simulated response. "event" has levels in SI units only, and
+        bands have no shares of the measured channel.
+    window : float, optional
+        Length of a window [s] in which the root mean square of the response is taken: longer than a period of the
+        response, and shorter than the strong part of the motion. In a test without time [steps]. Needed for
+        ``level="response"`` without bands. With ``level="measured"``, the noise of a prediction follows the response
+        within the window; by default it has one level for the whole motion, as the likelihood always has.
+    local : float, optional
+        For ``level="response"``: part of the variance that follows the envelope of the response, from 0 to 1 (0.25);
+        the other part follows the whole response. 0 is one level for the whole motion, 1 the envelope alone.
+    deformation : float, optional
+        For ``level="response"`` in a test with an imposed deformation: the deformation at which the standard deviation
+        is the share of the level [m; - for a strain], such as 1 % of the height of a column. The standard deviation is
+        then proportional to a power of the largest deformation reached. Give specimens of different size each their
+        own.
+    growth : float, optional
+        This power, 0.25 by default. Only with `deformation`.
     sensor : mapping of channel names to float, or sequence of float, optional
         Known standard deviations of the sensors [SI unit of the channel], one per channel; zero for names that are left
-        out. The parameters are then the standard deviations of the model error, and may be zero:
-        sigma_total^2 = sensor^2 + sigma^2.
+        out. The parameters are then levels of the model error, and may be zero. Needed, and positive, for
+        ``level="response"``: it is the standard deviation of the error where the response is zero.
     effective_samples : mapping of channel names to float, or sequence of float, optional
-        Number of independent samples that each channel is worth, as estimated by
-        `fe_likelihoods.noise.residuals.effective_samples`; the number of samples where it is smaller or the name
-        is left out.
+        Number of independent samples that each channel is worth, as estimated by `fe_likelihoods.effective_samples`;
+        the number of samples where it is smaller or the name is left out. For "channel" and "all", not for
+        ``level="response"``.
+    scales : mapping of channel names to float, or sequence of float, optional
+        Positive scale of each channel [SI unit of the channel], of which the shared level of ``groups="all"`` and
+        shares of ``level="measured"`` are multiples. By default the root mean squares of the measured channels, set by
+        the likelihood.
+    layout, events, measured, excited
+        Times of the samples; events, and which (event, channel) are measured; excitation. Set by the likelihood
+        (`with_measurements`, `under`) and by predictions.
 
     Raises
     ------
     ValueError
-        For no channel, an unknown channel, a negative sensor noise, or a number of samples that is not positive.
+        For no channel, an unknown channel, an unknown or impossible combination, a missing or impossible option.
 
     Notes
     -----
-    With n samples in channel c (those that are not missing) and the sum of squared residuals J_c, the log-likelihood is
-    [1]_, eqs. (2) and (3)::
+    ======================================  =====================  ==========================================
+    groups, level                           parameters             for
+    ======================================  =====================  ==========================================
+    ``"channel"``, ``"si"``                 ``sigma_<channel>``    synthetic data, thinned measurements
+    ``"all"``, ``"si"``                     ``sigma``              few or short channels; ratio of noise to
+                                                                   signal
+    ``"event"``, ``"si"``                   ``sigma_<channel>``    sensors, cables and errors that change
+                                            ``_<event>``           from test to test
+    ``"channel"`` or ``"all"``,             ``share_<channel>``,   predictions of weaker or stronger motions
+    ``"measured"``                          ``share``
+    ``"channel"`` or ``"all"``,             ``share_<channel>``,   predictions of other motions and tests
+    ``"response"``                          ``share``
+    bands, ``"si"``                         ``sigma_<channel>``    errors that are correlated in time
+                                            ``_band1``, ...
+    bands, ``"response"``                   ``share_<channel>``    the same, for predictions of other motions
+                                            ``_band1``, ...
+    ======================================  =====================  ==========================================
+
+    **White noise** (``"si"`` without bands). With n samples in channel c (missing samples do not count) and the sum of
+    squared residuals J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
 
         log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
 
-    With effective samples, the term of channel c is multiplied by n_eff / n. This has the effect of thinning to n_eff
-    samples without discarding any. The result is not a density of the measurements: only evidences of models with the
-    same n_eff can be compared.
+    With events, the sum is over events too. With effective samples, the term of channel c is multiplied by n_eff / n.
+    This has the effect of thinning to n_eff samples without discarding any. The result is not a density of the
+    measurements: only evidences of models with the same n_eff can be compared.
+
+    **Shares of the measured channel.** The likelihood is that of white noise with other parameters: ``share_top = 0.2``
+    is a standard deviation of 20 % of the root mean square of the measured channel "top". Shares of 1 or more are
+    impossible (the model would explain nothing): their log-likelihood is -inf, and `propagate` refuses them with
+    ``noise=True``. In a prediction the root mean square R of the simulated response is known, and the level is that of
+    response and error together: sigma^2 = (sensor^2 + share^2 R^2) / (1 - share^2). The likelihood is not a normalised
+    density of the measurements, because the level is computed from them: evidences compare these shares with other
+    noises approximately only.
+
+    **Shares of the response in time.** The window moves in steps of a third of its length, so that the level is
+    constant within these parts of the time::
+
+        l^2 = ((1 - local) R^2 + local e^2) (d / deformation)^(2 growth)
+
+    with the mean square e^2 of the response in a part and its two neighbours, the mean square R^2 of the response in
+    the whole motion (each event, and each pause, has its own), and the largest deformation d up to the middle of the
+    part; without `deformation` the last factor is one. The likelihood is a normalised density. A simulation is cached
+    with 1 + 6 T / window numbers per channel, for a duration of T; `local`, `deformation` and `growth` do not change
+    what is cached. A share that was found in a part of a motion, beside a gap or with a long quiet end belongs to
+    another R^2 than the whole motion has: calibrate and predict whole motions, or use ``local=1``. Do not choose
+    `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may prefer a response
+    that is too large, because it permits larger errors. Compare the RRMSE of the fit with that under ``level="si"``
+    (`fit_measures`); predictions warn of it.
+
+    **Bands of frequency.** With the coefficients z_k of the DCT-II, orthonormal, of the residuals::
+
+        log L = sum_k [ -1/2 log(2 pi) - log(sigma_k) - z_k^2 / (2 sigma_k^2) ]
+        sigma_k^2 = sensor^2 + (share_b u_b)^2          "response": u_b^2 is the mean square of the n_b coefficients of
+                                                        the simulated response in the band b of k
+        sigma_k^2 = sensor^2 + sigma_b^2 n / n_b        "si": sigma_b is the root mean square of the errors in b
+
+    This is the multivariate normal density of the samples, in both cases normalised. The errors are stationary in time
+    except near the ends, where they are reflected. Missing samples divide a channel into stretches, which are
+    independent and transformed by themselves; stretches that are shorter than a period of the lowest edge are refused.
+
+    Statistics of ``level="response"`` are not quadratic in the residuals, so samplers cannot use a guide
+    (`fe_likelihoods.ResponseGuide`).
 
     References
     ----------
     .. [1] M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd, "Bayesian nonlinear finite element model
        updating of a full-scale bridge-column using sequential Monte Carlo", in "Model Validation and Uncertainty
        Quantification, Volume 3", Springer.
+
+    Examples
+    --------
+    >>> noise = GaussianNoise(model.channels, level="response", window=1.0, sensor={"top": 0.005})
+    >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior | {"share_top": HalfNormal(0.5)})
+    >>> propagate(posterior, samples, record=weaker, noise=True)  # noise of the weaker response
     """
 
-    channels: tuple[Channel, ...]
-    sensor: tuple[float, ...] | None
-    effective_samples: tuple[float, ...] | None
+    channels: Sequence[Channel]
+    _: KW_ONLY
+    groups: Literal["channel", "all", "event"] | Sequence[float] = "channel"
+    level: Literal["si", "measured", "response"] = "si"
+    window: float | None = None
+    local: float | None = None
+    deformation: float | None = None
+    growth: float | None = None
+    sensor: PerChannel = None
+    effective_samples: PerChannel = None
+    scales: PerChannel = None
+    layout: Layout | None = None
+    events: tuple[EventWindow, ...] = ()
+    measured: tuple[tuple[int, int], ...] = ()
+    excited: Excited = Excited()
 
-    def __init__(
-        self, channels: Sequence[Channel], *, sensor: PerChannel = None, effective_samples: PerChannel = None
-    ) -> None:
-        set_channels(self, channels, sensor)
-        set_effective(self, effective_samples)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", checked_channels(self, self.channels))
+        object.__setattr__(self, "groups", self._checked_groups())
+        if self.level not in ("si", "measured", "response"):
+            raise ValueError(f'GaussianNoise: level must be "si", "measured" or "response"; got {self.level!r}')
+        possible = {"measured": ("channel", "all"), "response": ("channel", "all", "bands")}
+        if self._kind not in possible.get(self.level, (self._kind,)):
+            raise ValueError(
+                f"GaussianNoise: groups={self.groups!r} cannot have level={self.level!r}; possible are levels in SI "
+                'units with all groups, "measured" and "response" with "channel" and "all", and "response" with bands'
+            )
+        self._check_options()
+
+    def _checked_groups(self) -> str | tuple[float, ...]:
+        """The groups, or the edges of the bands as a tuple of numbers."""
+        if isinstance(self.groups, str):
+            if self.groups not in ("channel", "all", "event"):
+                raise ValueError(
+                    'GaussianNoise: groups must be "channel", "all", "event", or the frequencies between bands [Hz], '
+                    f"such as (1.0, 5.0); got {self.groups!r}"
+                )
+            return self.groups
+        edges = numbers(self, "groups", self.groups, "in Hz")
+        ascending = all(low < high for low, high in zip((0.0, *edges), edges, strict=False))
+        if not edges or not ascending or not edges[-1] < math.inf:
+            raise ValueError(
+                "GaussianNoise expects ascending positive frequencies between the bands [Hz], such as (1.0, 5.0); got "
+                f'{self.groups!r}. For one band use groups="channel"'
+            )
+        return edges
+
+    def _check_options(self) -> None:
+        """Set options as floats, with their defaults; ValueError for one without a meaning here, or a missing one."""
+        for name, means, default, where, meaning, possible in (
+            ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", _positive),
+            (
+                "local",
+                self._in_parts,
+                _LOCAL,
+                _RESPONSE,
+                "from 0 (one level for the motion) to 1 (the envelope)",
+                _part,
+            ),
+            ("deformation", self._in_parts, None, _RESPONSE, "positive, such as 1 % of a column height", _positive),
+            ("growth", self.deformation is not None, _GROWTH, "deformation=", "an exponent, zero or more", _finite),
+        ):
+            if (value := self._option(name, means, where, default)) is not None:
+                object.__setattr__(self, name, as_number(self, name, value, meaning, possible))
+        if self._in_parts and self.window is None:
+            raise ValueError(
+                'GaussianNoise: level="response" needs window=, a length [s] in which the level of the response is '
+                "taken: longer than a period of the response, shorter than the strong part of the motion"
+            )
+        object.__setattr__(self, "sensor", sensor_levels(self, self.channels, self.sensor))
+        if self.level == "response" and not all(level > 0.0 for level in self.sensor or (0.0,)):
+            raise ValueError(
+                'GaussianNoise: level="response" needs the noise of the sensor of each channel, a positive standard '
+                f"deviation in SI units, for parts or bands in which the response is zero; got {self.sensor!r}. Take "
+                "it from the quiet part before the motion, or from the resolution of the sensor, or use levels in SI "
+                "units"
+            )
+        whole = 'groups="channel" and "all", with level="si" or "measured"'
+        for name, means, where, default, unit in (
+            ("effective_samples", self._whole, whole, math.inf, "of samples"),
+            ("scales", self._scaled, 'groups="all" in SI units, and level="measured"', None, "in SI units"),
+        ):
+            given = self._option(name, means, where)
+            values = per_channel(self, self.channels, name, given, default, unit)
+            if values is not None and not all(value > 0.0 for value in values):
+                raise ValueError(
+                    f"GaussianNoise: {name} must be positive numbers {unit}; got {given!r}: leave out channels without "
+                    "a signal"
+                )
+            object.__setattr__(self, name, values)
+
+    def _option(self, name: str, means: bool, where: str, default: float | None = None) -> Any:
+        """A given option, else its default; ValueError for one that is given and has no meaning here."""
+        given = getattr(self, name)
+        if given is not None and not means:
+            raise ValueError(
+                f"GaussianNoise: {name}= is for {where}; got {name}={given!r} with groups={self.groups!r} and "
+                f"level={self.level!r}: leave it out"
+            )
+        return default if given is None and means else given
+
+    # ------------------------------------------------------------------ what it is
+
+    @property
+    def _kind(self) -> str:
+        return self.groups if isinstance(self.groups, str) else "bands"
+
+    @property
+    def _whole(self) -> bool:
+        """Whether the sums of squares over all samples are sufficient."""
+        return self._kind in ("channel", "all") and self.level != "response"
+
+    @property
+    def _in_parts(self) -> bool:
+        """Whether levels follow the response in parts of the time."""
+        return self.level == "response" and self._kind != "bands"
+
+    @property
+    def _scaled(self) -> bool:
+        """Whether parameters are multiples of scales of the channels."""
+        return self.level == "measured" or (self.level == "si" and self._kind == "all")
+
+    @property
+    def white(self) -> bool:
+        """Whether errors are white, with levels in SI units for the whole measurements."""
+        return self._whole and self.level == "si"
+
+    @property
+    def n_bands(self) -> int:
+        """Number of bands of frequency; one without bands."""
+        return 1 if isinstance(self.groups, str) else len(self.groups) + 1
+
+    @property
+    def title(self) -> str:
+        """Class and options, without channels and numbers per channel, for reports."""
+        options = shown((), self._options(("groups", "level", "window", "local", "deformation")))
+        return type(self).__name__ + (f"({options})" if options else "")
 
     def __repr__(self) -> str:
-        # display units change no value, so they are left out
-        named = [f"{channel.name}: {channel.quantity}" for channel in self.channels]
-        return f"GaussianNoise({', '.join(named + options_repr(self.sensor, self.effective_samples))})"
+        # the layout and the excitation, which measurements and model determine, change no value of the likelihood
+        bound = ("channels", "layout", "events", "measured", "excited")
+        names = [field.name for field in fields(self) if field.name not in bound]
+        return f"{type(self).__name__}({shown(self.channels, self._options(names))})"
+
+    def _options(self, names: Sequence[str]) -> dict[str, Any]:
+        default = {"groups": "channel", "level": "si"}
+        return {name: getattr(self, name) for name in names if getattr(self, name) != default.get(name)}
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``sigma_<channel>``: standard deviations, each in the SI unit of its channel."""
-        return tuple(f"sigma_{channel.name}" for channel in self.channels)
+        """``sigma_...`` [SI unit of the channel] or ``share_...`` [-], see the table of the class.
 
-    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray) -> np.ndarray:
+        Bands of each channel follow each other from low to high, then come those of the next channel.
+
+        Raises
+        ------
+        ValueError
+            For ``groups="event"``, before the likelihood has set the events.
+        """
+        kind, names = "sigma" if self.level == "si" else "share", [channel.name for channel in self.channels]
+        if self._kind == "all":
+            return (kind,)
+        if self._kind == "event":
+            self._bound(self.events)
+            return tuple(f"{kind}_{names[row]}_{self.events[event].name}" for event, row in self.measured)
+        if self._kind == "bands":
+            return tuple(f"{kind}_{name}_band{band}" for name in names for band in range(1, self.n_bands + 1))
+        return tuple(f"{kind}_{name}" for name in names)
+
+    @property
+    def parameter_channels(self) -> dict[str, Channel]:
+        """Channel of each parameter that is a standard deviation in the unit of this channel, by name."""
+        if self.level != "si" or self._kind == "all":
+            return {}
+        rows = [row for _, row in self.measured]
+        if self._kind != "event":
+            rows = np.repeat(np.arange(len(self.channels)), self.n_bands).tolist()
+        return {name: self.channels[row] for name, row in zip(self.parameter_names, rows, strict=True)}
+
+    @property
+    def statistic(self) -> GroupSums | None:
+        """Sufficient statistic of the residuals; None for the sums of squares of all samples."""
+        return None if self._whole else self._sums()
+
+    def _sums(self, dt: float | Sequence[float] | None = None) -> Any:
+        """Sums in groups of the measured samples; of a response from the time zero with the step `dt`."""
+        if dt is not None:
+            steps = tuple(np.broadcast_to(np.asarray(dt, dtype=float), len(self.channels)).tolist())
+            layout = Layout(steps, (0.0,) * len(steps), ())
+        else:
+            layout = self._bound(self.layout)
+        if self._kind == "bands":
+            return BandSums(self.groups, layout.steps, self.level == "response")
+        if self._kind == "event":
+            step = layout.steps[0]
+            return EventSums(
+                tuple(
+                    (math.ceil(each.start / step - _ROUND_OFF), math.floor(each.end / step + _ROUND_OFF) + 1)
+                    for each in self.events
+                )
+            )
+        return PartSums(self.window / _PARTS, layout.steps, layout.starts)
+
+    def _bound(self, value: Any) -> Any:
+        if not value:
+            raise ValueError(
+                f"{self.title} needs the times of the samples, their root mean squares and the excitation: take the "
+                "noise of a likelihood, FELikelihood(model, measurements, noise).noise"
+            )
+        return value
+
+    # ------------------------------------------------------------------ measurements and excitation
+
+    def under(self, model: Any, first: int = 0) -> "GaussianNoise":
+        """The same noise under the excitation of a model, whose response begins at the step `first`.
+
+        Raises
+        ------
+        ValueError
+            If the noise has levels per event, and the excitation is not `fe_likelihoods.Events`; if it grows with a
+            deformation, and none is imposed on the model; if the window is shorter than three time steps of the model,
+            or longer than one of its events.
+        """
+        if self._kind == "event" and not self.events:
+            return replace(self, events=events_of(model).windows)
+        if not self._in_parts:
+            return self
+        self._check_step(model.dt)
+        events = find_events(model)
+        for each in () if events is None else events.windows:
+            if self.window > each.end - each.start + (1.0 + _ROUND_OFF) * model.dt:
+                raise ValueError(
+                    f"GaussianNoise: the window of {self.window:g} s must not be longer than an event; {each.name!r} "
+                    f"has {each.end - each.start:g} s: give a shorter window, or leave out this event"
+                )
+        excited = excited_parts(model, self.window / _PARTS, first)
+        if self.deformation is not None and not excited.reached:
+            raise ValueError(
+                "GaussianNoise: deformation= is for a model under an imposed deformation, with a DisplacementHistory "
+                "in its attribute loading or record, or an array (n_steps,) in its attribute deformation or strain; "
+                f"this {type(model).__name__} has none: leave deformation out"
+            )
+        return replace(self, excited=excited)
+
+    def with_measurements(self, measurements: Measurements) -> "GaussianNoise":
+        """The same noise, with the same parameters, for these measurements: their scales, if none are set, and times.
+
+        Raises
+        ------
+        ValueError
+            If the window is shorter than three time steps; a band is above half the sampling frequency; gaps leave a
+            stretch that is shorter than a period of the lowest edge; or with events, if channels have times of their
+            own or a sample is outside of every event.
+        """
+        if self._scaled and self.scales is None:
+            return replace(self, scales=measurements.root_mean_squares)
+        if self._whole:
+            return self
+        layout = Layout(tuple(measurements.steps), tuple(measurements.starts), ())
+        placed, there = replace(self, layout=layout), ~np.isnan(measurements.values)
+        sums = placed._sums()
+        check = {"bands": self._check_bands, "event": self._check_events}.get(self._kind)
+        if check is None:
+            self._check_step(max(layout.steps))
+        else:
+            check(measurements, there, sums)
+        counts = sums.counts(there)
+        measured = self.measured
+        if self._kind == "event":
+            found = tuple(zip(*(each.tolist() for each in np.nonzero(counts)), strict=True))
+            measured = measured or found
+            if unknown := [self.channels[row].name for event, row in found if (event, row) not in measured]:
+                raise ValueError(
+                    f"the noise has no level for {', '.join(unknown)} in an event in which they are measured: make a "
+                    'new GaussianNoise(model.channels, groups="event")'
+                )
+        return replace(placed, layout=layout._replace(counts=tuple(map(tuple, counts.tolist()))), measured=measured)
+
+    def _check_step(self, dt: float) -> None:
+        if self.window < (_PARTS - _ROUND_OFF) * dt:
+            raise ValueError(
+                f"GaussianNoise: the window of {self.window:g} s must be at least three steps of {dt:g} s; give a "
+                "longer one, or a motion with a shorter time step (Record.resample)"
+            )
+
+    def _check_events(self, measurements: Measurements, there: np.ndarray, sums: EventSums) -> None:
+        if not measurements.simultaneous or measurements.start != 0.0:
+            raise ValueError(
+                'groups="event" needs channels with the same times, from the first sample of the record; use '
+                "Events.join, or a noise for all events"
+            )
+        outside = there.copy()
+        for first, stop in sums.windows:
+            outside[:, first:stop] = False
+        if outside.any():
+            place = int(np.argmax(outside.any(axis=0)))
+            raise ValueError(
+                f"{int(outside.sum())} measured samples are outside of every event, the first at "
+                f"{place * measurements.dt:g} s; the events are at "
+                f"{', '.join(f'{e.start:g} to {e.end:g} s' for e in self.events)}: put NaN there, as Events.join does, "
+                "or use a noise for all samples"
+            )
+
+    def _check_bands(self, measurements: Measurements, there: np.ndarray, sums: BandSums) -> None:
+        for channel, step, row in zip(measurements.channels, sums.steps, there, strict=True):
+            if not sums.edges[-1] < 0.5 / step:
+                raise ValueError(
+                    f"GaussianNoise: channel {channel.name!r} has a step of {step:g} s and contains frequencies below "
+                    f"{0.5 / step:g} Hz; the last band begins at {sums.edges[-1]:g} Hz: leave that edge out"
+                )
+            found = list(stretches(row))
+            short = [each for each in found if (each.stop - each.start) * step * sums.edges[0] < 1.0]
+            if len(found) > 1 and short:
+                place = short[0]
+                raise ValueError(
+                    f"GaussianNoise: gaps divide channel {channel.name!r} into {len(found)} stretches, of which "
+                    f"{len(short)} are shorter than a period of the lowest edge, {sums.edges[0]:g} Hz; the first has "
+                    f"{place.stop - place.start} samples from {measurements.times(channel.name)[place.start]:g} s on. "
+                    "Replace short stretches by NaN, fill short gaps, or use AutoregressiveNoise, which bridges gaps"
+                )
+
+    def remark_on_gaps(self) -> str:
+        """What to say of channels whose share is that of the mean square of a part of the motion, or of an event.
+
+        Empty for a noise without parts of the time or without measurements, for ``local=1``, and if at most 5 % of the
+        samples are missing within the measured motion. An event without any sample of a channel is no gap, since each
+        event has a mean square of its own.
+        """
+        if not self._in_parts or self.layout is None or self.local == 1.0:
+            return ""
+        named, counts, events = [], np.array(self.layout.counts), self.excited.events
+        for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
+            known = np.flatnonzero(row)
+            inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # whole parts
+            if events:  # odd numbers; nothing needs to be measured in the pauses
+                of_parts = np.array(events)[np.minimum(np.arange(len(row)), len(events) - 1)]
+                measured = np.unique(of_parts[row > 0])  # each event has its own mean square
+                inside = inside[(of_parts[inside] % 2 == 1) & np.isin(of_parts[inside], measured)]
+            expected = self.window / _PARTS / step * inside.size
+            share = 1.0 - row[inside].sum() / expected if inside.size else 0.0
+            named += [f"{channel.name!r} ({share:.0%})"] if share > _LARGEST_GAP else []
+        if not named:
+            return ""
+        return (
+            f"{self.title}: samples are missing within the channels {', '.join(named)}. The share is that of the mean "
+            "square of the other samples. If the strong part of the motion is missing, the share is too large and "
+            "predictions of whole motions too wide: use local=1, whose level is that of samples near by"
+        )
+
+    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
+        """Noise of other channels, and the weights of the parameters in its own; see `fe_likelihoods.Noise`.
+
+        With events, the level of a channel in an event is the mean of the levels of channels with a weight that were
+        measured in this event.
+        """
+        others = replace(
+            self,
+            channels=channels,
+            sensor=weighted(self.sensor, weights),
+            scales=weighted(self.scales, weights),
+            effective_samples=None,
+            layout=None,
+        )
+        if self._kind != "event":
+            return others, np.eye(1) if self._kind == "all" else np.kron(weights, np.eye(self.n_bands))
+        measured, rows = [], []
+        for event in range(len(self.events)):
+            known = np.array([row if number == event else -1 for number, row in self.measured])
+            for other, of_channels in enumerate(weights):
+                row = np.where(known >= 0, of_channels[known], 0.0)
+                if row.any():
+                    measured.append((event, other))
+                    rows.append(row / row.sum())
+        return replace(others, measured=tuple(measured)), np.array(rows).reshape(-1, len(self.measured))
+
+    # ------------------------------------------------------------------ densities
+
+    def log_likelihood(
+        self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
+    ) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
         ----------
-        misfit : (n, n_channels) float
-            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
-            failed.
+        statistics : (n, n_numbers) float
+            Sums of squared residuals (n, n_channels), or what `statistic` returns [SI unit of the channel, squared];
+            NaN where the simulation failed.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel where samples are missing.
-        sigma : (n, n_channels) float
-            Standard deviations of the noise [SI unit of the channel]; of the model error where sensor noise is given.
+            Number of samples of every channel, or of each channel where samples are missing.
+        parameters : (n, n_noise) float
+            Parameters of the noise, in the order of `parameter_names`.
 
         Returns
         -------
         (n,) float
-            -inf where a sigma is impossible (zero or negative; with sensor noise only negative) and where the misfit is
-            NaN or infinite; never NaN.
-        """
-        return white_log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
+            -inf for impossible parameters (negative; zero without sensor noise; for shares of the measured channel 1
+            or more), and where the statistics are not finite; never NaN.
 
+        Raises
+        ------
+        ValueError
+            If the noise does not know the measurements, or knows others.
+        """
+        statistics, n_channels = np.asarray(statistics, dtype=float), len(self.channels)
+        samples, power = np.broadcast_to(samples_per_channel(n_samples), n_channels), None
+        if self._whole:
+            counts, squares = samples[None], statistics[:, None]
+        else:
+            counts = np.array(self._bound(self.layout).counts)
+            if not np.array_equal(counts.sum(axis=0), samples):
+                raise ValueError(
+                    f"the noise is for {counts.sum(axis=0).tolist()} samples per channel, the measurements have "
+                    f"{samples.tolist()}: take the noise of a likelihood of these measurements"
+                )
+            squares, *powers = split_sums(statistics, n_channels, len(counts))
+            power = powers[0] if powers else None
+        deviations = self._deviations(parameters, counts, power)
+        with np.errstate(all="ignore"):
+            # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
+            ratio = np.sqrt(squares) / deviations
+            terms = -counts * (HALF_LOG_TWO_PI + np.log(deviations)) - 0.5 * ratio * ratio
+            if self.effective_samples is not None:
+                terms = terms * np.minimum(np.array(self.effective_samples) / counts, 1.0)
+        possible = (deviations > 0.0) & (deviations < np.inf) & np.isfinite(squares)
+        return np.where(possible, np.where(counts > 0, terms, 0.0), -np.inf).sum(axis=(1, 2))
+
+    def _deviations(self, parameters: np.ndarray, counts: np.ndarray, power: np.ndarray | None = None) -> np.ndarray:
+        """Standard deviations (n, n_groups, n_channels) of the coordinates; NaN for impossible parameters.
+
+        `counts` (n_groups, n_channels), and `power` (n, n_groups, n_channels), the sums of squares of the response.
+        """
+        values, levels = self._values(parameters, 1.0), np.ones(1)
+        if self._scaled:
+            levels = self._scales
+        elif self._kind == "bands":
+            n_stretches = len(counts) // self.n_bands
+            values = np.tile(values, (1, n_stretches, 1))
+            if power is None:
+                samples = counts.reshape(n_stretches, self.n_bands, -1).sum(axis=1)
+                power = np.repeat(samples, self.n_bands, axis=0)[None]
+            levels = np.sqrt(power / np.maximum(counts, 1))
+        elif self._in_parts:
+            if self.deformation is not None:
+                self._bound(self.excited.reached)
+            with np.errstate(invalid="ignore"):
+                levels = np.sqrt(squared_levels(power, counts, self.local, self.excited, self.deformation, self.growth))
+        return self._with_sensor(values, levels)
+
+    def _with_sensor(self, values: np.ndarray, levels: np.ndarray) -> np.ndarray:
+        """Sensor noise and model error together; NaN for impossible parameters."""
+        with np.errstate(invalid="ignore"):
+            impossible = ~(values >= 0.0) | ((values >= 1.0) & (self.level == "measured"))
+            return np.where(impossible, np.nan, np.hypot(self._floor, values * levels))
+
+    def _values(self, parameters: np.ndarray, unknown: float) -> np.ndarray:
+        """Parameters (n, n_noise) by group and channel, (n, events or bands or 1, n_channels or 1)."""
+        parameters = np.asarray(parameters, dtype=float)
+        if self._kind == "event":
+            values = np.full((len(parameters), len(self.events), len(self.channels)), unknown)
+            for column, (event, row) in enumerate(self.measured):
+                values[:, event, row] = parameters[:, column]
+            return values
+        n_channels = 1 if self._kind == "all" else len(self.channels)
+        return parameters.reshape(len(parameters), n_channels, self.n_bands).transpose(0, 2, 1)
+
+    @property
+    def _floor(self) -> np.ndarray:
+        return np.zeros(len(self.channels)) if self.sensor is None else np.array(self.sensor)
+
+    @property
+    def _scales(self) -> np.ndarray:
+        return np.array(self._bound(self.scales))
+
+    # ------------------------------------------------------------------ predictions and checks
+
+    @only_if(lambda noise: noise._kind != "event")
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviation of the errors of every channel, sensor noise included.
 
         Parameters
         ----------
-        parameters : (n, n_channels) float
+        parameters : (n, n_noise) float
             Parameters of the noise.
 
         Returns
         -------
         (n, n_channels) float
-            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+            [SI unit of the channel]; NaN for impossible parameters. With shares of the response: where the response is
+            zero; elsewhere they depend on it, see `response_deviations`.
         """
-        return total_deviations(np.asarray(parameters, dtype=float), self.sensor)
+        values, levels = self._values(parameters, 1.0), np.ones(1)
+        if self.level == "response":
+            levels = np.zeros(1)
+        elif self._scaled:
+            levels = self._scales
+        found = self._with_sensor(values, levels)
+        if self._kind != "bands":
+            return found[:, 0]
+        total = np.hypot(np.sqrt(np.square(values * levels).sum(axis=1)), self._floor)
+        return np.where(np.isnan(found).any(axis=1), np.nan, total)
 
-    def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
-        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
-        return GaussianNoise(channels, sensor=weighted(self.sensor, weights)), weights
+    @only_if(lambda noise: noise._kind == "event")
+    def deviations_per_event(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, n_events, n_channels) of the errors [SI]; NaN where there is no level.
 
+        Impossible parameters are returned as they are, negative.
+        """
+        values = self._values(parameters, np.nan)
+        return np.where(values < 0.0, values, np.hypot(self._floor, values))
 
-@dataclass(frozen=True)
-class SharedGaussianNoise:
-    """Independent white Gaussian noise with one unknown standard deviation for all channels, in units of their scales.
+    @only_if(lambda noise: noise.level != "si" or noise._kind == "bands")
+    def response_deviations(
+        self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
+    ) -> np.ndarray:
+        """Standard deviations of the errors of a simulated response at each step.
 
-    Channels of different dimensions can only share a dimensionless sigma: the standard deviation of channel c is
-    sigma times the scale of the channel. With `of`, the scale is the root mean square of the measured channel, and
-    sigma is the ratio of noise to signal.
+        Parameters
+        ----------
+        parameters : (n_noise,) float
+            Parameters of the noise.
+        response : (n_channels, n_steps) float
+            Response [SI unit of each channel]; NaN where a sample is missing.
+        dt : float or sequence of float, optional
+            Its time step [s], of a response from the time zero. Default: the response is at the measured samples.
+            Shares of the measured channel need it.
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-        The measured channels, in the order of the sums of squared residuals.
-    scales : sequence of float
-        One positive scale per channel [SI unit of the channel].
-    sensor, effective_samples : optional
-        As for `GaussianNoise`.
+        Returns
+        -------
+        (n_channels, n_steps) float
+            [SI unit of each channel]; NaN where the response is.
+        """
+        if self.level == "measured":
+            level = local_level(response, None if self.window is None else self.window / dt)
+            shares = np.asarray(parameters, dtype=float)[:, None]
+            return np.hypot(self._floor[:, None], shares * level) / np.sqrt((1.0 - shares) * (1.0 + shares))
+        response = np.asarray(response, dtype=float)
+        sums, deviations = self._of_response(parameters, response, dt)
+        return sums.in_time(deviations, ~np.isnan(response))
 
-    Raises
-    ------
-    ValueError
-        If there is not one positive scale per channel, and as `GaussianNoise`.
+    def _of_response(
+        self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None
+    ) -> tuple[Any, np.ndarray]:
+        """The groups of a response, and the standard deviations (n_groups, n_channels) of one sample."""
+        sums, there = self._sums(dt), ~np.isnan(response)
+        power = sums.powers(response, there)[None] if self.level == "response" else None
+        return sums, self._deviations(np.asarray(parameters, dtype=float)[None], sums.counts(there), power)[0]
 
-    Notes
-    -----
-    The likelihood is that of the measurements, not of the scaled measurements: it contains the logarithms of the
-    scales, so evidences of different noises can be compared.
-    """
-
-    channels: tuple[Channel, ...]
-    scales: tuple[float, ...]
-    sensor: tuple[float, ...] | None
-    effective_samples: tuple[float, ...] | None
-
-    def __init__(
+    @only_if(lambda noise: noise._kind == "bands")
+    def response_errors(
         self,
-        channels: Sequence[Channel],
-        scales: Sequence[float],
-        *,
-        sensor: PerChannel = None,
-        effective_samples: PerChannel = None,
-    ) -> None:
-        channels = tuple(channels)
-        object.__setattr__(self, "scales", numbers(self, "scales", scales, "[SI unit of the channel]"))
-        if not channels or len(self.scales) != len(channels):
-            raise ValueError(
-                f"SharedGaussianNoise expects one scale per channel; got {len(channels)} channels and "
-                f"{len(self.scales)} scales"
-            )
-        for channel, scale in zip(channels, self.scales, strict=True):
-            if not (math.isfinite(scale) and scale > 0.0):
-                raise ValueError(
-                    f"SharedGaussianNoise expects positive scales; got {scale} for channel {channel.name!r}: remove a "
-                    "channel without signal from the measurements, or give its scale"
-                )
-        set_channels(self, channels, sensor)
-        set_effective(self, effective_samples)
-
-    @classmethod
-    def of(cls, measurements: Measurements, **options: PerChannel) -> "SharedGaussianNoise":
-        """Noise with the root mean squares of the measured channels as scales.
+        parameters: np.ndarray,
+        response: np.ndarray,
+        normal: np.ndarray,
+        dt: float | Sequence[float] | None = None,
+        sensor: bool = True,
+    ) -> np.ndarray:
+        """Errors (n_channels, n_steps) [SI] of a simulated response, from independent standard normal numbers.
 
         Parameters
         ----------
-        measurements : Measurements
-        **options
-            `sensor` and `effective_samples`, as for the class.
+        parameters, response, dt
+            As for `response_deviations`.
+        normal : (n_channels, n_steps) float
+            The standard normal numbers.
+        sensor : bool
+            Whether the errors contain sensor noise. Without it they are errors of the model.
         """
-        mean = np.mean if measurements.complete else np.nanmean
-        return cls(measurements.channels, np.sqrt(mean(np.square(measurements.values), axis=1)), **options)
+        response = np.asarray(response, dtype=float)
+        sums, deviations = self._of_response(parameters, response, dt)
+        if not sensor:  # sensor noise is white: the same variance in each coefficient
+            deviations = np.sqrt(np.maximum(np.square(deviations) - np.square(self._floor), 0.0))
+        return sums.errors(normal, deviations, ~np.isnan(response))
 
-    def __repr__(self) -> str:
-        named = [f"{c.name}: {c.quantity} / {scale!r}" for c, scale in zip(self.channels, self.scales, strict=True)]
-        return f"SharedGaussianNoise({', '.join(named + options_repr(self.sensor, self.effective_samples))})"
+    @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
+    def whitened(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Residuals divided by their standard deviations: white, with a standard deviation of one, if the noise fits.
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """``sigma``, dimensionless."""
-        return ("sigma",)
-
-    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors of every channel, sensor noise included.
+        With bands, the coefficients of the residuals are divided.
 
         Parameters
         ----------
-        parameters : (n, 1) float
-            Shared standard deviation, in units of the scales.
+        residuals, response : (n_channels, n_samples) float
+            At the measured samples [SI unit of each channel]; NaN where a sample is missing.
+        parameters : (n_noise,) float
+            Parameters of the noise.
 
         Returns
         -------
-        (n, n_channels) float
-            [SI unit of the channel]; NaN for a negative parameter where sensor noise is given.
+        (n_channels, n_samples) float
+            [-], for `fe_likelihoods.residual_checks`.
         """
-        return total_deviations(np.asarray(parameters, dtype=float) * np.array(self.scales), self.sensor)
+        return self._whitened(residuals, response, parameters)[0]
 
-    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray) -> np.ndarray:
-        """Log-likelihood of the measurements.
+    @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
+    def log_densities(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Terms (n_channels, n_samples) of the log-likelihood, of which each belongs to one sample.
 
-        Parameters
-        ----------
-        misfit : (n, n_channels) float
-            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
-            failed.
-        n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel where samples are missing.
-        sigma : (n, 1) float
-            Shared standard deviation, in units of the scales.
-
-        Returns
-        -------
-        (n,) float
-            -inf where sigma is impossible (see `GaussianNoise.log_likelihood`) and where the misfit is NaN or infinite;
-            never NaN.
+        Arguments as for `whitened`. With bands, a term is the density of the whitened residual and an equal part of the
+        logarithm of the determinant. Zero where a sample is missing.
         """
-        return white_log_likelihood(misfit, n_samples, self.standard_deviations(sigma), self.effective_samples)
+        white, logarithms = self._whitened(residuals, response, parameters)
+        return np.nan_to_num(-HALF_LOG_TWO_PI - logarithms - 0.5 * np.square(white), nan=0.0)
 
-    def with_channels(
-        self, channels: Sequence[Channel], weights: np.ndarray
-    ) -> "tuple[SharedGaussianNoise, np.ndarray]":
-        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
-        scales, sensor = weighted(self.scales, weights), weighted(self.sensor, weights)
-        return SharedGaussianNoise(channels, scales, sensor=sensor), np.eye(1)
-
-
-def set_channels(noise: Any, channels: Sequence[Channel], sensor: PerChannel) -> None:
-    """Set and check the fields `channels` and `sensor` of a frozen noise."""
-    object.__setattr__(noise, "channels", tuple(channels))
-    if not noise.channels:
-        raise ValueError(f"{type(noise).__name__} expects at least one channel; got none")
-    values = _per_channel(noise, "sensor", sensor, 0.0)
-    if values is not None and not all(0.0 <= value < math.inf for value in values):
-        raise ValueError(
-            f"{type(noise).__name__}: sensor must be standard deviations in SI units, zero or more; got {sensor!r}"
-        )
-    object.__setattr__(noise, "sensor", values)
-
-
-def set_effective(noise: Any, effective_samples: PerChannel) -> None:
-    """Set and check the field `effective_samples` of a frozen noise."""
-    values = _per_channel(noise, "effective_samples", effective_samples, math.inf)
-    if values is not None and not all(value > 0.0 for value in values):
-        raise ValueError(
-            f"{type(noise).__name__}: effective_samples must be positive numbers of samples; got {effective_samples!r}"
-        )
-    object.__setattr__(noise, "effective_samples", values)
-
-
-def _per_channel(noise: Any, what: str, given: PerChannel, default: float) -> tuple[float, ...] | None:
-    """One number per channel, or None if none are given."""
-    if given is None:
-        return None
-    names = [channel.name for channel in noise.channels]
-    if isinstance(given, Mapping):
-        unknown = set(given) - set(names)
-        if unknown:
-            raise ValueError(
-                f"{type(noise).__name__}: {what} has the unknown channels {sorted(unknown)}; the channels are "
-                f"{', '.join(names)}"
-            )
-        given = [given.get(name, default) for name in names]
-    values = numbers(noise, what, given, "per channel" if what == "effective_samples" else "[SI unit of the channel]")
-    if len(values) != len(names):
-        raise ValueError(
-            f"{type(noise).__name__}: {what} must be one number for each of {', '.join(names)}; got {len(values)}"
-        )
-    return values
-
-
-def numbers(noise: Any, what: str, given: Any, unit: str) -> tuple[float, ...]:
-    """Numbers that a user gave for a noise, in any sequence; see `as_number`."""
-    listed = [given] if isinstance(given, str) else np.ravel(np.asarray(given, dtype=object))
-    return tuple(as_number(noise, what, value, unit) for value in listed)
-
-
-def options_repr(sensor: tuple[float, ...] | None, effective_samples: tuple[float, ...] | None = None) -> list[str]:
-    """Options that differ from the default, for the `repr`, which fingerprints are made of."""
-    options = {"sensor": sensor, "effective_samples": effective_samples}
-    return [f"{name}={value!r}" for name, value in options.items() if value is not None]
-
-
-def weighted(values: tuple[float, ...] | None, weights: np.ndarray) -> np.ndarray | None:
-    """Weighted sums (n_others,) of one number per channel, such as those of the sensors; None for None."""
-    return None if values is None else weights @ np.array(values)
-
-
-def total_deviations(sigma: np.ndarray, sensor: tuple[float, ...] | None) -> np.ndarray:
-    """Standard deviations of model error and sensor noise together; NaN for a negative sigma."""
-    if sensor is None:
-        return sigma
-    with np.errstate(invalid="ignore"):
-        return np.where(sigma >= 0.0, np.hypot(sigma, sensor), np.nan)
-
-
-def white_log_likelihood(
-    misfit: np.ndarray, n_samples: int | SampleCounts, sigma: np.ndarray, effective: tuple[float, ...] | None
-) -> np.ndarray:
-    """Log-likelihood (n,) of independent Gaussian residuals with standard deviations `sigma` (n, n_channels)."""
-    misfit, n = np.asarray(misfit, dtype=float), samples_per_channel(n_samples)
-    with np.errstate(all="ignore"):
-        # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
-        ratio = np.sqrt(misfit) / sigma
-        terms = -n * (HALF_LOG_TWO_PI + np.log(sigma)) - 0.5 * ratio * ratio
-    if effective is not None:
-        terms = terms * np.minimum(np.array(effective) / n, 1.0)
-    possible = (sigma > 0.0) & np.isfinite(misfit)
-    return np.where(possible, terms, -np.inf).sum(axis=-1)
+    def _whitened(
+        self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residuals, and the mean logarithm of the standard deviations at each sample."""
+        sums, deviations = self._of_response(parameters, np.where(np.isnan(residuals), np.nan, response), None)
+        return sums.whitened(residuals, deviations)

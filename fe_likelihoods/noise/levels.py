@@ -15,7 +15,7 @@ import numpy as np
 
 from ..signals.events import find_events
 
-__all__ = ["Excited", "excited_parts", "imposed_deformation", "squared_levels"]
+__all__ = ["Excited", "excited_parts", "imposed_deformation", "local_level", "squared_levels"]
 
 _ROUND_OFF = 1e-6  # of a part
 
@@ -126,3 +126,29 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
     total[..., 1:, :] += values[..., :-1, :]
     total[..., :-1, :] += values[..., 1:, :]
     return total
+
+
+def local_level(response: np.ndarray, steps: float | None) -> np.ndarray:
+    """Root mean square of histories within a window around each step.
+
+    Parameters
+    ----------
+    response : (n_channels, n_steps) float
+        Histories.
+    steps : float or None
+        Length of the window in steps, rounded to an odd number; None for all steps. At the ends of the histories the
+        window contains the steps that are there.
+
+    Returns
+    -------
+    (n_channels, n_steps) float
+    """
+    squares = np.square(response)
+    n = squares.shape[1]
+    if steps is None or steps >= 2 * n:
+        return np.broadcast_to(np.sqrt(squares.mean(axis=1, keepdims=True)), squares.shape)
+    half = round(0.5 * (steps - 1.0)) if steps > 1.0 else 0
+    sums = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
+    first, stop = np.maximum(np.arange(n) - half, 0), np.minimum(np.arange(n) + half + 1, n)
+    means = (sums[:, stop] - sums[:, first]) / (stop - first)
+    return np.sqrt(np.maximum(means, 0.0))

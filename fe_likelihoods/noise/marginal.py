@@ -14,13 +14,15 @@ equations are on the page ``docs/theory/likelihood.rst``.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .gaussian import GaussianNoise, Noise, SharedGaussianNoise
+from ..signals.channels import Channel
+from .gaussian import GaussianNoise
+from .protocol import Noise, noise_title
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["MarginalNoise", "sampled_noise"]
@@ -39,8 +41,9 @@ class MarginalNoise:
 
     Parameters
     ----------
-    noise : GaussianNoise or SharedGaussianNoise
-        Effective samples are allowed, known sensor noise is not.
+    noise : GaussianNoise
+        With levels in SI units per channel or for all channels. Effective samples are allowed, known sensor noise is
+        not.
     priors : mapping of str to Distribution
         Priors of exactly the noise's parameters.
 
@@ -64,14 +67,15 @@ class MarginalNoise:
     `fe_likelihoods.Posterior.marginal` does this for a posterior with all parameters.
     """
 
-    noise: GaussianNoise | SharedGaussianNoise
+    noise: GaussianNoise
     priors: tuple[Any, ...]
 
-    def __init__(self, noise: GaussianNoise | SharedGaussianNoise, priors: Mapping[str, Any]) -> None:
-        if not isinstance(noise, GaussianNoise | SharedGaussianNoise) or noise.sensor is not None:
+    def __init__(self, noise: GaussianNoise, priors: Mapping[str, Any]) -> None:
+        if not isinstance(noise, GaussianNoise) or not noise.white or noise.sensor is not None:
             raise ValueError(
-                "MarginalNoise integrates out the standard deviations of white noise, GaussianNoise or "
-                f"SharedGaussianNoise, without sensor noise; got {noise!r}: keep the parameters of this one"
+                "marginal() integrates out the standard deviations of white noise in SI units, GaussianNoise(channels) "
+                'or GaussianNoise(channels, groups="all"), without sensor noise and time shifts; got '
+                f"{noise_title(noise)}: keep the parameters of this noise"
             )
         object.__setattr__(self, "noise", noise)
         if set(priors) != set(noise.parameter_names):
@@ -82,7 +86,12 @@ class MarginalNoise:
         object.__setattr__(self, "priors", tuple(priors[name] for name in noise.parameter_names))
 
     @property
-    def channels(self) -> tuple:
+    def title(self) -> str:
+        """The noise, and that its levels are integrated out."""
+        return f"{noise_title(self.noise)}, its levels integrated out"
+
+    @property
+    def channels(self) -> Sequence[Channel]:
         """Channels of the noise."""
         return self.noise.channels
 
@@ -159,7 +168,7 @@ class MarginalNoise:
         if self.noise.effective_samples is not None:
             counts = np.minimum(counts, self.noise.effective_samples)
             misfit = misfit * (counts / n)
-        if isinstance(self.noise, GaussianNoise):
+        if self.noise.groups == "channel":
             return misfit, counts, 0.0
         scales = np.array(self.noise.scales)
         return (misfit / scales**2).sum(axis=1, keepdims=True), counts.sum(keepdims=True), -counts @ np.log(scales)

@@ -3,7 +3,7 @@
 A residual is the measured minus the simulated response at parameters that fit. White noise treats the n samples of a
 channel as independent. Residuals of real measurements are not, because the error of a model changes slowly and repeats
 from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
-of independent samples for `fe_likelihoods.noise.gaussian.GaussianNoise`, and `innovations` shows whether
+of independent samples for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
 `fe_likelihoods.AutoregressiveNoise` explains them::
 
     residuals = posterior.likelihood.residuals(best)
@@ -106,14 +106,14 @@ def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n
     elif whitened:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample is left. The errors have another correlation "
-            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, BandNoise "
-            '("bands" in TOML), or GaussianNoise(effective_samples=...).'
+            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, "
+            "GaussianNoise with bands of frequency (groups = [1.0, 5.0] in TOML), or effective_samples=."
         ]
     else:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample. {n_samples:.0f} samples are worth "
             f"{n_effective:.0f} independent ones, and intervals under white noise are too narrow: use "
-            'AutoregressiveNoise ("autoregressive" in TOML) or GaussianNoise(effective_samples=...).'
+            'AutoregressiveNoise (kind = "autoregressive" in TOML) or GaussianNoise(effective_samples=...).'
         ]
     if normal < _UNLIKELY:
         found.append("Not normal: look at the tails for outliers or missing physics.")
@@ -323,7 +323,7 @@ def residual_checks(
         The channels, one per row: their names and display units are those of the printed table.
     whitened : bool
         True if the rows are what a noise with correlation does not predict: `innovations` of `AutoregressiveNoise`, or
-        the result of ``BandNoise.whitened``. The numbers are the same, the sentences advise otherwise.
+        the result of ``GaussianNoise.whitened``. The numbers are the same, the sentences advise otherwise.
 
     Returns
     -------

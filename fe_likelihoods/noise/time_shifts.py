@@ -1,4 +1,4 @@
-"""Unknown time shifts of channels: the clock of a logger that is not that of the excitation.
+"""Unknown time shifts of channels: the clock of a logger differs from the clock of the excitation.
 
 The equations are on the page ``docs/theory/noise.rst``.
 """
@@ -12,33 +12,29 @@ from scipy.linalg import block_diag
 
 from ..signals.channels import Channel
 from ..signals.interpolation import POINTS
-from .gaussian import GaussianNoise, Noise, SharedGaussianNoise, as_number
+from .gaussian import GaussianNoise
+from .options import as_number
+from .protocol import Noise, noise_title
 from .sample_counts import SampleCounts
 
-__all__ = ["TimeShiftNoise"]
+__all__ = ["ShiftedNoise", "with_time_shifts"]
 
 
 @dataclass(frozen=True)
-class TimeShiftNoise:
-    """White noise with an unknown time shift of some channels.
+class ShiftedNoise:
+    """White noise with unknown time shifts of channels, as ``FELikelihood(..., time_shifts=)`` makes it.
 
     A sample at the time t is compared with the response at t - shift: with a positive shift, the measurement is later
     than the response.
 
     Parameters
     ----------
-    noise : GaussianNoise or SharedGaussianNoise
-        The noise of the samples.
-    time_shifts : mapping of str to float
-        Largest shift in both directions [s], by the names of the channels that are shifted. The prior of a shift must
-        be within it.
+    noise : GaussianNoise
+        The noise of the samples, with levels in SI units per channel or for all channels.
+    shifts : tuple of (str, float)
+        Channels and their largest shifts in both directions [s].
     dt : float
         Time step of the model's response [s].
-
-    Raises
-    ------
-    ValueError
-        For another noise, an unknown channel, or a largest shift that is not positive.
 
     Notes
     -----
@@ -49,50 +45,16 @@ class TimeShiftNoise:
 
     So that every shift compares the same samples, those within the largest shift of all channels, and three further
     steps, of an end of the response are left out of the shifted channels.
-
-    Examples
-    --------
-    >>> noise = TimeShiftNoise(GaussianNoise(model.channels), {"top": 0.05}, model.dt)
-    >>> prior["time_shift_top"] = Uniform(-0.05, 0.05)
-    >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior)
     """
 
-    noise: GaussianNoise | SharedGaussianNoise
+    noise: GaussianNoise
     shifts: tuple[tuple[str, float], ...]
     dt: float
 
-    def __init__(self, noise: GaussianNoise | SharedGaussianNoise, time_shifts: Mapping[str, float], dt: float) -> None:
-        if not isinstance(noise, GaussianNoise | SharedGaussianNoise):
-            raise ValueError(
-                f"TimeShiftNoise expects a GaussianNoise or a SharedGaussianNoise; got {noise!r}. For errors "
-                "correlated in time, and for standard deviations that are integrated out, estimate the shift with "
-                "align(response, measurements), correct it with Measurements.shift(-lag), and use the noise without "
-                "TimeShiftNoise"
-            )
-        names = [channel.name for channel in noise.channels]
-        if not isinstance(time_shifts, Mapping):
-            raise ValueError(
-                f"TimeShiftNoise expects the largest shifts [s] by the names of channels, such as {{{names[0]!r}: "
-                f"0.05}}; got {time_shifts!r}"
-            )
-        unknown = sorted(set(time_shifts) - set(names))
-        if unknown or not time_shifts:
-            raise ValueError(
-                f"TimeShiftNoise expects the largest shifts of some of the channels {', '.join(names)}; got "
-                f"{dict(time_shifts)!r}"
-            )
-        shifts = tuple(
-            (name, as_number(self, "time_shifts", time_shifts[name], "[s]")) for name in names if name in time_shifts
-        )
-        dt = as_number(self, "dt", dt, "[s]")
-        if not all(0.0 < shift < math.inf for _, shift in shifts) or not 0.0 < dt < math.inf:
-            raise ValueError(
-                f"TimeShiftNoise expects positive largest shifts and a positive step, in seconds; got {dict(shifts)!r} "
-                f"and {dt!r}"
-            )
-        object.__setattr__(self, "noise", noise)
-        object.__setattr__(self, "shifts", shifts)
-        object.__setattr__(self, "dt", dt)
+    @property
+    def title(self) -> str:
+        """The noise, and the channels with time shifts."""
+        return f"{self.noise.title} with time shifts of {', '.join(self.time_shifts)}"
 
     @property
     def channels(self) -> Sequence[Channel]:
@@ -114,7 +76,7 @@ class TimeShiftNoise:
         return self.noise.standard_deviations(np.asarray(parameters, dtype=float)[..., : self._n_noise])
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple[Noise, np.ndarray]:
-        """Noise of other channels, and the weights of the parameters in its own; see `Noise`.
+        """Noise of other channels, and the weights of the parameters in its own; see `fe_likelihoods.Noise`.
 
         A measured channel keeps its unknown shift, another one has none.
         """
@@ -122,7 +84,7 @@ class TimeShiftNoise:
         names = [channel.name for channel in channels]
         kept = [k for k, (name, _) in enumerate(self.shifts) if name in names]
         matrix = block_diag(of_noise, np.eye(len(self.shifts))[kept])
-        return (TimeShiftNoise(noise, dict(self.shifts[k] for k in kept), self.dt) if kept else noise), matrix
+        return (ShiftedNoise(noise, tuple(self.shifts[k] for k in kept), self.dt) if kept else noise), matrix
 
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
@@ -168,6 +130,47 @@ class TimeShiftNoise:
     @property
     def _n_noise(self) -> int:
         return len(self.noise.parameter_names)
+
+
+def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: float) -> Noise:
+    """The noise of a likelihood with unknown time shifts of channels.
+
+    Parameters
+    ----------
+    noise : Noise
+    time_shifts : mapping of str to float, or None
+        Largest shifts in both directions [s] by the names of channels; None for those that the noise already has.
+    dt : float
+        Time step of the model's response [s].
+
+    Raises
+    ------
+    ValueError
+        For a noise that is not white or not in SI units, an unknown channel, or a largest shift that is not positive.
+    """
+    if isinstance(noise, ShiftedNoise):
+        noise, time_shifts = noise.noise, noise.time_shifts if time_shifts is None else time_shifts
+    if time_shifts is None:
+        return noise
+    if not isinstance(noise, GaussianNoise) or not noise.white:
+        raise ValueError(
+            "time_shifts= is for white noise in SI units, GaussianNoise(channels) or GaussianNoise(channels, "
+            f'groups="all"); got {noise_title(noise)}. For other noises, and for standard deviations that are '
+            "integrated out, estimate the shift with align(response, measurements), correct it with "
+            "Measurements.shift(-lag), and leave time_shifts= out"
+        )
+    names = [channel.name for channel in noise.channels]
+    if not isinstance(time_shifts, Mapping) or not time_shifts or set(time_shifts) - set(names):
+        raise ValueError(
+            f"time_shifts= expects the largest shifts [s] of some of the channels {', '.join(names)} by name, such as "
+            f"{{{names[0]!r}: 0.05}}; got {time_shifts!r}"
+        )
+    shifts = [
+        (name, as_number(noise, "time_shifts", time_shifts[name], "in s")) for name in names if name in time_shifts
+    ]
+    if not all(0.0 < shift < math.inf for _, shift in shifts):
+        raise ValueError(f"time_shifts= expects positive largest shifts, in seconds; got {dict(shifts)!r}")
+    return ShiftedNoise(noise, tuple(shifts), dt)
 
 
 def _misfit_at(sums: np.ndarray, steps: np.ndarray) -> np.ndarray:

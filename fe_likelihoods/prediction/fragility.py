@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from ..noise.protocol import follows_response
 from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -25,7 +26,6 @@ from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
-from .model_error import follows_response
 from .new_event import draw_new_event, of_hierarchy
 from .propagation import check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
@@ -207,8 +207,8 @@ def fragility(
         Ratios of measured to fitted values of the quantity in several events: the error of the model.
     noise : bool or str, optional
         The error of the model from the noise of the calibration, as for `propagate`. Default: "model" if there are no
-        ratios, the noise follows the response (`RelativeNoise`) and the samples have its parameters. Otherwise the
-        error of the model is left out, with a warning; False states that this is on purpose.
+        ratios, the noise follows the response (`GaussianNoise` with shares) and the samples have its parameters.
+        Otherwise the error of the model is left out, with a warning; False states that this is on purpose.
     n : int
         Number of draws from a `Hierarchy`.
     intensity : callable
@@ -352,7 +352,9 @@ def _chosen(
         elif (complete := _with_noise(posterior_or_model, samples, part, source)) is not None:
             noise, rows = "model", complete
     if noise is None and ratios is None:
-        warn_of_missing_error("fragility", "calibrate with a RelativeNoise and give samples of all parameters", 4)
+        warn_of_missing_error(
+            "fragility", "calibrate with noise in shares of the response and give samples of all parameters", 4
+        )
     noise = noise or False
     if not of_population:
         return predictor, rows, noise, None

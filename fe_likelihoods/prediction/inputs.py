@@ -12,8 +12,9 @@ import numpy as np
 
 from ..cache.memory import distinct_keys
 from ..noise.draws import SampleNoise, sample_noise
-from ..noise.events import EventNoise
+from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
+from ..noise.protocol import noise_title
 from ..probability.inputs import as_points
 from ..probability.joint import JointLikelihood
 from ..probability.likelihood import FELikelihood
@@ -140,8 +141,8 @@ def split_samples(
     samples : (n, ndim) array_like, or named values of shape (n,)
         All parameters, or without `noise` the structural parameters alone.
     noise : bool or str
-        Whether the noise is wanted; the name of an event for the noise that was calibrated with it (`EventNoise`);
-        "model" for the error of the model alone (`model_error`).
+        Whether the noise is wanted; the name of an event for the noise that was calibrated with it
+        (``groups="event"``); "model" for the error of the model alone (`model_error`).
     other_record : bool
         Whether the prediction is of another record than that of the likelihood.
 
@@ -183,11 +184,11 @@ def split_samples(
     if not noise:
         return thetas, None
     parameters = points[:, len(structural) :]
-    if isinstance(noise_model, EventNoise):
+    if hasattr(noise_model, "deviations_per_event"):
         return thetas, _noise_of_events(noise_model, parameters, model, noise, other_record)
     if isinstance(noise, str) and noise != "model":
         raise ValueError(
-            f"noise={noise!r} names an event, and {type(noise_model).__name__} has no levels per event; give noise=True"
+            f"noise={noise!r} names an event, and {noise_title(noise_model)} has no levels per event; give noise=True"
         )
     whole = sample_noise(noise_model, parameters, len(model.channels), model.dt)  # refuses impossible parameters
     return thetas, model_error(noise_model, parameters, model.dt) if noise == "model" else whole
@@ -206,17 +207,18 @@ def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
 
 
 def _noise_of_events(
-    noise_model: EventNoise, parameters: np.ndarray, model: Model, noise: bool | str, other_record: bool
+    noise_model: GaussianNoise, parameters: np.ndarray, model: Model, noise: bool | str, other_record: bool
 ) -> SampleNoise:
     """Noise with levels per event: each at its steps, or those of one event at all steps."""
-    names = ", ".join(map(repr, noise_model.names))
+    known = [each.name for each in noise_model.events]
+    names = ", ".join(map(repr, known))
     rows = [[channel.name for channel in noise_model.channels].index(channel.name) for channel in model.channels]
     deviations = noise_model.deviations_per_event(parameters)[:, :, rows]
     if not (deviations[~np.isnan(deviations)] > 0.0).all() or np.isinf(deviations).any():
         raise ValueError("the noise needs positive standard deviations; some samples have others")
     if not isinstance(noise, str):
         events = find_events(model)
-        if other_record or events is None or events.names != noise_model.names:
+        if other_record or events is None or list(events.names) != known:
             raise ValueError(
                 "the noise has levels per event, and the prediction is of another record: give the event whose levels "
                 f"hold for it, noise= one of {names}"
@@ -224,9 +226,9 @@ def _noise_of_events(
         steps = [(each.start / model.dt, each.end / model.dt) for each in events.windows]
         events = tuple(slice(math.ceil(start - 1e-6), math.floor(end + 1e-6) + 1) for start, end in steps)
         return SampleNoise(np.nan_to_num(deviations), None, events)
-    if noise not in noise_model.names:
+    if noise not in known:
         raise ValueError(f"noise={noise!r} is no event of the noise; give one of {names}")
-    chosen = deviations[:, noise_model.names.index(noise)]
+    chosen = deviations[:, known.index(noise)]
     if np.isnan(chosen).any():
         without = [c.name for c, values in zip(model.channels, chosen.T, strict=True) if np.isnan(values).any()]
         raise ValueError(

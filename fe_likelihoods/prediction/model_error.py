@@ -1,19 +1,22 @@
 r"""Error of a model in the response of a structure, without the noise of the sensors.
 
-A noise whose standard deviation follows the response (`RelativeNoise`, `ModulatedNoise`) has two parts: the noise of
-the sensor, which is no motion of the structure, and the error of the model. Their variances add,
-:math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest of
-many independent errors adds to each peak, while the errors of a model are motions of a structure and change as slowly
-as its response. A draw of the error of the model therefore has the amplitudes of the spectrum of the response, random
-phases, and the standard deviation :math:`\sigma_m` at each step. A noise with a spectrum of its own (`BandNoise`) keeps
-it, from which the white noise of the sensor is taken out per frequency. See ``docs/theory/prediction.rst``.
+A noise whose standard deviation follows the response (`GaussianNoise` with ``level="measured"`` or ``"response"``) has
+two parts: the noise of the sensor, which is no motion of the structure, and the error of the model. Their variances
+add, :math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest
+of many independent errors adds to each peak, while the errors of a model are motions of a structure and change as
+slowly as its response. A draw of the error of the model therefore has the amplitudes of the spectrum of the response,
+random phases, and the standard deviation :math:`\sigma_m` at each step. A noise with a spectrum of its own (bands of
+frequency) keeps it, from which the white noise of the sensor is taken out per frequency. See
+``docs/theory/prediction.rst``.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["ModelError", "follows_response", "model_error"]
+from ..noise.protocol import follows_response, noise_title
+
+__all__ = ["ModelError", "model_error"]
 
 
 class ModelError(NamedTuple):
@@ -52,19 +55,14 @@ class ModelError(NamedTuple):
         return deviations * np.fft.irfft(spectrum * np.fft.rfft(normal, axis=1), n=n_steps, axis=1)
 
 
-def follows_response(noise: Any) -> bool:
-    """Return whether the standard deviation of a noise is a share of the response, which holds for other motions."""
-    return hasattr(noise, "response_deviations") and getattr(noise, "relative", True)
-
-
 def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
     """Error of the model of samples of the parameters of a noise.
 
     Parameters
     ----------
     noise : Noise
-        With a method ``response_deviations``, such as `RelativeNoise`, and ``sensor``, the standard deviations of the
-        noise of the sensors, or None.
+        With a method ``response_deviations``, such as `GaussianNoise` with ``level="response"``, and ``sensor``, the
+        known standard deviations of the sensors, or None.
     parameters : (n, n_noise) float
         Parameters of the noise.
     dt : float
@@ -81,7 +79,7 @@ def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
     """
     if not follows_response(noise):
         raise ValueError(
-            f'noise="model" needs a noise that follows the response, such as RelativeNoise; {type(noise).__name__} '
-            "does not tell the error of the model from that of the sensors: use noise=True, or ratios="
+            'noise="model" needs a noise that follows the response, such as GaussianNoise(..., level="response"); '
+            f"{noise_title(noise)} does not tell model error from sensor noise: use noise=True, or ratios="
         )
     return ModelError(noise, parameters, dt)

@@ -128,11 +128,11 @@ def predict_new_event(
         only) the ratio of each draw is that at its predicted value.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The parameters of the noise must be varying,
-        common, or have the same prior in all events. Shares of the response (`ModulatedNoise`, `RelativeNoise`)
+        common, or have the same prior in all events. Shares of the response (`GaussianNoise`)
         transfer between events, levels in SI units do not.
     n : int
         Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more of
-        `RelativeNoise`, are left out.
+        ``level="measured"``, are left out.
     seed : int, optional
         Seed of the draws of parameters, ratios and noise.
     **options
@@ -347,8 +347,8 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     if possible.mean() < 1.0 - _LARGEST_IMPOSSIBLE:
         warnings.warn(
             f"predict_new_event: {1.0 - possible.mean():.0%} of the draws have an impossible noise, such as a share of "
-            "the measured signal of 1 or more, and are left out. Use ModulatedNoise, whose shares of the response have "
-            'no upper bound, let shares vary with Varying(..., scale="logit"), or state a narrower prior of their '
+            "the measured signal of 1 or more, and are left out. Use level='response', whose shares have no "
+            'upper bound, let shares vary with Varying(..., scale="logit"), or state a narrower prior of their '
             "spread between events",
             stacklevel=3,
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..noise.gaussian import noise_channels, noise_under
+from ..noise.protocol import noise_channels, noise_title, noise_under
 from ..probability.inputs import as_points, check_model
 from ..simulation.model import Model
 from .inputs import PredictionSource, split_samples
@@ -66,7 +66,7 @@ def predict_channels_of(
     calibrated = source.noise
     if not hasattr(calibrated, "with_channels"):
         raise ValueError(
-            f"{type(calibrated).__name__} does not say what the noise of other channels is: give it a method "
+            f"{noise_title(calibrated)} does not say what the noise of other channels is: give it a method "
             "with_channels(channels, weights), see fe_likelihoods.Noise, or predict with noise=False"
         )
     weights, remark = _weights(model, source)

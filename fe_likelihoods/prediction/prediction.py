@@ -73,8 +73,8 @@ class Prediction:
         State of the structure at the beginning: "virgin", that of the model before any excitation, or "end", that after
         the excitation with which the model was made.
     shifted : tuple of str
-        Channels of the measurements with unknown time shifts (`fe_likelihoods.TimeShiftNoise`). The histories are those
-        of the response, without a shift.
+        Channels of the measurements with unknown time shifts (``time_shifts=`` of `fe_likelihoods.FELikelihood`). The
+        histories are those of the response, without a shift.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
     spread : EventSpread or None

@@ -32,8 +32,7 @@ from tqdm import tqdm
 
 from ..cache.simulation_cache import SimulationCache
 from ..cache.stored_responses import StoredResponses
-from ..noise.gaussian import noise_time_shifts, noise_under, remark_on_gaps
-from ..noise.time_shifts import TimeShiftNoise
+from ..noise.protocol import noise_time_shifts, noise_under, remark_on_gaps
 from ..probability.inputs import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
@@ -133,10 +132,10 @@ def propagate(
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
         response. "model" predicts the response of the structure with the error of the model and without the noise of
-        the sensors, for a noise that follows the response (`RelativeNoise`, `ModulatedNoise`, `BandNoise`); the errors
-        have the spectrum of the response, or that of the bands, because white errors make peaks too large. A noise with
-        levels per event (`EventNoise`) has those of each event in that event; under another `record`, give the name of
-        the event whose levels hold for it.
+        the sensors, for a noise that follows the response (`GaussianNoise` with shares); the errors have the spectrum
+        of the response, or that of the bands, because white errors make peaks too large. A noise with levels per event
+        has those of each event in that event; under another `record`, give the name of the event whose levels hold for
+        it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional
@@ -201,13 +200,12 @@ def propagate(
         If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
         SI units, and their level is more than three times that of the measurements of the calibration, or less than a
         third.
-        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response
-        (`RelativeNoise`, `ModulatedNoise`), and their median is more than 1.1 times that of the response.
-        Once for each likelihood, if its residuals are correlated and `GaussianNoise`, `SharedGaussianNoise`,
-        `RelativeNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent, or the whitened
-        residuals of `ModulatedNoise` or `BandNoise` are correlated; and if less than 0.75 times the simulated response
-        fits the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of
-        this response (`ModulatedNoise`, `BandNoise`).
+        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and their
+        median is more than 1.1 times that of the response. Once for each likelihood, if its residuals are correlated
+        and `GaussianNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent, or the
+        whitened residuals of shares or bands are correlated; and if less than 0.75 times the simulated response fits
+        the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of this
+        response.
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
@@ -338,7 +336,7 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     joint = posterior
     posterior, samples = part_of(joint, complete, part, False)
     source = read_source(posterior)
-    if source.likelihood is not None and isinstance(source.likelihood.noise, TimeShiftNoise):
+    if noise_time_shifts(source.noise):
         posterior, samples = part_of(joint, complete, part, True)
     if source.likelihood is None:
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
@@ -346,11 +344,11 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     compared = getattr(likelihood.measured, "values", likelihood.measured)
     power = sum_of_squares(compared, [channel.name for channel in likelihood.measurements.channels])
     thetas, _ = split_samples(source, samples, False)
-    if not isinstance(likelihood.noise, TimeShiftNoise):
+    if not (shifted := noise_time_shifts(likelihood.noise)):
         return likelihood.misfit(thetas) / power
     if not (isinstance(samples, Mapping) or np.shape(samples)[-1:] == (likelihood.ndim,)):
         raise ValueError(
-            f"the channels {', '.join(likelihood.noise.time_shifts)} have unknown time shifts: give samples of all "
+            f"the channels {', '.join(shifted)} have unknown time shifts: give samples of all "
             f"{likelihood.ndim} parameters"
         )
     noise = as_points(samples, likelihood.parameter_names)[:, thetas.shape[1] :]

@@ -158,7 +158,7 @@ def exceedance(
 
     Examples
     --------
-    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record, noise="model")  # with RelativeNoise
+    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record, noise="model")  # noise in shares
     >>> exceedance(drift, 50.0, unit="mm")
     >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record)
     >>> exceedance(drift, 50.0, unit="mm", ratios=EventRatios([0.93, 1.10, 1.02]))
@@ -187,7 +187,7 @@ def exceedance(
             raise ValueError("ratios contain the error of the model, and the prediction contains it already: leave one")
         spread = spread._replace(ratios=ratios)
     elif prediction is not None and noise is None and not has_error:
-        warn_of_missing_error("exceedance", 'propagate with noise="model" and a RelativeNoise')
+        warn_of_missing_error("exceedance", 'propagate with noise="model" and noise in shares of the response')
     effective = float(check_effective_sample_size(effective_sample_size, effective))
     limits, values = threshold_in_si(threshold, unit, channels), spread.values
     if values.ndim > 1 and limits.shape not in ((), values.shape[1:]):

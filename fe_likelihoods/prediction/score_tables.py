@@ -353,7 +353,7 @@ def _warn_of_certainty(channels: Sequence[Channel], certain: np.ndarray, samples
     warnings.warn(
         f"score: the predicted standard deviation of measured samples is zero: {', '.join(which)}. They are left out "
         "of the log score and of the PIT. Predict with noise=True; for a noise that is a share of the response, state "
-        "the noise of the sensors too, such as RelativeNoise.of(measurements, sensor=...)",
+        "the noise of the sensors too, such as GaussianNoise(model.channels, sensor=...)",
         stacklevel=4,
     )
 

@@ -15,11 +15,9 @@ import numpy as np
 
 from ..cache.verification import StaleCache
 from ..noise.autoregressive import AutoregressiveNoise
-from ..noise.bands import BandNoise
-from ..noise.gaussian import GaussianNoise, SharedGaussianNoise
+from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
-from ..noise.modulated import ModulatedNoise
-from ..noise.relative import RelativeNoise
+from ..noise.protocol import follows_response
 from ..noise.residuals import effective_samples, innovations, residual_checks
 from ..probability.failures import TooManyFailures
 from ..probability.inputs import as_points
@@ -28,7 +26,6 @@ from ..signals.channels import Channel, Measurements
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from .inputs import PredictionSource
-from .model_error import follows_response
 from .prediction import Prediction
 from .quantities import ChannelQuantity, measured_quantity, peak
 
@@ -160,7 +157,7 @@ def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: Pre
     return (
         "the predicted response has another level than the measurements of the calibration: "
         f"{', '.join(far)}. The noise keeps its level in SI units, so that the bands are too wide for a weaker and "
-        "too narrow for a stronger motion; ModulatedNoise, BandNoise and RelativeNoise scale with the response"
+        'too narrow for a stronger motion; shares of the response scale with it: level="response" of GaussianNoise'
     )
 
 
@@ -219,8 +216,10 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
     None if there is nothing to check: without a likelihood, for a noise that is not listed in `propagate`, and for
     samples of the structural parameters alone.
     """
-    kinds = (GaussianNoise, SharedGaussianNoise, RelativeNoise, AutoregressiveNoise)
-    if source.likelihood is None or not (isinstance(source.noise, kinds) or hasattr(source.noise, "whitened")):
+    known = isinstance(source.noise, GaussianNoise | AutoregressiveNoise) and hasattr(
+        source.noise, "standard_deviations"
+    )
+    if source.likelihood is None or not (known or hasattr(source.noise, "whitened")):
         return None
     names = (*source.model.parameter_names, *source.noise.parameter_names)
     if (len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1]) != len(names):
@@ -311,12 +310,12 @@ def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, s
             )
     if not far:
         return ""
-    smaller = "a smaller local=, such as 0.25 or 0, " if isinstance(noise, ModulatedNoise) and noise.local > 0.0 else ""
+    smaller = "a smaller local=, such as 0.25 or 0, " if getattr(noise, "local", None) else ""
     return (
         f"the simulated response of the calibration is too large: {', '.join(far)}. The noise is a share of the "
         "simulated response, so that the likelihood may prefer a response that is larger or lasts longer than the "
         "measured one, because it permits larger errors; the evidence and the verdict of the sampler do not show it. "
-        f"Calibrate with {smaller}RelativeNoise or GaussianNoise, and compare the RRMSE (in Python, fit_measures)"
+        f'Calibrate with {smaller}level="measured" or level="si", and compare the RRMSE (in Python, fit_measures)'
     )
 
 
@@ -348,10 +347,10 @@ def _contradiction(noise: Any, channels: Sequence[Channel], residuals: np.ndarra
     )
     what, other = "residuals", "AutoregressiveNoise or effective_samples="
     if autoregressive:
-        what, other = "innovations", "fewer samples, BandNoise or effective_samples="
+        what, other = "innovations", "fewer samples, GaussianNoise with bands of frequency, or effective_samples="
     elif whitened:
-        bands = "other bands" if isinstance(noise, BandNoise) else "BandNoise"
-        what, other = "whitened residuals", f"fewer samples or {bands}"
+        bands = "other bands" if getattr(noise, "n_bands", 1) > 1 else "GaussianNoise with bands"
+        what, other = "whitened residuals", f"fewer samples or {bands} of frequency"
     return (
         f"the {what} of the calibration are not independent, as the noise says they are: {names}. The posterior is too "
         f"narrow, and so is the spread of the predictions between its samples. Calibrate with {other}, or predict with "

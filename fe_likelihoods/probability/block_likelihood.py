@@ -22,10 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..noise.bands import BandNoise
-from ..noise.gaussian import GaussianNoise, Noise, SharedGaussianNoise, noise_of_part, noise_statistic
-from ..noise.modulated import ModulatedNoise
-from ..noise.relative import RelativeNoise
+from ..noise.gaussian import GaussianNoise
+from ..noise.protocol import Noise, noise_of_part, noise_statistic
 from ..noise.residuals import effective_samples
 from ..noise.sample_counts import count_samples, samples_per_channel
 from ..signals.channels import Measurements
@@ -34,7 +32,6 @@ __all__ = ["BlockLogLikelihood", "block_log_likelihood", "choose_blocks", "descr
 
 _CORRELATION_TIMES = 5.0  # length of a block; `effective_samples` sums the correlation over the same window
 _MOST_BLOCKS = 100
-_WHITE = GaussianNoise | SharedGaussianNoise | RelativeNoise
 _ROUND_OFF = 1e-6  # in steps
 
 
@@ -164,7 +161,7 @@ def block_log_likelihood(
             statistics = np.stack([reduce(each) for each in chosen])
         counts = count_samples(part)
         noise_of_block = noise_of_part(noise, replace(measurements, values=part))
-        if isinstance(noise, _WHITE) and noise.effective_samples is not None:
+        if getattr(noise, "effective_samples", None) is not None:
             # a sample counts as much as in the whole measurements
             share = np.minimum(np.array(noise.effective_samples) / total, 1.0)
             noise_of_block = replace(noise, effective_samples=share * samples_per_channel(counts))
@@ -216,11 +213,11 @@ def describe_blocks(seconds: float, chosen: bool, noise: Noise) -> str:
         f"One observation is one block of time with the samples of all channels. Blocks are at most {seconds:.4g} s "
         f"long, {how}. Shorter blocks would not be independent. Compare models with equal blocks only."
     )
-    if isinstance(noise, _WHITE | ModulatedNoise):
+    if not isinstance(noise, GaussianNoise):
+        return text + " The term of a block is conditional on the blocks before it."
+    if noise.n_bands == 1:
         return text
-    if isinstance(noise, BandNoise):
-        return text + (
-            " The term of a block is the density of its whitened residuals, with an equal part of the determinant for "
-            "each sample."
-        )
-    return text + " The term of a block is conditional on the blocks before it."
+    return text + (
+        " The term of a block is the density of its whitened residuals, with an equal part of the determinant for each "
+        "sample."
+    )

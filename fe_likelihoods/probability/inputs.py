@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..noise.gaussian import Noise, noise_channels, noise_time_shifts
+from ..noise.protocol import Noise, noise_channels
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
-from ..signals.sampling import same_step
 from ..simulation.model import Model
 from ..simulation.residual_statistics import Statistic, apply_statistic
 
@@ -18,7 +17,7 @@ __all__ = [
     "as_points",
     "as_rows",
     "check_model",
-    "check_noise_channels",
+    "check_noise",
     "check_statistic",
     "complete_repr",
     "match_measurements",
@@ -90,19 +89,19 @@ def check_model(model: Model) -> None:
         )
 
 
-def check_noise_channels(model: Model, noise: Noise) -> None:
-    """Raise ValueError if the channels of a noise, or its step, are not those of the model."""
+def check_noise(model: Model, noise: Noise) -> None:
+    """Raise ValueError if an object is no noise, or has other channels than the model."""
+    if not hasattr(noise, "log_likelihood"):
+        raise ValueError(
+            "noise must be a noise, such as GaussianNoise(model.channels) or GaussianNoise(model.channels, "
+            f'groups="event"); got {noise!r}'
+        )
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in noise_channels(noise, model.channels)]
     if expected != got:
         raise ValueError(
             f"the noise's channels are {', '.join(got)}, the model's are {', '.join(expected)}; make the noise with "
             "model.channels"
-        )
-    if noise_time_shifts(noise) and not same_step(noise.dt, model.dt):
-        raise ValueError(
-            f"the time shifts of the noise are for a response with a step of {noise.dt} s, the model's step is "
-            f"{model.dt} s; make the noise with model.dt"
         )
 
 
@@ -121,8 +120,7 @@ def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparis
     if not np.isfinite(apply_statistic(statistic, measured.values, measured.values)).all():
         raise ValueError(
             f"samples are missing, and the statistic {statistic!r} of the noise is not finite with residuals of NaN at "
-            "these samples; leave such residuals out in the statistic, or use GaussianNoise, SharedGaussianNoise or "
-            "AutoregressiveNoise"
+            "these samples; leave such residuals out in the statistic, or use GaussianNoise or AutoregressiveNoise"
         )
 
 

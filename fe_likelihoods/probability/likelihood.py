@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..noise.events import named_noise
-from ..noise.gaussian import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
+from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import MarginalNoise
+from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
 from ..noise.sample_counts import count_samples
+from ..noise.time_shifts import with_time_shifts
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
@@ -27,7 +28,7 @@ from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
 from .data_identity import combined_digest, data_digests
 from .distributions import Distribution, RandomState, uniform_numbers
-from .inputs import as_points, check_model, check_noise_channels, complete_repr, match_measurements
+from .inputs import as_points, check_model, check_noise, complete_repr, match_measurements
 from .multivariate import as_distribution
 from .parameters import Parameter, describe_parameters
 from .simulator import Simulator
@@ -50,9 +51,9 @@ class FELikelihood:
         up to the end of the model's response. NaN marks missing samples, which are left out. A channel may have its own
         step and start: the response is interpolated at the times of its samples, without a filter
         (`fe_likelihoods.signals.comparison`).
-    noise : Noise or "per event", optional
-        A noise of `fe_likelihoods.noise.gaussian` or any object with that protocol; by default `GaussianNoise` of
-        the model's channels. "per event" is an `EventNoise`, with a level per channel and event.
+    noise : Noise, optional
+        `GaussianNoise`, `AutoregressiveNoise`, or any object with the protocol `Noise`. Default: `GaussianNoise` of the
+        model's channels.
     pool : int, or object with ``map(function, items)``, optional
         Runs the simulations in parallel: a number of processes of this machine, a client of dask.distributed, an
         executor or a pool (see `fe_likelihoods.simulation.executors`). Without it, simulations run in this process:
@@ -75,6 +76,11 @@ class FELikelihood:
         Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
         simulation raises `TooManyFailures`; with a pool also a request of which simulations still run, if more have
         failed even when all of these succeed.
+    time_shifts : mapping of str to float, optional
+        Largest unknown time shift in both directions [s], by the names of channels whose clock may differ from the
+        clock of the excitation. Each has a parameter ``time_shift_<channel>`` [s] after the noise parameters; the prior
+        must be within the largest shift. With a positive shift, the measurement is later than the response. For white
+        noise in SI units (`fe_likelihoods.noise.time_shifts`).
 
     Attributes
     ----------
@@ -100,28 +106,30 @@ class FELikelihood:
     Warns
     -----
     UserWarning
-        If the share of a `ModulatedNoise` is that of a part of the motion, because samples are missing.
+        If noise is a share of the level of a part of the motion only, because samples are missing.
     """
 
     def __init__(
         self,
         model: Model,
         measurements: Measurements | Mapping[str, Measurements],
-        noise: Noise | str | None = None,
+        noise: Noise | None = None,
         pool: Any = None,
         *,
         memory_rows: int = 100_000,
         memory_bytes: int = 2**28,
         cache: SimulationCache | str | os.PathLike | None = None,
         max_failure_share: float = 1.0,
+        time_shifts: Mapping[str, float] | None = None,
     ) -> None:
         check_model(model)
         measurements = match_measurements(model, join_measurements(model, measurements))
-        noise = named_noise(model, measurements, noise)
-        check_noise_channels(model, noise)
-        self.noise = noise_under(noise_of_part(noise, measurements), model)
-        if gaps := remark_on_gaps(self.noise):
+        noise = GaussianNoise(model.channels) if noise is None else noise
+        check_noise(model, noise)
+        noise = noise_of_part(noise_under(noise, model), measurements)
+        if gaps := remark_on_gaps(noise):
             warnings.warn(gaps, stacklevel=2)
+        self.noise = with_time_shifts(noise, time_shifts, model.dt)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):
@@ -226,7 +234,7 @@ class FELikelihood:
             steps = math.ceil(measurements.end / self.model.dt - 1e-6)
             last = min(steps, self.model.n_steps - 1) * self.model.dt
         model = first_part(self.model, last)
-        self.shortened.append(self._with(model, measurements, noise_of_part(self.noise, measurements)))
+        self.shortened.append(self._with(model, measurements, self.noise))
         return self.shortened[-1]
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
@@ -451,7 +459,8 @@ class FELikelihood:
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
 
-        Model, measurements, pool, limits, cache on disk and the responses in memory are kept; counts start at zero.
+        Model, measurements, time shifts, pool, limits, cache on disk and the responses in memory are kept; counts start
+        at zero.
         """
         return self._with(self.model, self.measurements, noise)
 
@@ -466,6 +475,7 @@ class FELikelihood:
             memory_rows=own.memory_cache.rows,
             memory_bytes=own.response_memory.max_bytes,
             max_failure_share=own.failures.max_share,
+            time_shifts=noise_time_shifts(self.noise) or None,
         )
         other.simulator.share(own)
         return other

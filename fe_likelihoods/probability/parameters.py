@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..noise.bands import BandNoise
-from ..noise.events import EventNoise
-from ..noise.gaussian import Noise, SharedGaussianNoise, noise_channels
+from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
+from ..noise.protocol import Noise, noise_channels
 from ..signals.channels import Channel
 from ..simulation.model import Model
 from ..units import UNITS, find_unit
@@ -91,12 +90,8 @@ def channels_of_deviations(noise: Noise, default: Sequence[Channel]) -> dict[str
     `default`: the channels of the model, for a noise that does not specify its own.
     """
     sampled = sampled_noise(noise)
-    if isinstance(sampled, EventNoise):
-        rows = [sampled.channels[row] for _, row in sampled.levels]
-        return dict(zip(sampled.parameter_names, rows, strict=True))
-    if isinstance(sampled, BandNoise):
-        rows = [] if sampled.relative else [each for each in sampled.channels for _ in range(sampled.n_bands)]
-        return dict(zip(sampled.parameter_names, rows, strict=False))
+    if hasattr(sampled, "parameter_channels"):
+        return sampled.parameter_channels
     return {f"sigma_{channel.name}": channel for channel in noise_channels(sampled, default)}
 
 
@@ -109,6 +104,6 @@ def _of_noise(noise: Noise, default: Sequence[Channel]) -> list[Parameter]:
         elif name.startswith("time_shift_"):
             described.append(Parameter(name, "s"))
         else:
-            dimensionless = name.startswith(("rho_", "share_")) or isinstance(sampled, SharedGaussianNoise)
+            dimensionless = name.startswith(("rho_", "share_")) or isinstance(sampled, GaussianNoise)
             described.append(Parameter(name, "-" if dimensionless else ""))
     return described

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..noise.protocol import noise_title
 from .block_likelihood import BlockLogLikelihood
 from .distributions import Distribution, RandomState
 from .evaluation_queue import EvaluationQueue
@@ -421,7 +422,7 @@ class Posterior:
         for part, _ in parts:
             channels = ", ".join(channel.name for channel in part.measurements.channels)
             samples = np.sum(~np.isnan(part.measurements.values))
-            lines.append(f"{type(part.model).__name__}, {type(part.noise).__name__}, {samples} samples of {channels}")
+            lines.append(f"{type(part.model).__name__}, {noise_title(part.noise)}, {samples} samples of {channels}")
         report = self.report()
         lines.append(f"{report['simulations']} simulations so far, {report['failure_count']} failed")
         header, rows = self.prior.table()

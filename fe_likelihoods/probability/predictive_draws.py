@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..noise.draws import SampleNoise, sample_noise
-from ..noise.events import EventNoise
 from ..noise.marginal import MarginalNoise
-from ..noise.relative import RelativeNoise
-from ..noise.time_shifts import TimeShiftNoise
+from ..noise.protocol import noise_time_shifts, noise_title
+from ..noise.time_shifts import ShiftedNoise
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from ..signals.records import Record
@@ -23,7 +22,7 @@ from .joint import JointLikelihood
 from .likelihood import FELikelihood
 
 if TYPE_CHECKING:
-    from ..noise.gaussian import Noise
+    from ..noise.protocol import Noise
 
 __all__ = ["MeasuredData", "MeasuredHistory", "PredictiveDraws", "measured_data", "predictive_draws"]
 
@@ -123,7 +122,7 @@ def predictive_draws(
         parameters = rows[:, len(each.model.parameter_names) :]
         errors = _errors(each, noise, parameters, simulated, rng)
         if errors is None:
-            notes.append(f"{prefix}no replicated measurements: {type(noise).__name__} cannot be drawn from")
+            notes.append(f"{prefix}no replicated measurements: {noise_title(noise)} cannot be drawn from")
         for place, channel in enumerate(each.measurements.channels):
             there, name = ~np.isnan(values[place]), f"{prefix}{channel.name}"
             responses[name] = (residuals[:, place] + values[place])[:, there]
@@ -187,12 +186,12 @@ def _residuals(likelihood: FELikelihood, rows: np.ndarray, responses: np.ndarray
     """Simulated minus measured response of each row, (n, n_channels, n_samples) [SI], NaN where a sample is missing."""
     if not isinstance(likelihood.measured, Comparison):
         return responses - likelihood.measured
-    if not isinstance(likelihood.noise, TimeShiftNoise):
+    if not (shifted := noise_time_shifts(likelihood.noise)):
         return np.stack([likelihood.measured.residuals(response) for response in responses])
     measurements, found = likelihood.measurements, []
     for response, row in zip(responses, rows, strict=True):
         values = dict(zip(likelihood.parameter_names, row, strict=True))
-        times = {name: measurements.times(name) - values[f"time_shift_{name}"] for name in likelihood.noise.time_shifts}
+        times = {name: measurements.times(name) - values[f"time_shift_{name}"] for name in shifted}
         found.append(likelihood.measured.residuals_at(response, likelihood.model.dt, measurements.channels, times))
     return np.stack(found)
 
@@ -209,14 +208,14 @@ def _errors(
     if hasattr(noise, "log_densities"):
         drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt, at_samples=True)
         responses = np.stack([_at_samples(likelihood, response) for response in responses])
-    elif isinstance(noise, EventNoise):
+    elif hasattr(noise, "deviations_per_event"):
         deviations = np.nan_to_num(noise.deviations_per_event(parameters))
-        drawn = SampleNoise(deviations, None, tuple(slice(*window) for window in noise.windows))
+        drawn = SampleNoise(deviations, None, tuple(slice(*window) for window in noise.statistic.windows))
     elif hasattr(noise, "standard_deviations"):
         drawn = sample_noise(noise, parameters, n_channels, likelihood.model.dt)
     else:
         return None
-    if isinstance(noise, RelativeNoise) and isinstance(likelihood.measured, Comparison):
+    if drawn.of_response and not hasattr(noise, "log_densities") and isinstance(likelihood.measured, Comparison):
         # deviations at the steps of the model, then at the times of the samples, where interpolation may overshoot
         drawn = drawn._replace(of_response=partial(_deviations_at_samples, likelihood.measured, drawn.of_response))
     return np.stack([drawn.draw(row, n_samples, rng, response) for row, response in enumerate(responses)])
@@ -247,7 +246,7 @@ def _blocks(
     block: float | None,
     name: str,
 ) -> BlockLogLikelihood:
-    if isinstance(noise, TimeShiftNoise):  # the residuals are those at the shifts already
+    if isinstance(noise, ShiftedNoise):  # the residuals are those at the shifts already
         parameters, noise = parameters[:, : len(noise.noise.parameter_names)], noise.noise
     whole = np.array([np.inf])
     total = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, whole)[:, 0]

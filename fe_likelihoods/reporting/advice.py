@@ -207,8 +207,9 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
             "from sample to sample, so the data count as more than they are, and the intervals are too narrow."
         )
         action = (
-            'Use AutoregressiveNoise or BandNoise (in a TOML file: kind = "autoregressive" or "bands" in [noise]), or '
-            "GaussianNoise(effective_samples=...), and look at the residuals for an effect that the model lacks."
+            'Use AutoregressiveNoise (in a TOML file: kind = "autoregressive" in [noise]), or GaussianNoise with bands '
+            "of frequency (groups = [1.0, 5.0]) or effective_samples=, and look at the residuals for an effect that "
+            "the model lacks."
         )
         found.append(Advice(CAUTION, "The errors are not white noise", text, action))
     coloured = ("autoregressive", "bands")
@@ -219,8 +220,8 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
             f"in {_listed(left)}: the errors have another correlation than that of the noise model."
         )
         action = (
-            'Compare with BandNoise (in a TOML file: kind = "bands" in [noise]) or '
-            "GaussianNoise(effective_samples=...), and look for an effect that the model lacks."
+            "Compare with GaussianNoise with bands of frequency (in a TOML file: groups = [1.0, 5.0] in [noise]) or "
+            "effective_samples=, and look for an effect that the model lacks."
         )
         found.append(Advice(CAUTION, "The noise model does not fit the errors", text, action))
     strange = [_place(fit, each) for fit, each in doubtful if each.checks.normal[0] < SMALL_PROBABILITY]

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..noise.marginal import sampled_noise
+from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
 from .advice import SAME_AS_PRIOR, residual_sentence
@@ -75,8 +75,7 @@ def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
         f"{channel.name} [{channel.unit}], {count} samples at {step:g} s"
         for channel, count, step in zip(measurements.channels, samples, measurements.steps, strict=True)
     ]
-    sampled = sampled_noise(likelihood.noise)
-    noise = type(sampled).__name__ + ("" if sampled is likelihood.noise else ", its levels integrated out")
+    noise = noise_title(likelihood.noise)
     return DataSet(key, type(model).__name__, excitation, measurements.description, noise, "; ".join(channels))
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..noise.autoregressive import AutoregressiveNoise
-from ..noise.bands import BandNoise
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, innovations, residual_checks
 from ..probability.likelihood import FELikelihood
@@ -157,7 +156,7 @@ def _split(
         windows = [(f"{key}, {window.name}" if key else window.name, window) for window in events.windows]
     sampled = sampled_noise(likelihood.noise)
     noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
-    noise = "bands" if isinstance(sampled, BandNoise) else noise
+    noise = "bands" if getattr(sampled, "n_bands", 1) > 1 else noise
     noise = "effective" if getattr(sampled, "effective_samples", None) is not None else noise
     checked = residuals.get(after)
     if checked is not None and hasattr(sampled, "whitened"):

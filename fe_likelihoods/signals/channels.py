@@ -178,6 +178,11 @@ class Measurements:
         return not np.isnan(self.values).any()
 
     @property
+    def root_mean_squares(self) -> NDArray[np.float64]:
+        """Root mean square of the samples of each channel, shape (n_channels,) [SI unit of the channel]."""
+        return np.sqrt(np.nanmean(np.square(self.values), axis=1))
+
+    @property
     def time(self) -> NDArray[np.float64]:
         """Times of the samples, shape (n_steps,) [s]; ValueError if they differ between channels (see `times`)."""
         if not self.simultaneous:

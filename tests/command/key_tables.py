@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fe_likelihoods.command.priors import FORMS
-from fe_likelihoods.command.schema import EVENT, MODELS, NOISES, PARTS, SECTIONS, Key
+from fe_likelihoods.command.schema import EVENT, MODELS, PARTS, SECTIONS, Key
 from fe_likelihoods.units import DIMENSIONS
 
 __all__ = ["PAGE", "key_tables"]
@@ -37,9 +37,6 @@ def key_tables() -> str:
         blocks += [_table(", ".join(parts), part_keys) for part_keys, parts in seen.items()]
     blocks += [_table(f"[{section}]", keys) for section, keys in SECTIONS.items()]
     blocks.append(_table("[events.NAME]", EVENT))
-    kinds = tuple(Key(name, ", ".join(each.keys) or "none", each.meaning) for name, each in NOISES.items())
-    head = "   * - key\n     - value"
-    blocks.append(_table("[noise] kind", kinds).replace(head, "   * - kind\n     - keys"))
     forms = tuple(Key(name, "text", form) for name, (form, _) in FORMS.items())
     blocks.append(_table("[priors]", forms).replace("   * - key\n     - value", "   * - distribution\n     - value"))
     return "\n".join(blocks)

@@ -186,7 +186,7 @@ def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkey
     from fe_likelihoods.command.events import predict_events, read_events
     from fe_likelihoods.prediction.quantities import peak
 
-    noise = '[noise]\nkind = "relative"\nwindow = "1 s"\n'
+    noise = '[noise]\nlevel = "measured"\nwindow = "1 s"\n'
     text = re.sub(r"(?m)^(sigma_.*|guide = true)\n", "", SETTINGS + EVENTS)
     (events / "oscillator.toml").write_text(text + noise)
     job = read_job("oscillator.toml")

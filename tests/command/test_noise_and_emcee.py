@@ -6,14 +6,7 @@ import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    AutoregressiveNoise,
-    BandNoise,
-    GaussianNoise,
-    ModulatedNoise,
-    RelativeNoise,
-    SharedGaussianNoise,
-)
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
@@ -33,47 +26,30 @@ def problem_of(folder, noise):  # noqa: F811
 
 
 @pytest.mark.parametrize(
-    ("keys", "cls", "values", "parameters"),
+    ("keys", "parameters", "options"),
     [
-        (
-            'kind = "per channel"\n' + SENSOR,
-            GaussianNoise,
-            {"sensor": SI},
-            ["sigma_acceleration", "sigma_displacement"],
-        ),
-        ('kind = "autoregressive"\n' + SENSOR, AutoregressiveNoise, {"sensor": SI}, None),
-        ('kind = "shared"\n' + SENSOR, SharedGaussianNoise, {"sensor": SI}, None),
-        ('kind = "relative"\n', RelativeNoise, {"sensor": None, "window": None}, None),
-        ('kind = "relative"\nwindow = "1.5 s"\n' + SENSOR, RelativeNoise, {"sensor": SI, "window": 1.5}, None),
-        (
-            'kind = "modulated"\nwindow = 1.0\nlocal = 0.5\n' + SENSOR,
-            ModulatedNoise,
-            {"sensor": SI, "window": 1.0, "local": 0.5},
-            ["share_acceleration", "share_displacement"],
-        ),
-        (
-            'kind = "bands"\nedges = [1.0, 5.0]\n' + SENSOR,
-            BandNoise,
-            {"sensor": SI, "edges": (1.0, 5.0), "relative": True},
-            [f"share_{name}_band{k}" for name in ("acceleration", "displacement") for k in (1, 2, 3)],
-        ),
-        (
-            'kind = "bands"\nedges = [2.0]\nshares = false\n',
-            BandNoise,
-            {"sensor": None, "edges": (2.0,), "relative": False},
-            [f"sigma_{name}_band{k}" for name in ("acceleration", "displacement") for k in (1, 2)],
-        ),
+        (SENSOR, "sigma_{}", {}),
+        ('kind = "autoregressive"\n' + SENSOR, "sigma_{} rho_{}", {}),
+        ('groups = "all"\n' + SENSOR, "sigma", {}),
+        ('level = "measured"\n', "share_{}", {"sensor": None, "window": None}),
+        ('level = "measured"\nwindow = "1.5 s"\n' + SENSOR, "share_{}", {"window": 1.5}),
+        ('level = "response"\nwindow = 1.0\nlocal = 0.5\n' + SENSOR, "share_{}", {"window": 1.0, "local": 0.5}),
+        ('groups = [1.0, 5.0]\nlevel = "response"\n' + SENSOR, "share_{}_band{1,2,3}", {"groups": (1.0, 5.0)}),
+        ("groups = [2.0]\n", "sigma_{}_band{1,2}", {"sensor": None, "groups": (2.0,)}),
     ],
 )
-def test_noises_are_those_of_python(folder, keys, cls, values, parameters):  # noqa: F811
+def test_noises_are_those_of_python(folder, keys, parameters, options):  # noqa: F811
     problem = problem_of(folder, keys)
     noise, likelihood = problem.posterior.likelihood.noise, problem.posterior.likelihood
-    assert type(noise) is cls
-    for name, value in values.items():
-        expected = tuple(value[channel.name] for channel in noise.channels) if isinstance(value, dict) else value
-        assert getattr(noise, name) == (pytest.approx(expected) if isinstance(expected, tuple) else expected)
-    if parameters is not None:
-        assert list(noise.parameter_names) == parameters
+    assert isinstance(noise, AutoregressiveNoise if "kind" in keys else GaussianNoise)
+    for name, value in ({"sensor": (SI["acceleration"], SI["displacement"])} | options).items():
+        assert getattr(noise, name) == (value if name != "sensor" or value is None else pytest.approx(value))
+    expected = []
+    for pattern in parameters.split():
+        for channel in SI if "{}" in pattern else [""]:
+            name, _, bands = pattern.replace("{}", channel).partition("{")
+            expected += [name + band for band in bands.strip("}").split(",")]
+    assert list(noise.parameter_names) == expected
     assert set(problem.assumed) == set(noise.parameter_names)
     point = problem.posterior.prior.mean()
     assert np.isfinite(likelihood.log_likelihood(point)) and np.isfinite(problem.posterior(point[None])).all()
@@ -82,20 +58,23 @@ def test_noises_are_those_of_python(folder, keys, cls, values, parameters):  # n
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ('kind = "modulatd"', "[noise] kind: unknown noise 'modulatd'; did you mean modulated?"),
-        ('kind = "modulated"\nwindow = "1 s"', '[noise] sensor: the kind "modulated" needs this key'),
-        ('kind = "modulated"\n' + SENSOR, '[noise] window: the kind "modulated" needs this key'),
-        ('kind = "modulated"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
-        ('kind = "modulated"\nwindow = "0 s"\n' + SENSOR, "[noise] ModulatedNoise: window must be a positive length"),
-        ('kind = "modulated"\nwindow = "0.01 s"\n' + SENSOR, "must be at least three steps"),
-        ('kind = "modulated"\nwindow = 1.0\nlocal = 2.0\n' + SENSOR, "local must be from 0"),
-        ('kind = "bands"\n' + SENSOR, '[noise] edges: the kind "bands" needs this key'),
-        ('kind = "bands"\nedges = [1.0]', '[noise] sensor: the kind "bands" needs this key'),
-        ('kind = "bands"\nedges = [5.0, 1.0]\n' + SENSOR, "expects ascending positive frequencies"),
-        ('kind = "bands"\nedges = [1.0, 500.0]\n' + SENSOR, "contains frequencies below"),
-        ('kind = "bands"\nedges = "1 Hz"\n' + SENSOR, "[noise] edges: expected a list of numbers"),
-        ('kind = "relative"\nedges = [1.0]', '[noise] edges: the kind "relative" has no such key; it is for "bands"'),
-        ('window = "1 s"', '[noise] window: the kind "per channel" has no such key; it is for "relative", "modulated"'),
+        ('kind = "autoregresive"', "[noise] kind: unknown noise 'autoregresive'; did you mean autoregressive?"),
+        ('kind = "autoregressive"\ngroups = "all"', '[noise] groups: the kind "autoregressive" has no such key'),
+        ('level = "response"\nwindow = "1 s"', '[noise] GaussianNoise: level="response" needs the noise of the sensor'),
+        ('level = "response"\n' + SENSOR, '[noise] GaussianNoise: level="response" needs window='),
+        ('level = "response"\nwindow = "1 g"\n' + SENSOR, "[noise] window: expected a number in s"),
+        ('level = "response"\nwindow = "0 s"\n' + SENSOR, "[noise] GaussianNoise: window must be a positive length"),
+        ('level = "response"\nwindow = "0.01 s"\n' + SENSOR, "must be at least three steps"),
+        ('level = "response"\nwindow = 1.0\nlocal = 2.0\n' + SENSOR, "local must be from 0"),
+        ('level = "SI"', 'level must be "si", "measured" or "response"; got \'SI\''),
+        ('groups = "channels"', 'groups must be "channel", "all", "event", or the frequencies'),
+        ('groups = [1.0]\nlevel = "response"', "needs the noise of the sensor"),
+        ('groups = [1.0]\nlevel = "measured"', "cannot have level='measured'"),
+        ("groups = [5.0, 1.0]\n" + SENSOR, "expects ascending positive frequencies"),
+        ("groups = [1.0, 500.0]\n" + SENSOR, "contains frequencies below"),
+        ("groups = true\n" + SENSOR, "[noise] groups: expected a text in quotes, or a list of numbers"),
+        ('window = "1 s"', "window= is for level="),
+        ('marginal = true\nlevel = "measured"', "[noise] marginal() integrates out the standard deviations"),
         ('sensor = {acceleration = "1 mm"}', "[noise] sensor: acceleration: expected a number in m/s"),
         ('sensor = {accelaration = "1 g"}', "sensor: unknown channel 'accelaration'; did you mean acceleration?"),
         ('sensor = {acceleration = "-1 g"}', "[noise] sensor: acceleration: expected a standard deviation"),
@@ -110,31 +89,25 @@ def test_wrong_keys_of_the_noise_are_named(folder, keys, message):  # noqa: F811
 
 
 def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
-    (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nkind = "modulated"\nwindow = "1 s"\n{SENSOR}')
+    (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nlevel = "response"\nwindow = "1 s"\n{SENSOR}')
     output = call("run", "oscillator.toml", "--quiet", code=1)
     assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
 
 
 def test_messages_about_noises_are_in_the_words_of_the_file():
     for words, told in (
-        ("ModulatedNoise, BandNoise and RelativeNoise scale", '"modulated", "bands" and "relative" of [noise] scale'),
+        ("Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" in [noise]'),
         (
-            "Calibrate with AutoregressiveNoise or effective_samples=",
-            'Set kind = "autoregressive" or "bands" in [noise]',
-        ),
-        ("Calibrate with fewer samples or BandNoise", 'Use fewer samples, or set kind = "bands" in [noise]'),
-        (
-            "Calibrate with a smaller local=, such as 0.25 or 0, RelativeNoise or GaussianNoise",
-            'Set a smaller local, such as 0.25 or 0, or kind = "relative" or "per channel" in [noise]',
-        ),
-        (
-            'Predict peaks with noise="model"',
+            'Predict peaks of the structure with noise="model"',
             'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
         ),
     ):
         assert in_toml_terms(f"the bands. {words} x") == f"the bands. {told} x"
     source = (ROOT / "fe_likelihoods" / "prediction" / "transfer_checks.py").read_text()
-    assert "ModulatedNoise, BandNoise and RelativeNoise scale" in source
+    assert (
+        "AutoregressiveNoise or effective_samples=" in source
+        and 'Predict peaks of the structure with noise="model"' in source
+    )
 
 
 def test_emcee_runs_and_goes_on_with_more_steps(folder):  # noqa: F811

@@ -9,10 +9,8 @@ from fe_likelihoods import (
     FunctionModel,
     GaussianNoise,
     HalfNormal,
-    MarginalNoise,
     Measurements,
     Posterior,
-    SharedGaussianNoise,
     TruncatedNormal,
     Uniform,
 )
@@ -44,10 +42,11 @@ def vibration(noise="marginal", function=free_vibration, seed=1, truth=TRUTH, da
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": damping or TruncatedNormal(1.0, 0.3)}
     sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
     if noise == "marginal":
-        return Posterior(FELikelihood(model, measured, MarginalNoise(GaussianNoise(CHANNELS), sigmas)), prior)
+        return Posterior(FELikelihood(model, measured).marginal(sigmas), prior)
     if noise == "shared":
         return Posterior(
-            FELikelihood(model, measured, SharedGaussianNoise.of(measured)), prior | {"sigma": HalfNormal(0.3)}
+            FELikelihood(model, measured, GaussianNoise(measured.channels, groups="all")),
+            prior | {"sigma": HalfNormal(0.3)},
         )
     if noise == "autoregressive":
         rho = {"rho_top": Uniform(-0.5, 0.9), "rho_base": Uniform(-0.5, 0.9)}

@@ -13,13 +13,11 @@ from fe_likelihoods import (
     Channel,
     FELikelihood,
     FunctionModel,
-    GaussianNoise,
     HalfNormal,
     JointLikelihood,
     Measurements,
     Posterior,
     SimulationFailed,
-    TimeShiftNoise,
     TruncatedNormal,
     Uniform,
 )
@@ -244,7 +242,7 @@ def test_data_sets_that_cannot_be_stacked():
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
     with pytest.raises(ValueError, match="data sets that have all samples"):
         Posterior(JointLikelihood({"first": first, "second": gaps}), prior).guide()
-    shifted = FELikelihood(second.model, second.measurements, TimeShiftNoise(GaussianNoise(CHANNEL), {"top": 0.05}, DT))
+    shifted = FELikelihood(second.model, second.measurements, time_shifts={"top": 0.05})
     prior |= {shifted.parameter_names[-1]: Uniform(-0.05, 0.05)}
     with pytest.raises(ValueError, match=r"cannot emulate time shifts of channels.*Measurements\.shift"):
         Posterior(JointLikelihood({"first": first, "second": shifted}), prior).guide()

@@ -9,7 +9,6 @@ from scipy.optimize import minimize
 from scipy.signal import butter, lfilter
 
 from fe_likelihoods import (
-    BandNoise,
     Channel,
     FELikelihood,
     FunctionModel,
@@ -18,10 +17,8 @@ from fe_likelihoods import (
     LinearOscillator,
     LogNormal,
     Measurements,
-    ModulatedNoise,
     Posterior,
     Record,
-    RelativeNoise,
     fit_measures,
     peak,
     propagate,
@@ -79,7 +76,7 @@ def _negative(posterior, logs):
 
 
 def modulated(local):
-    return ModulatedNoise([GROUND], window=1.0, sensor={"acceleration": 0.03}, local=local)
+    return GaussianNoise([GROUND], level="response", window=1.0, sensor={"acceleration": 0.03}, local=local)
 
 
 SHARE, SIGMA = {"share_acceleration": HalfNormal(0.5)}, {"sigma_acceleration": HalfNormal(3.0)}
@@ -92,7 +89,7 @@ def test_a_response_that_is_too_large_under_shares_of_itself_is_said(seed):
     values = bouc_wen(ground, 0.01) + 0.03 * rng.standard_normal(STEPS)
     posterior, samples = calibrated(ground, values, modulated(1.0), SHARE)
     found = [text for text in said(propagate, posterior, samples) if "too large" in text]
-    assert len(found) == 1 and "local=" in found[0] and "GaussianNoise" in found[0]
+    assert len(found) == 1 and "local=" in found[0] and 'level="si"' in found[0]
     assert not [text for text in said(propagate, posterior, samples) if "too large" in text], "said once"
     assert any("too large" in text for text in propagate(posterior, samples, progress=False).remarks)
     # the figures are those of the fit, and the noise is its cause
@@ -175,20 +172,20 @@ def test_alarms_of_whitened_residuals_in_100_runs(kind):
         for seed in range(100):
             rng = np.random.default_rng([9, seed])
             if kind == "modulated":
-                noise = ModulatedNoise([TOP], window=0.5, sensor={"top": SENSOR}, local=0.25)
+                noise = GaussianNoise([TOP], level="response", window=0.5, sensor={"top": SENSOR}, local=0.25)
                 posterior, samples = of_gain(rng, noise, correlated(rng, rho), lambda *_: [0.3])
             else:
-                noise = BandNoise([TOP], (EDGE,), sensor={"top": SENSOR})
+                noise = GaussianNoise([TOP], groups=(EDGE,), level="response", sensor={"top": SENSOR})
                 posterior, samples = of_gain(rng, noise, band_errors(rng, rho), band_shares)
             found += [text for text in said(propagate, posterior, samples) if "not independent" in text]
         counts.append(len(found))
     assert counts[0] == 0 and counts[1] >= 95
     assert "whitened residuals of the calibration" in found[0] and "effective_samples" not in found[0]
-    assert ("BandNoise" in found[0]) == (kind == "modulated"), "which is the noise in use"
+    assert ("GaussianNoise with bands" in found[0]) == (kind == "modulated"), "which is the noise in use"
 
 
 def test_the_check_of_shares_uses_the_excitation_of_the_calibration(rng):
-    noise = ModulatedNoise([TOP], window=0.5, sensor={"top": SENSOR})
+    noise = GaussianNoise([TOP], level="response", window=0.5, sensor={"top": SENSOR})
     posterior, samples = of_gain(rng, noise, correlated(rng, 0.8), lambda *_: [0.3])
     own = [text for text in said(propagate, posterior, samples, noise=True, seed=1) if "not independent" in text]
     again, samples = of_gain(np.random.default_rng(0), noise, correlated(rng, 0.8), lambda *_: [0.3])
@@ -197,12 +194,12 @@ def test_the_check_of_shares_uses_the_excitation_of_the_calibration(rng):
     assert again.report()["simulations"] == 1
 
 
-@pytest.mark.parametrize("kind", (ModulatedNoise, RelativeNoise))
+@pytest.mark.parametrize("kind", ("response", "measured"))
 def test_peaks_with_white_errors_in_shares_are_said(kind, rng):
     model = Filter(excitation(rng))
     measured = Measurements([TOP], DT, model.simulate([1.0]))
-    noise = RelativeNoise.of(measured)
-    noise = noise if kind is RelativeNoise else ModulatedNoise([TOP], window=0.5, sensor={"top": SENSOR})
+    noise = GaussianNoise(measured.channels, level="measured")
+    noise = noise if kind == "measured" else GaussianNoise([TOP], level="response", window=0.5, sensor={"top": SENSOR})
     prior = {"gain": LogNormal(1.0, 0.5), "share_top": HalfNormal(0.5)}
     posterior = Posterior(FELikelihood(model, measured, noise), prior)
     options = {"noise": True, "seed": 1, "check": False}
@@ -240,7 +237,7 @@ def test_a_response_below_the_noise_of_its_sensor_is_not_said_to_be_too_large():
     channels = (Channel("weak", "displacement", "mm"), TOP)
     times = DT * np.arange(STEPS)
     waves = np.sqrt(2.0) * np.array([0.003 * np.sin(6.0 * times), np.sin(7.0 * times)])
-    noise = ModulatedNoise(channels, window=1.0, sensor=[0.1, 0.05])
+    noise = GaussianNoise(channels, level="response", window=1.0, sensor=[0.1, 0.05])
     small = 0
     for seed in range(20):
         rng = np.random.default_rng([5, seed])
@@ -254,7 +251,7 @@ def test_a_response_below_the_noise_of_its_sensor_is_not_said_to_be_too_large():
 
 
 def test_every_judged_sample_is_said_whatever_was_judged_before(rng):
-    noise = ModulatedNoise([TOP], window=0.5, sensor={"top": SENSOR}, local=1.0)
+    noise = GaussianNoise([TOP], level="response", window=0.5, sensor={"top": SENSOR}, local=1.0)
     posterior, _ = of_gain(rng, noise, correlated(rng, 0.0), lambda *_: [0.3])
     right, large = np.tile([1.0, 0.3], (3, 1)), np.tile([2.0, 0.52], (3, 1))
     assert not [text for text in said(propagate, posterior, right) if "too large" in text]
@@ -269,7 +266,7 @@ def test_peaks_that_do_not_fit_into_memory_are_predicted_without_the_remark(rng)
     waves = Filter(excitation(rng)).unit * np.array([[1.0], [0.5]])
     model = FunctionModel(lambda theta: theta[0] * waves, ["gain"], channels, DT, N)
     measured = Measurements(channels, DT, waves)
-    likelihood = FELikelihood(model, measured, RelativeNoise.of(measured))
+    likelihood = FELikelihood(model, measured, GaussianNoise(measured.channels, level="measured"))
     samples = np.array([1.0, 0.5, 0.5]) * np.exp(0.01 * rng.standard_normal((50, 3)))
     options = {"quantity": [peak("top"), peak("low")], "noise": True, "seed": 1, "progress": False, "check": False}
     predicted = propagate(likelihood, samples, memory_bytes=400, **options)

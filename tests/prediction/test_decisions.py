@@ -9,9 +9,7 @@ from scipy import special, stats
 from scipy.fft import dct
 
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.noise.bands import BandNoise
 from fe_likelihoods.noise.gaussian import GaussianNoise
-from fe_likelihoods.noise.relative import RelativeNoise
 from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
 from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.model_error import model_error
@@ -58,9 +56,9 @@ def wave():
     return Wave(Record("motion", 0.01, np.linspace(-1.0, 1.0, 500)))
 
 
-def with_noise(model, kind, **options):
+def with_noise(model, level):
     measured = Measurements(model.channels, model.dt, model.simulate([1.0]))
-    noise = kind.of(measured, **options) if kind is RelativeNoise else kind(model.channels)
+    noise = GaussianNoise(model.channels, level=level)
     prior = {"gain": LogNormal(1.0, 0.5), noise.parameter_names[0]: HalfNormal(0.5)}
     return Posterior(FELikelihood(model, measured, noise), prior)
 
@@ -167,7 +165,7 @@ def test_what_the_events_tell_holds_for_any_tail_of_the_ratios(degrees):
 
 def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
     events, prior = {"weak": 0.2, "strong": 2.0}, Prior({"gain": LogNormal(1.0, 0.5)})
-    posteriors = {name: with_noise(wave.with_record(wave.record.scale(k)), GaussianNoise) for name, k in events.items()}
+    posteriors = {name: with_noise(wave.with_record(wave.record.scale(k)), "si") for name, k in events.items()}
     tests = {
         name: StoredPosterior(
             {"gain": np.exp(0.05 * rng.standard_normal(200))}, prior, measurements=each.likelihood.measurements
@@ -246,7 +244,7 @@ def test_level_ratios_correct_each_draw_at_its_own_level(hierarchy):  # noqa: F8
 
 
 def test_event_level_is_what_the_ratio_divides_by(wave):
-    posterior = with_noise(wave, RelativeNoise)
+    posterior = with_noise(wave, "measured")
     samples = np.array([[0.8, 0.1], [1.1, 0.1], [0.9, 0.1]])
     level = event_level(posterior, samples, peak("top"))
     assert level == pytest.approx(0.9 * np.abs(wave.shape).max())
@@ -254,8 +252,11 @@ def test_event_level_is_what_the_ratio_divides_by(wave):
 
 
 def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_response(wave):
-    noise = RelativeNoise.of(
-        Measurements(wave.channels, wave.dt, wave.simulate([1.0])), window=1.0, sensor={"top": 0.1}
+    noise = GaussianNoise(
+        Measurements(wave.channels, wave.dt, wave.simulate([1.0])).channels,
+        level="measured",
+        window=1.0,
+        sensor={"top": 0.1},
     )
     response, rng = wave.simulate([1.0]), np.random.default_rng(1)
     error = model_error(noise, np.full((1, 1), 0.3), wave.dt)
@@ -268,7 +269,7 @@ def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_r
     assert powers[slow].sum() > 0.98 * powers.sum()
     assert np.square(np.abs(np.fft.rfft(response[0])))[slow].sum() > 0.99 * wave.n_steps * np.square(response).sum() / 2
     # White errors add to every peak; those of the model do not add more than their own few peaks do.
-    posterior, samples = with_noise(wave, RelativeNoise), np.tile([1.0, 0.2], (400, 1))
+    posterior, samples = with_noise(wave, "measured"), np.tile([1.0, 0.2], (400, 1))
     plain = np.abs(response).max()
     medians = {
         kind: propagate(posterior, samples, quantity=peak("top"), noise=kind, seed=1, progress=False).quantile(0.5)
@@ -276,13 +277,15 @@ def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_r
     }
     assert medians[True] > 1.15 * plain and 0.98 * plain < medians["model"] < 1.06 * plain
     with pytest.raises(ValueError, match='noise="model" needs a noise that follows the response'):
-        propagate(with_noise(wave, GaussianNoise), samples, quantity=peak("top"), noise="model")
+        propagate(with_noise(wave, "si"), samples, quantity=peak("top"), noise="model")
 
 
 def test_error_of_the_model_with_bands_has_no_noise_of_the_sensor_in_any_band():
     rng, n, sensor = np.random.default_rng(1), 512, 0.5
     response = np.sin(2.0 * np.pi * 2.0 * 0.01 * np.arange(n))[None]  # 2 Hz: almost nothing above 5 Hz
-    noise = BandNoise([Channel("top", "displacement", "m")], (1.0, 5.0), sensor={"top": sensor})
+    noise = GaussianNoise(
+        [Channel("top", "displacement", "m")], groups=(1.0, 5.0), level="response", sensor={"top": sensor}
+    )
     parameters = np.array([[0.3, 0.2, 0.4]])
     error = model_error(noise, parameters, 0.01)
     draws = np.stack([error.draw(0, n, rng, response)[0] for _ in range(3000)])
@@ -303,7 +306,7 @@ def test_error_of_the_model_with_bands_has_no_noise_of_the_sensor_in_any_band():
 
 
 def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
-    posterior = with_noise(wave, RelativeNoise)
+    posterior = with_noise(wave, "measured")
     samples = np.stack([np.exp(0.02 * rng.standard_normal(300)), 0.3 * np.exp(0.05 * rng.standard_normal(300))], axis=1)
     records = [wave.record.scale(k) for k in (0.7, 0.85, 1.0, 1.15, 1.4)]
     arguments = (records, peak("top"), float(np.abs(wave.shape).max()))
@@ -319,7 +322,7 @@ def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
     with pytest.warns(UserWarning, match="fragility: the probabilities leave the error of the model out"):
         structural = fragility(posterior, samples[:, :1], *arguments, progress=False)
     np.testing.assert_array_equal(structural.probability, parameters.probability)
-    gaussian = with_noise(wave, GaussianNoise)
+    gaussian = with_noise(wave, "si")
     with pytest.warns(UserWarning, match="ratios=EventRatios"):
         fragility(gaussian, samples, *arguments, progress=False)
     with pytest.warns(UserWarning, match="keeps its level in SI units"):

@@ -1,11 +1,12 @@
-"""Predictions with `ModulatedNoise`: gaps are those of the calibration; what has no level is refused before it runs."""
+"""Predictions with shares of the response: gaps are those of the calibration; what has no level is refused before it
+runs."""
 
 import warnings
 
 import numpy as np
 import pytest
 
-from fe_likelihoods import Events, FELikelihood, LinearOscillator, Measurements, ModulatedNoise, Record, propagate
+from fe_likelihoods import Events, FELikelihood, GaussianNoise, LinearOscillator, Measurements, Record, propagate
 
 DT, WINDOW = 0.02, 0.6
 SAMPLES = np.array([[1.0, 1.0, 0.1, 0.1]] * 10)
@@ -20,7 +21,7 @@ def quake(seed, duration=12.0):
 
 def noise_for(model, **options):
     deviations = 1e-3 * np.abs(model.simulate([1.0, 1.0])).max(axis=1)
-    return ModulatedNoise(model.channels, window=WINDOW, sensor=deviations, **options)
+    return GaussianNoise(model.channels, level="response", window=WINDOW, sensor=deviations, **options)
 
 
 def with_gap(**options) -> tuple[FELikelihood, list[str]]:

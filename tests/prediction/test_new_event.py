@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fe_likelihoods import GaussianNoise
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.noise.modulated import ModulatedNoise
-from fe_likelihoods.noise.relative import RelativeNoise
 from fe_likelihoods.prediction.event_ratios import EventRatios
 from fe_likelihoods.prediction.new_event import event_ratio, predict_new_event
 from fe_likelihoods.prediction.quantities import peak, rms
@@ -61,7 +60,7 @@ def hierarchy(rng):
 def posterior(rng):
     model = Amplified()
     measured = Measurements([TOP], model.dt, model.simulate([MEDIAN]) + 1e-4 * rng.standard_normal((1, 100)))
-    noise = RelativeNoise.of(measured)
+    noise = GaussianNoise(measured.channels, level="measured")
     return Posterior(FELikelihood(model, measured, noise), {"gain": LogNormal(0.03, 1.0), "share_top": HalfNormal(0.5)})
 
 
@@ -135,7 +134,7 @@ def test_shares_of_modulated_noise_have_no_upper_limit(hierarchy):
     wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1e-4, 3.0, 5.0])  # median 0.6, spread 0.5; one gain
     model = Amplified()
     measured = Measurements([TOP], model.dt, model.simulate([MEDIAN]))
-    noise = ModulatedNoise(model.channels, window=0.5, sensor=(1e-9,), local=0.0)
+    noise = GaussianNoise(model.channels, level="response", window=0.5, sensor=(1e-9,), local=0.0)
     posterior = Posterior(FELikelihood(model, measured, noise), {"gain": HalfNormal(1.0), "share_top": HalfNormal(0.5)})
     prediction = predict_new_event(wide, posterior, 0.1, noise=True, n=2000, seed=1)
     assert prediction.n_samples == 2000
@@ -146,7 +145,7 @@ def test_shares_of_modulated_noise_have_no_upper_limit(hierarchy):
 
 def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
     wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1.0, 3.0, 5.0])  # a median of 0.6, a spread of 0.5
-    with pytest.warns(UserWarning, match=r"1\d% of the draws have an impossible noise.*ModulatedNoise.*logit"):
+    with pytest.warns(UserWarning, match=r"1\d% of the draws have an impossible noise.*level='response'.*logit"):
         prediction = predict_new_event(wide, posterior, 0.1, noise=True, n=2000, seed=1)
     expected = 2000 * stats.norm.cdf(np.log(1.0 / 0.6) / 0.5)
     assert abs(prediction.n_samples - expected) < 4.0 * np.sqrt(2000 * 0.15 * 0.85)

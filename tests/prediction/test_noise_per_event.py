@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Events, FELikelihood, LinearOscillator, Measurements, Record, fragility, peak, propagate
+from fe_likelihoods import (
+    Events,
+    FELikelihood,
+    GaussianNoise,
+    LinearOscillator,
+    Measurements,
+    Record,
+    fragility,
+    peak,
+    propagate,
+)
 
 
 @pytest.fixture
@@ -14,7 +24,7 @@ def likelihood(rng):
     coarse = {name: LinearOscillator(each).simulate([1, 1])[:, ::2] for name, each in zip("12", records, strict=True)}
     measured = {"EQ1": Measurements(model.channels, 0.04, coarse["1"])}
     measured["EQ2"] = Measurements(model.channels[:1], 0.04, coarse["2"][:1])
-    return FELikelihood(model, measured, "per event")
+    return FELikelihood(model, measured, GaussianNoise(model.channels, groups="event"))
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import pytest
 
 from fe_likelihoods import (
     AutoregressiveNoise,
-    BandNoise,
     Channel,
     Events,
     FELikelihood,
@@ -16,11 +15,7 @@ from fe_likelihoods import (
     GaussianNoise,
     LinearOscillator,
     Measurements,
-    ModulatedNoise,
     Record,
-    RelativeNoise,
-    SharedGaussianNoise,
-    TimeShiftNoise,
     peak,
     propagate,
 )
@@ -57,11 +52,15 @@ def sensors(channels):
 
 KINDS = {
     "white": lambda channels, sensor, levels: GaussianNoise(channels, sensor=sensor),
-    "shared": lambda channels, sensor, levels: SharedGaussianNoise(channels, levels, sensor=sensor),
-    "relative": lambda channels, sensor, levels: RelativeNoise(channels, levels, window=0.4, sensor=sensor),
-    "modulated": lambda channels, sensor, levels: ModulatedNoise(channels, window=0.4, sensor=sensor),
-    "bands": lambda channels, sensor, levels: BandNoise(channels, (2.0, 8.0), sensor=sensor),
-    "bands, SI": lambda channels, sensor, levels: BandNoise(channels, (2.0, 8.0), relative=False, sensor=sensor),
+    "shared": lambda channels, sensor, levels: GaussianNoise(channels, groups="all", scales=levels, sensor=sensor),
+    "relative": lambda channels, sensor, levels: GaussianNoise(
+        channels, level="measured", scales=levels, window=0.4, sensor=sensor
+    ),
+    "modulated": lambda channels, sensor, levels: GaussianNoise(channels, level="response", window=0.4, sensor=sensor),
+    "bands": lambda channels, sensor, levels: GaussianNoise(
+        channels, groups=(2.0, 8.0), level="response", sensor=sensor
+    ),
+    "bands, SI": lambda channels, sensor, levels: GaussianNoise(channels, groups=(2.0, 8.0), sensor=sensor),
     "autoregressive": lambda channels, sensor, levels: AutoregressiveNoise(channels, sensor=sensor),
 }
 
@@ -183,8 +182,7 @@ def test_refusals_come_before_any_simulation(rng):
 
 
 def test_a_measured_channel_keeps_its_unknown_time_shift(rng):
-    noise = TimeShiftNoise(GaussianNoise(MEASURED), {"low": 0.05, "drift": 0.05}, DT)
-    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED), noise)
+    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED), time_shifts={"low": 0.05, "drift": 0.05})
     samples = np.hstack([drawn(FELikelihood(wave(MEASURED), measured(MEASURED)), rng), np.full((30, 2), 0.01)])
     plain = FELikelihood(wave(MEASURED), measured(MEASURED))
     for channels, shifted in ((ALL, ("low", "drift")), ((MIDDLE, TOP), ())):
@@ -219,7 +217,7 @@ def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
         "EQ1": Measurements(channels, 0.02, np.ones((2, 61))),
         "EQ2": Measurements(channels[:1], 0.02, np.ones((1, 51))),
     }
-    likelihood = FELikelihood(model, measured_in, "per event")
+    likelihood = FELikelihood(model, measured_in, GaussianNoise(model.channels, groups="event"))
     assert likelihood.parameter_names[2:] == ("sigma_a_EQ1", "sigma_b_EQ1", "sigma_a_EQ2")
     samples = np.hstack([rng.normal(1.0, 0.05, (50, 2)), rng.uniform(0.5, 1.0, (50, 3))])
     other, _ = copies(["c", "b"])

@@ -7,9 +7,9 @@ import pytest
 from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import integrate, stats
 
+from fe_likelihoods import GaussianNoise
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.noise.relative import RelativeNoise
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import final_value, peak, rms
 from fe_likelihoods.prediction.score_tables import envelope, score_values, strong_part
@@ -284,7 +284,7 @@ def test_samples_at_rest_are_left_out_of_log_score_and_pit(rng):
     rows = np.tile([1.0, 0.3, 0.3], (100, 1))
 
     def predicted(**options):
-        noise = RelativeNoise.of(measured, window=0.1, **options)
+        noise = GaussianNoise(measured.channels, level="measured", window=0.1, **options)
         return propagate(
             Posterior(FELikelihood(model, measured, noise), prior), rows, noise=True, seed=1, progress=False
         )

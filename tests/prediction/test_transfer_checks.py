@@ -166,7 +166,7 @@ def test_a_noise_that_knows_of_the_correlation_is_right(kind, rng):
         wrong, _ = calibrated(np.random.default_rng(5), rho=0.9, noise=noise)
         (text,) = said(propagate, wrong, samples * [1, 1, 0.3])
         assert "innovations of the calibration are not independent" in text
-        assert "BandNoise" in text and "AutoregressiveNoise" not in text, "which is the noise in use"
+        assert "bands of frequency" in text and "AutoregressiveNoise" not in text, "which is the noise in use"
 
 
 def test_the_check_is_one_simulation_that_is_counted_and_taken_from_the_cache(rng):

@@ -7,7 +7,6 @@ from scipy import stats
 from fe_likelihoods import (
     AutoregressiveNoise,
     Channel,
-    EventNoise,
     Events,
     FELikelihood,
     FunctionModel,
@@ -17,10 +16,7 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
-    RelativeNoise,
-    SharedGaussianNoise,
     SimulationFailed,
-    TimeShiftNoise,
     TruncatedNormal,
     Uniform,
 )
@@ -53,8 +49,8 @@ NOISES = {
     "white": (GaussianNoise(CHANNELS), TWO),
     "sensor": (GaussianNoise(CHANNELS, sensor=[0.1, 0.05]), TWO),
     "effective": (GaussianNoise(CHANNELS, effective_samples=[30.0, 500.0]), TWO),
-    "shared": (SharedGaussianNoise(CHANNELS, [1.0, 2.0]), TWO[:, :1]),
-    "relative": (RelativeNoise(CHANNELS, [1.0, 2.0], effective_samples=[30.0, 500.0]), TWO),
+    "shared": (GaussianNoise(CHANNELS, groups="all", scales=[1.0, 2.0]), TWO[:, :1]),
+    "relative": (GaussianNoise(CHANNELS, level="measured", scales=[1.0, 2.0], effective_samples=[30.0, 500.0]), TWO),
     "autoregressive": (AutoregressiveNoise(CHANNELS), np.hstack([TWO, [[0.3, -0.2], [0.0, 0.8], [0.5, 0.5]]])),
 }
 
@@ -125,8 +121,7 @@ def test_levels_per_event_and_joint_likelihoods(rng):
         name: Measurements(CHANNELS[1:], DT, record.acceleration[None] + rng.normal(0, 0.1, (1, 50)))
         for name in events.names
     }
-    likelihood = FELikelihood(long, data, "per event")
-    assert isinstance(likelihood.noise, EventNoise)
+    likelihood = FELikelihood(long, data, GaussianNoise(long.channels, groups="event"))
     rows = np.array([[1.0, 0.1, 0.2], [1.1, 0.15, 0.1]])
     blocks = posterior_of(likelihood).block_log_likelihood(rows, 1.0)
     assert np.allclose(blocks.values.sum(axis=1), likelihood.log_likelihood(rows), rtol=1e-10)
@@ -144,8 +139,7 @@ def test_levels_per_event_and_joint_likelihoods(rng):
 
 
 def test_time_shifts_are_those_of_the_samples(rng):
-    noise = TimeShiftNoise(GaussianNoise(CHANNELS), {"top": 0.3}, DT)
-    likelihood = FELikelihood(model(), measure(rng), noise)
+    likelihood = FELikelihood(model(), measure(rng), time_shifts={"top": 0.3})
     rows = np.hstack([STRUCTURAL, TWO, [[0.0], [0.13], [-0.2]]])
     blocks = posterior_of(likelihood).block_log_likelihood(rows, 2.0)
     assert np.allclose(blocks.values.sum(axis=1), likelihood.log_likelihood(rows), rtol=1e-6)

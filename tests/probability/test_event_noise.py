@@ -6,7 +6,6 @@ import pytest
 from fe_likelihoods import (
     AutoregressiveNoise,
     Channel,
-    EventNoise,
     Events,
     FELikelihood,
     GaussianNoise,
@@ -17,7 +16,6 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
-    SharedGaussianNoise,
     ShearFrame,
     SimulationCache,
     TruncatedNormal,
@@ -78,7 +76,7 @@ def test_data_of_an_event_are_the_same_after_another_event_and_alone(model, even
     prior = {name: TruncatedNormal(1.0, 0.3) for name in NAMES}
     prior |= {name: HalfNormal(1.0) for name in after.parameter_names[2:]}
     assert Posterior(after, prior).data_fingerprint == Posterior(alone["EQ2"], prior).data_fingerprint
-    both = FELikelihood(model, measured, "per event")
+    both = FELikelihood(model, measured, GaussianNoise(model.channels, groups="event"))
     turned = FELikelihood(
         model, {name: each.select(["displacement", "acceleration"]) for name, each in measured.items()}
     )
@@ -100,7 +98,7 @@ def test_events_on_the_supports_of_a_structure(events):
     theta = np.array([1.0, 1.0, 0.05, 0.05])
     parts = events.split(structure.simulate(theta))
     measured = {name: Measurements(structure.channels, 0.02, part) for name, part in parts.items()}
-    likelihood = FELikelihood(structure, measured, noise="per event")
+    likelihood = FELikelihood(structure, measured, noise=GaussianNoise(structure.channels, groups="event"))
     assert likelihood.parameter_names[4:] == ("sigma_low_EQ1", "sigma_top_EQ1", "sigma_low_EQ2", "sigma_top_EQ2")
     assert np.nanmax(np.abs(likelihood.residuals(theta))) == 0.0
 
@@ -115,7 +113,7 @@ def test_an_event_without_measurement_changes_the_state_only(model, events, meas
 
 
 def test_a_level_per_event(model, events, measured):
-    likelihood = FELikelihood(model, measured, noise="per event")
+    likelihood = FELikelihood(model, measured, noise=GaussianNoise(model.channels, groups="event"))
     sigmas = ("acceleration_EQ1", "displacement_EQ1", "acceleration_EQ2", "displacement_EQ2")
     assert likelihood.parameter_names == (*NAMES, *(f"sigma_{name}" for name in sigmas))
     assert likelihood.fast_parameters == (2, 3, 4, 5)
@@ -128,18 +126,21 @@ def test_a_level_per_event(model, events, measured):
     assert likelihood([1.1, 0.9, 0.3, 0.01, 0.3, 0.0]) == -np.inf and likelihood.simulations == 1
     best = {name: part.std(axis=1) for name, part in errors.items()}
     assert (best["EQ2"] > 3.0 * best["EQ1"]).all()
+    sensor = GaussianNoise(model.channels, groups="event", sensor=(0.3, 0.02))
+    total = np.hypot([*levels["EQ1"], *levels["EQ2"]], [0.3, 0.02, 0.3, 0.02])
+    assert FELikelihood(model, measured, sensor)(point) == pytest.approx(likelihood([1.1, 0.9, *total]), rel=1e-12)
 
 
 def test_only_measured_channels_have_levels(model, measured):
     partial = {"EQ1": measured["EQ1"].select(["displacement"]), "EQ2": measured["EQ2"]}
-    likelihood = FELikelihood(model, partial, noise="per event")
+    likelihood = FELikelihood(model, partial, noise=GaussianNoise(model.channels, groups="event"))
     assert "sigma_acceleration_EQ1" not in likelihood.parameter_names and likelihood.ndim == 2 + 3
     assert np.isfinite(likelihood([1.0, 1.0, 0.01, 1.0, 0.01]))
 
 
 def test_other_noises_work_with_events(model, events, measured):
     joined = events.join(measured).select(["acceleration", "displacement"])
-    for noise in (SharedGaussianNoise.of(joined), AutoregressiveNoise(model.channels)):
+    for noise in (GaussianNoise(joined.channels, groups="all"), AutoregressiveNoise(model.channels)):
         likelihood = FELikelihood(model, measured, noise)
         values = [1.0, 1.0, *(0.3 if "rho" not in name else 0.2 for name in noise.parameter_names)]
         assert np.isfinite(likelihood(values))
@@ -147,10 +148,10 @@ def test_other_noises_work_with_events(model, events, measured):
 
 def test_first_part_cache_and_guide(model, measured, tmp_path):
     cache = SimulationCache(tmp_path / "cache.db")
-    likelihood = FELikelihood(model, measured, noise="per event", cache=cache)
+    likelihood = FELikelihood(model, measured, noise=GaussianNoise(model.channels, groups="event"), cache=cache)
     point = [1.0, 1.0, 0.3, 0.01, 0.5, 0.02]
     value = likelihood(point)
-    again = FELikelihood(model, measured, noise="per event", cache=cache)
+    again = FELikelihood(model, measured, noise=GaussianNoise(model.channels, groups="event"), cache=cache)
     assert again(point) == value and again.simulator.disk_hits == 1
     assert FELikelihood(model, measured, cache=cache).fingerprint != again.fingerprint
     part = likelihood.first(0.5)  # within the first event
@@ -170,8 +171,15 @@ def test_steps_of_the_measurements_may_be_longer(events, model):
     joined = events.join({"EQ1": first, "EQ2": second})
     assert joined.dt == 0.04 and joined.n_steps == 80
     assert np.flatnonzero(joined.values[0] == 0.0).tolist() == [55, 56, 57, 58, 59]
-    noise = EventNoise.of(events, joined)
-    assert noise.samples == ((30,), (5,)) and noise.windows == ((0, 30), (55, 80))
+    model = LinearOscillator(events, period=0.5)
+    noise = GaussianNoise(channel, groups="event").under(model).with_measurements(joined)
+    assert noise.layout.counts == ((30,), (5,)) and noise.statistic.windows == ((0, 30), (55, 80))
+    assert noise.parameter_names == ("sigma_displacement_EQ1", "sigma_displacement_EQ2")
+    only_first = noise.under(model).with_measurements(events.join({"EQ1": first}))
+    assert only_first.parameter_names == noise.parameter_names, "the parameters stay for a part of the measurements"
+    fewer = GaussianNoise(channel, groups="event").under(model).with_measurements(events.join({"EQ1": first}))
+    with pytest.raises(ValueError, match="no level for displacement in an event in which they are measured"):
+        fewer.with_measurements(joined)
     late = events.join({"EQ2": Measurements(channel, 0.02, np.zeros((1, 5)), start=0.1)})
     assert np.flatnonzero(~np.isnan(late.values[0])).tolist() == [115, 116, 117, 118, 119]
 
@@ -193,11 +201,11 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
             FELikelihood(model, wrong)
     whole = Measurements(model.channels, 0.02, model.simulate([1.0, 1.0]))
     with pytest.raises(ValueError, match="100 measured samples are outside of every event, the first at 1.2 s"):
+        FELikelihood(model, whole, noise=GaussianNoise(model.channels, groups="event"))
+    with pytest.raises(ValueError, match='groups="event".; got .per event.'):
         FELikelihood(model, whole, noise="per event")
-    with pytest.raises(ValueError, match="or \"per event\"; got 'per channel'"):
-        FELikelihood(model, whole, noise="per channel")
     plain = LinearOscillator(events.trim(0.0, 1.0))
-    for arguments in ((measured,), (whole, "per event")):
+    for arguments in ((measured,), (whole, GaussianNoise(plain.channels, groups="event"))):
         with pytest.raises(ValueError, match="need a model whose excitation is Events"):
             FELikelihood(plain, *arguments)
 
@@ -206,7 +214,7 @@ def test_response_that_begins_after_a_lead_is_refused(events, rng):
     frame = ShearFrame({"low": 1, "top": 2}, [1, 1], [900.0, 700.0])
     structure = LinearStructure(frame, events, lead=0.4)
     data = {"EQ2": Measurements(structure.channels, 0.02, rng.normal(size=(2, 50)))}
-    for noise in (None, "per event"):
+    for noise in (None, GaussianNoise(structure.channels, groups="event")):
         with pytest.raises(ValueError, match="this LinearStructure lacks 0.4 s; leave out its lead, and put NaN"):
             FELikelihood(structure, data, noise)
     assert FELikelihood(LinearStructure(frame, events), data).n_samples.samples.tolist() == [50, 50]

@@ -1,4 +1,4 @@
-"""`ModulatedNoise` that grows with the deformation that a test imposes: density, calibration, other tests."""
+"""Shares of the response that grow with the deformation that a test imposes: density, calibration, other tests."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from fe_likelihoods import (
     Channel,
     DisplacementHistory,
     FELikelihood,
+    GaussianNoise,
     HalfNormal,
     JointLikelihood,
     Measurements,
-    ModulatedNoise,
     Posterior,
     Steel,
     SteelCoupon,
@@ -75,11 +75,11 @@ def cycles(drift, n=240, height=HEIGHT):
 
 def noise_of(specimen, **options):
     settings = {"window": WINDOW, "sensor": [SENSOR], "growth": GROWTH, "deformation": 0.01 * specimen.height}
-    return ModulatedNoise(FORCE, **settings | options)
+    return GaussianNoise(FORCE, level="response", **settings | options)
 
 
 def without_growth():
-    return ModulatedNoise(FORCE, window=WINDOW, sensor=[SENSOR])
+    return GaussianNoise(FORCE, level="response", window=WINDOW, sensor=[SENSOR])
 
 
 def deviations(specimen, theta, share, local=0.25, first=0):
@@ -134,7 +134,7 @@ def test_the_likelihood_is_the_multivariate_normal_density_with_and_without_gaps
 
 def test_the_density_integrates_to_one_over_the_measurements():
     specimen = Specimen(DisplacementHistory("two", [0.01, -0.03]))
-    noise = ModulatedNoise(FORCE, window=3.0, sensor=[SENSOR], deformation=0.02, growth=0.5)
+    noise = GaussianNoise(FORCE, level="response", window=3.0, sensor=[SENSOR], deformation=0.02, growth=0.5)
     simulated = specimen.simulate([1.0])
     noise = FELikelihood(specimen, Measurements(FORCE, 1.0, simulated), noise).noise
     sd = noise.response_deviations(np.array([0.3]), simulated)[0]
@@ -266,9 +266,9 @@ def test_deformations_that_a_test_imposes():
         np.testing.assert_array_equal(imposed_deformation(model), history.displacement)
     assert imposed_deformation(_Shaken()) is None
     with pytest.raises(ValueError, match="deformation must be a positive deformation"):
-        ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=0.0)
+        GaussianNoise(FORCE, level="response", window=1.0, sensor=[1.0], deformation=0.0)
     with pytest.raises(ValueError, match="growth must be an exponent"):
-        ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=1.0, growth=-1.0)
-    with pytest.raises(ValueError, match=r"growth=2.0 without deformation=.*give it, or leave growth out"):
-        ModulatedNoise(FORCE, window=1.0, sensor=[1.0], growth=2.0)
-    assert ModulatedNoise(FORCE, window=1.0, sensor=[1.0], deformation=1.0).growth == 0.25
+        GaussianNoise(FORCE, level="response", window=1.0, sensor=[1.0], deformation=1.0, growth=-1.0)
+    with pytest.raises(ValueError, match="growth= is for deformation=.*got growth=2.0 .*leave it out"):
+        GaussianNoise(FORCE, level="response", window=1.0, sensor=[1.0], growth=2.0)
+    assert GaussianNoise(FORCE, level="response", window=1.0, sensor=[1.0], deformation=1.0).growth == 0.25

@@ -10,10 +10,10 @@ from fe_likelihoods import (
     Events,
     FELikelihood,
     FunctionModel,
+    GaussianNoise,
     HalfNormal,
     JointLikelihood,
     LinearOscillator,
-    MarginalNoise,
     Measurements,
     Posterior,
     RCColumn,
@@ -25,6 +25,7 @@ from fe_likelihoods import (
     peak,
     propagate,
 )
+from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.prediction.propagation import fit_measures
 from fe_likelihoods.problems import bridge_column_data
 from samplers import SMCSampler
@@ -220,7 +221,9 @@ def test_units_of_the_noise_of_events_are_compared(rng):
         channels = (Channel("top", quantity, "m" if key == "a" else "m/s2"),)
         model = FunctionModel(lambda theta: np.ones((1, 20)), ["k"], channels, 0.02, 20)
         model.record = events
-        likelihoods[key] = FELikelihood(model, {"EQ1": Measurements(channels, 0.02, np.ones((1, 20)))}, "per event")
+        likelihoods[key] = FELikelihood(
+            model, {"EQ1": Measurements(channels, 0.02, np.ones((1, 20)))}, GaussianNoise(channels, groups="event")
+        )
     with pytest.raises(ValueError, match="'sigma_top_EQ1' must have one unit; it is in m in 'a' and in m/s2 in 'b'"):
         JointLikelihood(likelihoods)
     assert JointLikelihood(likelihoods, separate=["sigma_top_EQ1"]).ndim == 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from fe_likelihoods import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
@@ -86,9 +86,9 @@ def test_channels_are_a_sum_and_a_shared_sigma_is_one_integral(rng):
     expected = sum(noise.log_likelihood(misfit[:, [k]], 80) for k, noise in enumerate(each))
     both = MarginalNoise(GaussianNoise([TOP, DRIFT]), priors)
     np.testing.assert_allclose(both.log_likelihood(misfit, 80), expected, rtol=1e-14)
-    shared = SharedGaussianNoise([TOP, DRIFT], [2.0, 0.5])
+    shared = GaussianNoise([TOP, DRIFT], groups="all", scales=[2.0, 0.5])
     grid = np.geomspace(0.2, 4.0, 4001)
-    for noise in (shared, SharedGaussianNoise([TOP, DRIFT], [2.0, 0.5], effective_samples=(20.0, 1e3))):
+    for noise in (shared, GaussianNoise([TOP, DRIFT], groups="all", scales=[2.0, 0.5], effective_samples=(20.0, 1e3))):
         one = MarginalNoise(noise, {"sigma": HalfNormal(1.0)})
         values = [noise.log_likelihood(np.tile(j, (4001, 1)), 80, grid[:, None]) for j in misfit]
         values = np.array(values) + HalfNormal(1.0).logpdf(grid)
@@ -136,7 +136,7 @@ def test_draws_have_the_conditional_distribution(rng):
     "noise", [AutoregressiveNoise([TOP]), GaussianNoise([TOP], sensor=[0.1]), "white"], ids=["AR", "sensor", "name"]
 )
 def test_noises_that_cannot_be_integrated_out_are_refused(noise):
-    with pytest.raises(ValueError, match="keep the parameters of this one"):
+    with pytest.raises(ValueError, match="keep the parameters of this noise"):
         MarginalNoise(noise, {"sigma_top": HalfNormal(1.0)})
 
 
@@ -178,7 +178,7 @@ def test_the_posterior_is_the_full_one_summed_over_the_noise(full):
     assert np.isneginf(marginal.log_prob([-1.0, 1.0])) and np.isneginf(marginal.log_prob([1.0, 100.0]))
     assert marginal.fingerprint != full.fingerprint == pickle.loads(pickle.dumps(full)).fingerprint
     assert pickle.loads(pickle.dumps(marginal)).fingerprint == marginal.fingerprint == full.marginal().fingerprint
-    with pytest.raises(ValueError, match="keep the parameters of this one"):
+    with pytest.raises(ValueError, match="keep the parameters of this noise"):
         marginal.marginal()
 
 

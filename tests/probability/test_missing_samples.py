@@ -13,10 +13,8 @@ from fe_likelihoods import (
     FunctionModel,
     GaussianNoise,
     HalfNormal,
-    MarginalNoise,
     Measurements,
     Posterior,
-    SharedGaussianNoise,
     SimulationCache,
     SimulationFailed,
     TruncatedNormal,
@@ -29,6 +27,7 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
+from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.noise.residuals import autocorrelation, lag_one_sums
 from fe_likelihoods.noise.sample_counts import SampleCounts, count_samples
 from fe_likelihoods.simulation.model import SimulationBatch
@@ -89,7 +88,7 @@ def test_white_noises_count_the_samples_that_are_there(rng, options):
     powers = [min(11.0 / there[0].sum(), 1.0) if "effective_samples" in options else 1.0, 1.0]
     for noise, parameters in (
         (GaussianNoise(CHANNELS, **options), np.array([[0.7, 0.03]])),
-        (SharedGaussianNoise(CHANNELS, (2.0, 0.1), **options), np.array([[0.4]])),
+        (GaussianNoise(CHANNELS, groups="all", scales=(2.0, 0.1), **options), np.array([[0.4]])),
     ):
         sigmas = noise.standard_deviations(parameters)[0]
         expected = sum(
@@ -123,7 +122,7 @@ def test_marginal_noise_counts_the_samples_that_are_there(rng):
     got = noise.log_likelihood(misfit, count_samples(residuals))[0]
     assert got == pytest.approx(each, rel=1e-13)
     assert got == pytest.approx(expected, rel=1e-7)
-    draws = noise.draw(np.repeat(misfit, 4000, axis=0), count_samples(residuals), 0)
+    draws = noise.draw(np.repeat(misfit, 4000, axis=0), count_samples(residuals), rng.random((4000, 2)))
     known = np.sqrt(misfit[0] / there.sum(axis=1))
     np.testing.assert_allclose(draws.mean(axis=0), known, rtol=0.1)
 
@@ -399,5 +398,5 @@ def test_errors_and_coverage_are_over_the_samples_that_are_there(rng):
     with pytest.raises(ValueError, match="channels top have no sample in this part"):
         prediction.coverage(data, part=slice(0, 4))
     assert len(prediction.plot(data).axes) == len(data.plot().axes) == 2
-    scales = SharedGaussianNoise.of(data).scales
+    scales = GaussianNoise(data.channels, groups="all").with_measurements(data).scales
     assert scales[0] == pytest.approx(math.sqrt(np.square(data.values[0][there[0]]).mean()))

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.noise.gaussian import GaussianNoise, SharedGaussianNoise
-from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods import Channel, FELikelihood, GaussianNoise, LinearOscillator, Measurements, Record
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
 
@@ -73,7 +72,7 @@ def test_a_row_does_not_depend_on_the_others(noise, rng):
 
 
 def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
-    shared = SharedGaussianNoise(CHANNELS, [2.0, 0.03])
+    shared = GaussianNoise(CHANNELS, groups="all", scales=[2.0, 0.03])
     assert shared.parameter_names == ("sigma",)
     sigma = rng.uniform(0.1, 3.0, (6, 1))
     misfit = rng.uniform(0.1, 3.0, (6, 2))
@@ -87,12 +86,54 @@ def test_a_shared_sigma_is_in_units_of_the_scale_of_each_channel(noise, rng):
 
 def test_scales_of_a_shared_sigma_are_the_root_mean_squares(rng):
     values = rng.normal(size=(2, 50)) * [[3.0], [0.01]]
-    shared = SharedGaussianNoise.of(Measurements(CHANNELS, 0.1, values))
+    shared = GaussianNoise(CHANNELS, groups="all").with_measurements(Measurements(CHANNELS, 0.1, values))
     np.testing.assert_allclose(shared.scales, np.sqrt(np.mean(values**2, axis=1)))
-    assert repr(shared) != repr(SharedGaussianNoise(CHANNELS, [1.0, 1.0]))
+    assert repr(shared) != repr(GaussianNoise(CHANNELS, groups="all", scales=[1.0, 1.0]))
 
 
 @pytest.mark.parametrize("scales", [[1.0], [1.0, 0.0], [1.0, -2.0], [math.nan, 1.0]])
 def test_invalid_scales_are_refused(scales):
     with pytest.raises(ValueError, match="scale"):
-        SharedGaussianNoise(CHANNELS, scales)
+        GaussianNoise(CHANNELS, groups="all", scales=scales)
+
+
+@pytest.mark.parametrize(
+    ("level", "options"), [("measured", {"window": 0.5}), ("response", {"window": 0.6, "sensor": (0.1, 0.001)})]
+)
+def test_one_share_for_all_channels_is_equal_shares_per_channel(level, options, rng):
+    record = Record("motion", 0.02, rng.standard_normal(200))
+    model = LinearOscillator(record)
+    response = model.simulate([1.0, 1.0])
+    measured = Measurements(model.channels, 0.02, response * (1.0 + 0.3 * rng.standard_normal(response.shape)))
+    each, one = (
+        FELikelihood(model, measured, GaussianNoise(model.channels, groups=groups, level=level, **options))
+        for groups in ("channel", "all")
+    )
+    assert one.parameter_names[2:] == ("share",)
+    for share in (0.1, 0.4):
+        assert one([1.0, 1.0, share]) == each([1.0, 1.0, share, share])
+        np.testing.assert_array_equal(
+            one.noise.response_deviations([share], response, 0.02),
+            each.noise.response_deviations([share, share], response, 0.02),
+        )
+    other, weights = one.noise.with_channels(model.channels[:1], np.array([[1.0, 0.0]]))
+    assert other.parameter_names == ("share",) and weights.tolist() == [[1.0]]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"groups": "each"}, 'groups must be "channel", "all", "event", or the frequencies'),
+        ({"level": "SI"}, 'level must be "si", "measured" or "response"'),
+        ({"groups": "event", "level": "measured"}, "possible are levels in SI units with all groups"),
+        ({"groups": (1.0,), "level": "measured"}, "possible are levels in SI units with all groups"),
+        ({"window": 1.0}, 'window= is for level="measured" or "response", without bands; got window=1.0'),
+        ({"local": 0.5, "level": "measured"}, 'local= is for level="response"'),
+        ({"scales": (1.0, 1.0)}, 'scales= is for groups="all" in SI units'),
+        ({"effective_samples": (1.0, 1.0), "groups": (1.0,)}, 'effective_samples= is for groups="channel"'),
+        ({"level": "response", "sensor": (1.0, 1.0)}, 'level="response" needs window='),
+    ],
+)
+def test_combinations_without_a_meaning_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        GaussianNoise(CHANNELS, **options)

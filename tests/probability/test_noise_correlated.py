@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from fe_likelihoods import AutoregressiveNoise, GaussianNoise, SharedGaussianNoise
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.draws import SampleNoise
@@ -102,7 +102,7 @@ def test_a_known_sensor_adds_its_variance(rng, given):
     np.testing.assert_allclose(noise.standard_deviations(sigma), total)
     white = GaussianNoise(CHANNELS)
     np.testing.assert_allclose(noise.log_likelihood(misfit, 30, sigma), white.log_likelihood(misfit, 30, total))
-    shared = SharedGaussianNoise(CHANNELS, [2.0, 0.5], sensor=given)
+    shared = GaussianNoise(CHANNELS, groups="all", scales=[2.0, 0.5], sensor=given)
     np.testing.assert_allclose(
         shared.standard_deviations(sigma[:, :1]), np.sqrt((sigma[:, :1] * [2.0, 0.5]) ** 2 + [0.0, 0.03**2])
     )
@@ -125,7 +125,7 @@ def test_effective_samples_weigh_the_channels(rng):
         noise = GaussianNoise(CHANNELS, effective_samples=given)
         np.testing.assert_allclose(noise.log_likelihood(misfit, 40, sigma), expected, rtol=1e-13)
         assert noise == GaussianNoise(CHANNELS, effective_samples=given) != GaussianNoise(CHANNELS)
-        shared = SharedGaussianNoise(CHANNELS, [1.0, 1.0], effective_samples=given)
+        shared = GaussianNoise(CHANNELS, groups="all", scales=[1.0, 1.0], effective_samples=given)
         np.testing.assert_allclose(
             shared.log_likelihood(misfit, 40, sigma[:, :1]),
             noise.log_likelihood(misfit, 40, sigma[:, [0, 0]]),
@@ -225,14 +225,18 @@ def test_the_cache_separates_statistics(tmp_path, rng, responses):
     cache = SimulationCache(tmp_path / "lines.sqlite", responses=responses)
     expected = {}
     for round_ in range(2):
-        for noise in (GaussianNoise(CHANNELS), AutoregressiveNoise(CHANNELS), SharedGaussianNoise(CHANNELS, [1, 1])):
+        for noise in (
+            GaussianNoise(CHANNELS),
+            AutoregressiveNoise(CHANNELS),
+            GaussianNoise(CHANNELS, groups="all", scales=[1, 1]),
+        ):
             model = Line()
             likelihood = FELikelihood(model, measurements, noise, cache=cache)
             statistics = likelihood.simulator.statistics(thetas)
             white = not isinstance(noise, AutoregressiveNoise)
             assert statistics.shape == (6, 2 if white else 6)
             assert np.array_equal(expected.setdefault(white, statistics), statistics)
-            known = round_ or isinstance(noise, SharedGaussianNoise) or (responses and not white)
+            known = round_ or noise.parameter_names == ("sigma",) or (responses and not white)
             assert (model.runs - likelihood.simulator.verifications, likelihood.simulator.disk_hits) == (
                 (0, 6) if known else (6, 0)
             )
@@ -374,9 +378,9 @@ def test_problems_take_another_noise():
     assert posterior.parameter_names[-4:] == ["sigma_acc_p1", "sigma_Ub_2", "rho_acc_p1", "rho_Ub_2"]
     assert posterior.prior.distributions["rho_Ub_2"] == Uniform(-1.0, 1.0)
     measurements = posterior.likelihood.measurements
-    noise = SharedGaussianNoise.of(measurements, effective_samples={"Ub_2": 50.0})
+    noise = GaussianNoise(measurements.channels, groups="all", effective_samples={"Ub_2": 50.0})
     given = isolated_bridge(channels=("acc_p1", "Ub_2"), noise=noise, step=1e-3)
-    assert given.likelihood.noise is noise and given.ndim == 11
+    assert given.likelihood.noise == noise.with_measurements(measurements) and given.ndim == 11
     assert given.fingerprint != isolated_bridge(channels=("acc_p1", "Ub_2"), step=1e-3).fingerprint
     with pytest.raises(ValueError, match='"per channel", "shared", "autoregressive" or "marginal"'):
         isolated_bridge(noise="pink")

@@ -1,4 +1,5 @@
-"""`ModulatedNoise` and `BandNoise`: densities against scipy, calibration, predictive draws, gaps, caches, reports."""
+"""Shares of the response, and bands of frequency: densities against scipy, calibration, predictive draws, gaps, caches,
+reports."""
 
 import pickle
 import warnings
@@ -11,7 +12,6 @@ from scipy.fft import dct
 
 from fe_likelihoods import (
     AutoregressiveNoise,
-    BandNoise,
     Channel,
     Events,
     FELikelihood,
@@ -21,13 +21,9 @@ from fe_likelihoods import (
     JointLikelihood,
     LinearOscillator,
     Measurements,
-    ModulatedNoise,
     Posterior,
     Record,
-    RelativeNoise,
-    SharedGaussianNoise,
     SimulationCache,
-    TimeShiftNoise,
     TruncatedNormal,
     find_modes,
     propagate,
@@ -35,14 +31,15 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.cache.comparison import largest_difference
 from fe_likelihoods.emulation.target import ResponseTarget
+from fe_likelihoods.noise.time_shifts import with_time_shifts
 
 N, DT = 240, 0.02
 CHANNELS = (Channel("top", "acceleration", "m/s2"), Channel("base", "displacement", "mm"))
 SENSOR, EDGES, WINDOW = (0.02, 1e-4), (2.0, 8.0), 0.6
 NOISES = {
-    "modulated": ModulatedNoise(CHANNELS, window=WINDOW, sensor=SENSOR),
-    "shares in bands": BandNoise(CHANNELS, EDGES, sensor=SENSOR),
-    "levels in bands": BandNoise(CHANNELS, EDGES, relative=False, sensor=SENSOR),
+    "modulated": GaussianNoise(CHANNELS, level="response", window=WINDOW, sensor=SENSOR),
+    "shares in bands": GaussianNoise(CHANNELS, groups=EDGES, level="response", sensor=SENSOR),
+    "levels in bands": GaussianNoise(CHANNELS, groups=EDGES, sensor=SENSOR),
 }
 PARAMETERS = {
     "modulated": np.array([0.3, 0.1]),
@@ -115,12 +112,12 @@ def test_the_likelihood_is_the_multivariate_normal_density(kind, rng):
 
 @pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
 def test_the_density_integrates_to_one_over_the_measurements(kind):
-    """`RelativeNoise`, the control, does not: its level is computed from the measurements."""
+    """Shares of the measured channel, the control, do not: their level is computed from the measurements."""
     channel = (CHANNELS[0],)
     model = FunctionModel(lambda theta: theta[0] * np.array([[1.0, -0.4]]), ["factor"], channel, DT, 2)
     noise = {
-        "modulated": ModulatedNoise(channel, window=3.0 * DT, sensor=(0.1,)),
-        "shares in bands": BandNoise(channel, (10.0,), sensor=(0.1,)),
+        "modulated": GaussianNoise(channel, level="response", window=3.0 * DT, sensor=(0.1,)),
+        "shares in bands": GaussianNoise(channel, groups=(10.0,), level="response", sensor=(0.1,)),
     }[kind]
     n = len(noise.parameter_names)
 
@@ -137,7 +134,7 @@ def test_the_density_integrates_to_one_over_the_measurements(kind):
     assert step * np.sum(density) == pytest.approx(1.0, abs=1e-4)
     values = [np.array([[one, two]]) for one in axes[0] for two in axes[1]]
     relative = [
-        RelativeNoise(channel, [np.sqrt(np.mean(each**2))]).log_likelihood(
+        GaussianNoise(channel, level="measured", scales=[np.sqrt(np.mean(each**2))]).log_likelihood(
             np.sum((each - simulated) ** 2, axis=1)[None], 2, [[0.3]]
         )[0]
         for each in values
@@ -193,7 +190,7 @@ def test_levels_in_bands_are_those_of_the_errors_whatever_the_time_step():
         found = noise.response_deviations(parameters, np.zeros((2, n)), dt)
         assert np.sqrt(np.mean(found[0] ** 2)) == pytest.approx(total, rel=1e-12)
         np.testing.assert_allclose(found[0, n // 4 : 3 * n // 4], total, rtol=0.03)
-    one = BandNoise(CHANNELS, EDGES, relative=False, sensor=SENSOR)
+    one = GaussianNoise(CHANNELS, groups=EDGES, sensor=SENSOR)
     errors = one.response_errors(
         parameters * [1, 0, 0, 1, 0, 0], np.zeros((2, 4000)), np.random.default_rng(1).standard_normal((2, 4000)), DT
     )
@@ -206,9 +203,9 @@ def test_calibrated_parameters_have_uniform_ranks(rng):
     n, repeats, channel = 120, 120, (CHANNELS[0],)
     model = FunctionModel(lambda theta: response(theta, n)[:1], ["factor"], channel, DT, n)
     noises = [
-        ModulatedNoise(channel, window=WINDOW, sensor=(0.02,)),
-        BandNoise(channel, (5.0,), sensor=(0.02,)),
-        BandNoise(channel, (5.0,), relative=False, sensor=(0.02,)),
+        GaussianNoise(channel, level="response", window=WINDOW, sensor=(0.02,)),
+        GaussianNoise(channel, groups=(5.0,), level="response", sensor=(0.02,)),
+        GaussianNoise(channel, groups=(5.0,), sensor=(0.02,)),
     ]
     axes = [np.linspace(0.4, 1.6, 21), np.linspace(0.05, 1.0, 14), np.linspace(0.05, 1.0, 14)]
     for noise in noises:
@@ -235,7 +232,7 @@ def test_calibrated_parameters_have_uniform_ranks(rng):
 
 def draw(noise, parameters, simulated, rng):
     normal = rng.standard_normal(simulated.shape)
-    if isinstance(noise, BandNoise):
+    if noise.n_bands > 1:
         return noise.response_errors(parameters, simulated, normal)
     return noise.response_deviations(parameters, simulated) * normal
 
@@ -392,21 +389,27 @@ def test_units_and_names_of_the_parameters():
 
 def test_what_is_wrong_is_refused():
     with pytest.raises(ValueError, match="needs the noise of the sensor.*quiet part"):
-        ModulatedNoise(CHANNELS, window=1.0, sensor={"top": 0.1})
+        GaussianNoise(CHANNELS, level="response", window=1.0, sensor={"top": 0.1})
     with pytest.raises(ValueError, match="window must be a positive length"):
-        ModulatedNoise(CHANNELS, window=0.0, sensor=SENSOR)
+        GaussianNoise(CHANNELS, level="response", window=0.0, sensor=SENSOR)
     for local in (-0.1, 1.1):
         with pytest.raises(ValueError, match="local must be from 0"):
-            ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, local=local)
+            GaussianNoise(CHANNELS, level="response", window=1.0, sensor=SENSOR, local=local)
     with pytest.raises(ValueError, match="at least three steps"):
-        FELikelihood(MODEL, measured(response([1.0])), ModulatedNoise(CHANNELS, window=0.05, sensor=SENSOR))
+        FELikelihood(
+            MODEL, measured(response([1.0])), GaussianNoise(CHANNELS, level="response", window=0.05, sensor=SENSOR)
+        )
     for edges in ((), (2.0, 1.0), (0.0, 1.0), (np.inf,)):
         with pytest.raises(ValueError, match="ascending positive frequencies"):
-            BandNoise(CHANNELS, edges, sensor=SENSOR)
-    with pytest.raises(ValueError, match=r"shares needs the noise of the sensor.*relative=False"):
-        BandNoise(CHANNELS, EDGES)
+            GaussianNoise(CHANNELS, groups=edges, level="response", sensor=SENSOR)
+    with pytest.raises(ValueError, match="needs the noise of the sensor.*levels in SI units"):
+        GaussianNoise(CHANNELS, groups=EDGES, level="response")
     with pytest.raises(ValueError, match="below 25 Hz"):
-        FELikelihood(MODEL, measured(response([1.0])), BandNoise(CHANNELS, (2.0, 25.0), sensor=SENSOR))
+        FELikelihood(
+            MODEL,
+            measured(response([1.0])),
+            GaussianNoise(CHANNELS, groups=(2.0, 25.0), level="response", sensor=SENSOR),
+        )
     gaps = response([1.0])
     gaps[0, ::7] = np.nan
     with pytest.raises(ValueError, match=r"divide channel 'top' into 35 stretches.*AutoregressiveNoise"):
@@ -426,22 +429,27 @@ def test_what_is_wrong_is_refused():
         (lambda: GaussianNoise(CHANNELS, sensor={"top": "0.02 g"}), "GaussianNoise: sensor"),
         (lambda: GaussianNoise(CHANNELS, sensor={"top": None}), "GaussianNoise: sensor"),
         (lambda: GaussianNoise(CHANNELS, effective_samples="few"), "GaussianNoise: effective_samples"),
-        (lambda: SharedGaussianNoise(CHANNELS, ["1 g", "2 mm"]), "SharedGaussianNoise: scales"),
+        (lambda: GaussianNoise(CHANNELS, groups="all", scales=["1 g", "2 mm"]), "GaussianNoise: scales"),
         (lambda: AutoregressiveNoise(CHANNELS, sensor="0.02 g"), "AutoregressiveNoise: sensor"),
-        (lambda: ModulatedNoise(CHANNELS, window="1 s", sensor=SENSOR), "ModulatedNoise: window"),
-        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor="0.02 g"), "ModulatedNoise: sensor"),
-        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, local="half"), "ModulatedNoise: local"),
-        (lambda: ModulatedNoise(CHANNELS, window=1.0, sensor=SENSOR, deformation="1 %"), "ModulatedNoise: deformation"),
-        (lambda: RelativeNoise(CHANNELS, "1 g"), "RelativeNoise: levels"),
-        (lambda: RelativeNoise(CHANNELS, (1.0, 1.0), window="1 s"), "RelativeNoise: window"),
-        (lambda: BandNoise(CHANNELS, "1 Hz", sensor=SENSOR), "BandNoise: edges"),
-        (lambda: BandNoise(CHANNELS, None, sensor=SENSOR), "BandNoise: edges"),
-        (lambda: TimeShiftNoise(GaussianNoise(CHANNELS), {"top": "0.1 s"}, DT), "TimeShiftNoise: time_shifts"),
-        (lambda: TimeShiftNoise(GaussianNoise(CHANNELS), {"top": 0.1}, "0.02 s"), "TimeShiftNoise: dt"),
+        (lambda: GaussianNoise(CHANNELS, level="response", window="1 s", sensor=SENSOR), "GaussianNoise: window"),
+        (lambda: GaussianNoise(CHANNELS, level="response", window=1.0, sensor="0.02 g"), "GaussianNoise: sensor"),
+        (
+            lambda: GaussianNoise(CHANNELS, level="response", window=1.0, sensor=SENSOR, local="half"),
+            "GaussianNoise: local",
+        ),
+        (
+            lambda: GaussianNoise(CHANNELS, level="response", window=1.0, sensor=SENSOR, deformation="1 %"),
+            "GaussianNoise: deformation",
+        ),
+        (lambda: GaussianNoise(CHANNELS, level="measured", scales="1 g"), "GaussianNoise: scales"),
+        (lambda: GaussianNoise(CHANNELS, level="measured", scales=(1.0, 1.0), window="1 s"), "GaussianNoise: window"),
+        (lambda: GaussianNoise(CHANNELS, groups=("1 Hz",), level="response", sensor=SENSOR), "GaussianNoise: groups"),
+        (lambda: GaussianNoise(CHANNELS, groups=None, level="response", sensor=SENSOR), "GaussianNoise: groups"),
+        (lambda: with_time_shifts(GaussianNoise(CHANNELS), {"top": "0.1 s"}, DT), "GaussianNoise: time_shifts"),
     ],
 )
 def test_what_is_no_number_is_refused_in_words(make, what):
-    with pytest.raises(ValueError, match=rf"^{what} must be a number .*; got .*to_si"):
+    with pytest.raises(ValueError, match=rf"^{what} must be a number, .*; got .*to_si"):
         make()
 
 
@@ -454,8 +462,8 @@ def test_events_have_levels_of_their_own_response(kind, rng):
     model = LinearOscillator(events)
     simulated, sensor = model.simulate([1.0, 1.0]), {"acceleration": 1e-3, "displacement": 1e-6}
     noise = {
-        "modulated": ModulatedNoise(model.channels, window=WINDOW, sensor=sensor),
-        "shares in bands": BandNoise(model.channels, (5.0,), sensor=sensor),
+        "modulated": GaussianNoise(model.channels, level="response", window=WINDOW, sensor=sensor),
+        "shares in bands": GaussianNoise(model.channels, groups=(5.0,), level="response", sensor=sensor),
     }[kind]
     parameters = np.array([0.2, 0.3] if kind == "modulated" else [0.2, 0.3, 0.4, 0.2])
     single = {}
@@ -497,7 +505,7 @@ def test_a_gap_makes_the_share_that_of_another_level_and_is_named(rng):
     shares = np.linspace(0.02, 1.0, 400)
 
     def found(local, gap):
-        noise = ModulatedNoise(CHANNELS, window=WINDOW, sensor=SENSOR, local=local)
+        noise = GaussianNoise(CHANNELS, level="response", window=WINDOW, sensor=SENSOR, local=local)
         values = motion.copy()
         exact = noise.with_measurements(Measurements(CHANNELS, DT, values))
         values += exact.response_deviations(np.array([0.2, 0.2]), motion) * rng.standard_normal(motion.shape)

@@ -7,13 +7,13 @@ from fe_likelihoods import (
     AutoregressiveNoise,
     Channel,
     FELikelihood,
+    GaussianNoise,
     HalfNormal,
     JointLikelihood,
     Measurements,
-    SharedGaussianNoise,
-    TimeShiftNoise,
     problems,
 )
+from fe_likelihoods.noise.time_shifts import with_time_shifts
 
 CHANNELS = (Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g"))
 
@@ -57,7 +57,7 @@ def test_only_multiples_have_a_nominal_value():
     ("noise", "units"),
     [
         (AutoregressiveNoise(CHANNELS), ["mm", "g", "-", "-"]),
-        (SharedGaussianNoise(CHANNELS, [1.0, 2.0]), ["-"]),
+        (GaussianNoise(CHANNELS, groups="all", scales=[1.0, 2.0]), ["-"]),
         (None, ["mm", "g"]),
     ],
 )
@@ -66,7 +66,7 @@ def test_units_of_noise_parameters(noise, units):
 
 
 def test_time_shifts_are_in_seconds():
-    noise = TimeShiftNoise(likelihood().noise, {"top": 0.02}, 0.01)
+    noise = with_time_shifts(likelihood().noise, {"top": 0.02}, 0.01)
     assert likelihood(noise).parameters[-1].label == "time_shift_top [s]"
 
 

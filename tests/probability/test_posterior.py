@@ -14,7 +14,7 @@ import pytest
 from scipy import optimize, stats
 
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.noise.gaussian import SharedGaussianNoise
+from fe_likelihoods.noise.gaussian import GaussianNoise
 from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.probability.failures import FailureLog, reason_without_numbers
 from fe_likelihoods.probability.likelihood import FELikelihood
@@ -283,7 +283,7 @@ def test_data_fingerprint_knows_the_measurements_only(oscillator, measurements, 
     likelihood = FELikelihood(oscillator, measurements)
     model = LinearOscillator(oscillator.record, 0.7)
     turned = measurements.select(["displacement", "acceleration"])
-    noise = SharedGaussianNoise.of(measurements)
+    noise = GaussianNoise(measurements.channels, groups="all")
     same = [FELikelihood(model, measurements), FELikelihood(oscillator, turned), likelihood.with_noise(noise)]
     other = Measurements(measurements.channels, measurements.dt, measurements.values * 1.01)
     assert {one.data_fingerprint for one in same} == {likelihood.data_fingerprint}

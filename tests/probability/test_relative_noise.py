@@ -8,7 +8,7 @@ import pytest
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.gaussian import GaussianNoise
-from fe_likelihoods.noise.relative import RelativeNoise, local_level
+from fe_likelihoods.noise.levels import local_level
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import rms
 from fe_likelihoods.probability.block_likelihood import block_log_likelihood
@@ -29,7 +29,7 @@ def record(rng):
 
 def posterior_of(model, measured, **options):
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
-    noise = RelativeNoise.of(measured, **options)
+    noise = GaussianNoise(measured.channels, level="measured", **options)
     return Posterior(FELikelihood(model, measured, noise), prior | {n: HalfNormal(0.5) for n in noise.parameter_names})
 
 
@@ -41,15 +41,20 @@ def test_the_likelihood_is_that_of_white_noise_with_the_scaled_deviations(rng):
     misfit, shares = np.array([[1e-4, 3.0], [np.nan, 1.0]]), np.array([[0.2, 0.3], [0.2, 0.3]])
     levels = np.sqrt(np.nanmean(values**2, axis=1))
     for options in ({}, {"sensor": (0.001, 0.1)}, {"effective_samples": (20, 30)}):
-        noise = RelativeNoise.of(measured, **options)
+        noise = GaussianNoise(channels, level="measured", **options).with_measurements(measured)
         expected = GaussianNoise(channels, **options).log_likelihood(misfit, 40, shares * levels)
         np.testing.assert_array_equal(noise.log_likelihood(misfit, 40, shares), expected)
         assert noise.log_likelihood(misfit, 40, -shares)[0] == -np.inf
         assert noise.log_likelihood(misfit, 40, [[0.2, 1.0], [0.2, 1.0]])[0] == -np.inf
     assert noise.parameter_names == ("share_top", "share_base")
-    sensor = RelativeNoise.of(measured, sensor={"base": 0.1}).standard_deviations(shares)
+    sensor = GaussianNoise(channels, level="measured", sensor={"base": 0.1}).with_measurements(measured)
+    sensor = sensor.standard_deviations(shares)
     np.testing.assert_allclose(sensor[0], [0.2 * levels[0], np.hypot(0.1, 0.3 * levels[1])])
-    assert repr(noise) != repr(RelativeNoise.of(measured)) != repr(RelativeNoise.of(measured, window=1.0))
+    assert (
+        repr(noise)
+        != repr(GaussianNoise(measured.channels, level="measured"))
+        != repr(GaussianNoise(measured.channels, level="measured", window=1.0))
+    )
 
 
 def test_level_of_a_response():
@@ -90,7 +95,7 @@ def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(re
         posterior.prior.subset(["stiffness", "damping"]).distributions
         | {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels},
     )
-    with pytest.warns(UserWarning, match=r"another level .*acceleration \(0\.1 times\).*RelativeNoise"):
+    with pytest.warns(UserWarning, match=r"another level .*acceleration \(0\.1 times\).*shares of the response"):
         fixed = propagate(absolute, np.tile([1.0, 1.0, 0.3, 0.2], (300, 1)), record=record.scale(0.1), **options)
     np.testing.assert_allclose(fixed.sd[0], 0.3, rtol=1e-9)
     with warnings.catch_warnings():  # neither noise that scales, nor a similar level
@@ -128,7 +133,7 @@ def test_shares_that_were_found_with_one_motion_cover_another_ten_times_weaker(r
     model, measured = LinearOscillator(record), motion(record)
     posterior = posterior_of(model, measured, window=1.0)
     misfit = posterior.likelihood.misfit([[1.0, 1.0]])[0]
-    shares = np.sqrt(misfit / measured.n_steps) / posterior.likelihood.noise.levels
+    shares = np.sqrt(misfit / measured.n_steps) / posterior.likelihood.noise.scales
     np.testing.assert_allclose(shares, 0.2, rtol=0.15)
     samples = np.tile([1.0, 1.0, *shares], (400, 1))
     prediction = propagate(posterior, samples, record=weaker, noise=True, seed=1, progress=False)
@@ -145,9 +150,10 @@ def test_a_large_share_covers_another_motion_because_the_measured_level_contains
     channels = [Channel(f"c{k}", "displacement", "mm") for k in range(3)]
     errors = deviations[:, None] * rng.standard_normal((3, n))
     measured = Measurements(channels, 0.02, shape + errors)
-    noise = RelativeNoise.of(measured, sensor=sensor * np.ones(3) if sensor else None)
+    noise = GaussianNoise(measured.channels, level="measured", sensor=sensor * np.ones(3) if sensor else None)
+    noise = noise.with_measurements(measured)
     misfit = np.sum(errors**2, axis=1)
-    shares = np.sqrt(misfit / n - sensor**2) / noise.levels  # at the maximum of the likelihood
+    shares = np.sqrt(misfit / n - sensor**2) / noise.scales  # at the maximum of the likelihood
     found = noise.response_deviations(shares, np.tile(shape, (3, 1)), 0.02)[:, 0]
     np.testing.assert_allclose(found, deviations, rtol=0.06)
     narrow = np.hypot(sensor, shares * np.sqrt(np.mean(shape**2)))  # control: without the error in the level
@@ -180,12 +186,14 @@ def test_replicated_measurements_have_the_noise_of_a_prediction(record, own_time
 
 def test_what_has_no_level_is_refused():
     for levels in ([0.0], [np.nan], [1.0, 2.0]):
-        with pytest.raises(ValueError, match="one positive response level"):
-            RelativeNoise((TOP,), levels)
+        with pytest.raises(ValueError, match="scales must be"):
+            GaussianNoise((TOP,), level="measured", scales=levels)
     with pytest.raises(ValueError, match="window must be a positive length"):
-        RelativeNoise((TOP,), [1.0], window=0.0)
+        GaussianNoise((TOP,), level="measured", scales=[1.0], window=0.0)
     model = FunctionModel(lambda theta: [theta[0] * np.ones(5)], ["a"], [TOP], 0.1, 5)
-    likelihood = FELikelihood(model, Measurements((TOP,), 0.1, [np.ones(5)]), RelativeNoise((TOP,), [1.0]))
+    likelihood = FELikelihood(
+        model, Measurements((TOP,), 0.1, [np.ones(5)]), GaussianNoise((TOP,), level="measured", scales=[1.0])
+    )
     posterior = Posterior(likelihood, {"a": TruncatedNormal(1.0, 0.1), "share_top": HalfNormal(0.2)})
     assert [each.unit for each in posterior.parameters][-1] == "-"
     with pytest.raises(ValueError, match="positive standard deviation"):
@@ -198,11 +206,11 @@ def test_blocks_of_time_count_a_sample_as_in_the_whole_measurements(rng):
     measured = Measurements((TOP,), 0.1, rng.standard_normal((1, 200)))
     residuals = 0.3 * rng.standard_normal((3, 1, 200))
     stops = np.array([5.0, 12.0, np.inf])
-    noise = RelativeNoise.of(measured, effective_samples=(50,))
+    noise = GaussianNoise(measured.channels, level="measured", effective_samples=(50,)).with_measurements(measured)
     white = GaussianNoise((TOP,), effective_samples=(50,))
     shares = np.full((3, 1), 0.3)
     terms, expected = (
         block_log_likelihood(each, measured, measured.values, residuals, parameters, stops)
-        for each, parameters in ((noise, shares), (white, shares * noise.levels[0]))
+        for each, parameters in ((noise, shares), (white, shares * noise.scales[0]))
     )
     np.testing.assert_allclose(terms, expected, rtol=1e-12)

@@ -130,7 +130,7 @@ def test_verdicts_say_what_to_do(rng):
     first, second, third, fourth = checks.sentences
     assert first == "White: no correlation from sample to sample was found."
     assert second.startswith(f"Not white: correlation {checks.lag_one[1]:.2f} from sample to sample. 800 samples are ")
-    assert 'use AutoregressiveNoise ("autoregressive" in TOML) or' in second
+    assert 'use AutoregressiveNoise (kind = "autoregressive" in TOML) or' in second
     assert f"worth {checks.n_effective[1]:.0f} independent ones" in second and "AutoregressiveNoise" in second
     assert third.startswith("Nearly white: ") and checks.white[2] < 0.01
     assert "Not normal" in fourth and "Not normal" not in first
@@ -149,7 +149,7 @@ def test_innovations_are_not_advised_to_use_the_noise_that_left_them(rng):
     assert checks.lag_one[0] > 0.3 and "AutoregressiveNoise" in residual.sentences[0]
     (advice,) = checks.sentences
     assert advice.startswith(f"Not white: correlation {checks.lag_one[0]:.2f} from sample to sample is left.")
-    assert "AutoregressiveNoise" not in advice and "BandNoise" in advice and advice in str(checks)
+    assert "AutoregressiveNoise" not in advice and "bands of frequency" in advice and advice in str(checks)
     title = plot_residuals(left, [channel], 0.01, whitened=True).axes[0].get_title(loc="left")
     assert " ".join(title.split()) == advice
     # white innovations need no advice, and the numbers do not depend on what the rows are

@@ -6,16 +6,13 @@ from scipy.special import logsumexp
 
 from fe_likelihoods import (
     AutoregressiveNoise,
-    BandNoise,
     Channel,
     FELikelihood,
     FunctionModel,
     GaussianNoise,
     HalfNormal,
     Measurements,
-    ModulatedNoise,
     Posterior,
-    RelativeNoise,
     TruncatedNormal,
 )
 from fe_likelihoods.noise.draws import sample_noise
@@ -39,9 +36,9 @@ RHO = np.linspace(-0.98, 0.98, 45)
 NOISES = {  # the noise, the axes of the grid of its parameters, and the parameters that make data
     "white": (GaussianNoise(TOP, sensor=SENSOR), [LEVELS], [0.25]),
     "autoregressive": (AutoregressiveNoise(TOP, sensor=SENSOR), [LEVELS, RHO], [0.25, 0.8]),
-    "modulated": (ModulatedNoise(TOP, window=0.6, sensor=SENSOR), [SHARES], [0.6]),
-    "envelope": (ModulatedNoise(TOP, window=0.6, sensor=SENSOR, local=1.0), [SHARES], [0.6]),
-    "bands": (BandNoise(TOP, (5.0,), sensor=SENSOR), [SHARES, SHARES], [0.8, 0.3]),
+    "modulated": (GaussianNoise(TOP, level="response", window=0.6, sensor=SENSOR), [SHARES], [0.6]),
+    "envelope": (GaussianNoise(TOP, level="response", window=0.6, sensor=SENSOR, local=1.0), [SHARES], [0.6]),
+    "bands": (GaussianNoise(TOP, groups=(5.0,), level="response", sensor=SENSOR), [SHARES, SHARES], [0.8, 0.3]),
 }
 
 
@@ -72,8 +69,11 @@ def test_the_evidence_prefers_the_noise_that_made_the_data(truth, rng):
     others = np.delete(comparison.log_bayes_factor, comparison.names.index(truth))
     # white noise is autoregressive noise without correlation, which costs the width of its prior only
     assert others.max() < (-1.0 if truth == "white" else -10.0)
-    # the evidence of `RelativeNoise`, not normalised, is near that of white noise, which has the same likelihood
-    relative = log_evidence(RelativeNoise.of(measured, sensor=SENSOR), [SHARES[SHARES < 1.0]], measured)
+    # the evidence of shares of the measured channel, not normalised, is near that of white noise, which has the same
+    # likelihood
+    relative = log_evidence(
+        GaussianNoise(measured.channels, level="measured", sensor=SENSOR), [SHARES[SHARES < 1.0]], measured
+    )
     assert abs(relative - found["white"][0]) < 2.0
 
 

@@ -14,9 +14,7 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
-    SharedGaussianNoise,
     SimulationCache,
-    TimeShiftNoise,
     TruncatedNormal,
     Uniform,
     align,
@@ -177,13 +175,14 @@ def shifted_data(rng, shift=0.0234, dt=DT):
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.0125])
-@pytest.mark.parametrize("inner", [GaussianNoise((TOP, DRIFT)), SharedGaussianNoise((TOP, DRIFT), (1.0, 0.02))])
+@pytest.mark.parametrize(
+    "inner", [GaussianNoise((TOP, DRIFT)), GaussianNoise((TOP, DRIFT), groups="all", scales=(1.0, 0.02))]
+)
 def test_shift_is_that_of_the_response(rng, dt, inner):
     data = shifted_data(rng, dt=dt)
-    noise = TimeShiftNoise(inner, {"top": 0.05}, DT)
-    assert noise.parameter_names[-1] == "time_shift_top"
-    likelihood = FELikelihood(MODEL, data, noise)
-    sigmas = [0.1, 0.002] if isinstance(inner, GaussianNoise) else [0.1]
+    likelihood = FELikelihood(MODEL, data, inner, time_shifts={"top": 0.05})
+    assert likelihood.parameter_names[-1] == "time_shift_top"
+    sigmas = [0.1, 0.002] if inner.groups == "channel" else [0.1]
     times = data.times("top")
     inside = np.isfinite(data.channel("top")) & (times > 0.0799) & (times < TIME[-1] - 0.0799)
     assert likelihood.n_samples.samples.tolist() == [inside.sum(), data.n_steps]
@@ -202,7 +201,7 @@ def test_shift_is_that_of_the_response(rng, dt, inner):
 
 def test_shift_without_interpolation_is_exact(rng):
     data = shifted_data(rng)
-    likelihood = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    likelihood = FELikelihood(MODEL, data, time_shifts={"top": 0.05})
     values, simulated = data.channel("top"), response([1.1, 0.9])[0]
     kept = np.flatnonzero(np.isfinite(values[8:-8])) + 8
     for steps in (-5, 0, 3, 5):
@@ -215,17 +214,17 @@ def test_shift_without_interpolation_is_exact(rng):
 
 
 def test_shift_is_found_and_stored(rng, tmp_path):
-    data, noise = shifted_data(rng), TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT)
-    likelihood = FELikelihood(MODEL, data, noise, cache=SimulationCache(tmp_path / "cache.db"))
+    data, options = shifted_data(rng), {"time_shifts": {"top": 0.05}}
+    likelihood = FELikelihood(MODEL, data, cache=SimulationCache(tmp_path / "cache.db"), **options)
     shifts = np.linspace(-0.05, 0.05, 401)
     values = likelihood.log_likelihood([[1.0, 1.0, 0.02, 0.0004, shift] for shift in shifts])
     weights = np.exp(values - values.max())
     mean = weights @ shifts / weights.sum()
     sd = np.sqrt(weights @ (shifts - mean) ** 2 / weights.sum())
     assert abs(mean - 0.0234) < 4.0 * sd and sd < 2e-3
-    again = FELikelihood(MODEL, data, noise, cache=SimulationCache(tmp_path / "cache.db"))
+    again = FELikelihood(MODEL, data, cache=SimulationCache(tmp_path / "cache.db"), **options)
     assert again.log_likelihood([1.0, 1.0, 0.02, 0.0004, 0.01]) == values[240] and again.simulations == 0
-    other = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.07}, DT))
+    other = FELikelihood(MODEL, data, time_shifts={"top": 0.07})
     assert other.fingerprint != likelihood.fingerprint
     prior = {"size": TruncatedNormal(1.0, 0.3), "stretch": TruncatedNormal(1.0, 0.3)}
     prior |= {"sigma_top": HalfNormal(0.1), "sigma_drift": HalfNormal(0.1), "time_shift_top": Uniform(-0.05, 0.05)}
@@ -235,23 +234,21 @@ def test_shift_is_found_and_stored(rng, tmp_path):
 
 def test_shifts_that_do_not_fit_are_refused(rng):
     white = GaussianNoise((TOP, DRIFT))
-    for arguments, message in (
-        ((AutoregressiveNoise((TOP, DRIFT)), {"top": 0.1}, DT), "a GaussianNoise or a SharedGaussianNoise"),
-        ((white, {"base": 0.1}, DT), "some of the channels top, drift"),
-        ((white, {}, DT), "some of the channels top, drift"),
-        ((white, {"top": 0.0}, DT), "positive largest shifts"),
+    for (noise, shifts), message in (
+        ((AutoregressiveNoise((TOP, DRIFT)), {"top": 0.1}), "white noise in SI units.*got AutoregressiveNoise"),
+        ((white, {"base": 0.1}), "some of the channels top, drift"),
+        ((white, {}), "some of the channels top, drift"),
+        ((white, {"top": 0.0}), "positive largest shifts"),
     ):
         with pytest.raises(ValueError, match=message):
-            TimeShiftNoise(*arguments)
+            FELikelihood(MODEL, shifted_data(rng), noise, time_shifts=shifts)
     with pytest.raises(ValueError, match="beyond the record; give a smaller one"):
-        FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 4.0}, DT))
-    with pytest.raises(ValueError, match="make the noise with model.dt"):
-        FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(white, {"top": 0.05}, 2.0 * DT))
+        FELikelihood(MODEL, shifted_data(rng), white, time_shifts={"top": 4.0})
 
 
 def test_samples_with_shifts_predict(rng):
     """The noise of the samples has the parameters of the shifts too."""
-    likelihood = FELikelihood(MODEL, shifted_data(rng), TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    likelihood = FELikelihood(MODEL, shifted_data(rng), time_shifts={"top": 0.05})
     samples = [[1.0, 1.0, 0.3, 0.0004, 0.02], [1.1, 0.9, 0.3, 0.0004, 0.03]]
     for noise in (False, True):
         found = propagate(likelihood, samples, noise=noise, progress=False)
@@ -261,10 +258,7 @@ def test_samples_with_shifts_predict(rng):
 
 def test_evidences_of_other_largest_shifts_are_not_those_of_the_same_data(rng):
     data, white = shifted_data(rng), GaussianNoise((TOP, DRIFT))
-    plain, *shifted = (
-        FELikelihood(MODEL, data, noise)
-        for noise in (white, *(TimeShiftNoise(white, {"top": shift}, DT) for shift in (0.05, 0.07)))
-    )
+    plain, *shifted = (FELikelihood(MODEL, data, time_shifts=shifts) for shifts in (None, {"top": 0.05}, {"top": 0.07}))
     digests = {each.data_fingerprint for each in (plain, *shifted)}
     assert len(digests) == 3
     assert FELikelihood(MODEL, data, shifted[0].noise).data_fingerprint == shifted[0].data_fingerprint
@@ -277,7 +271,7 @@ def test_evidences_of_other_largest_shifts_are_not_those_of_the_same_data(rng):
 
 def test_residuals_and_errors_are_at_the_shift(rng):
     data = shifted_data(rng, dt=0.0125)
-    likelihood = FELikelihood(MODEL, data, TimeShiftNoise(GaussianNoise((TOP, DRIFT)), {"top": 0.05}, DT))
+    likelihood = FELikelihood(MODEL, data, time_shifts={"top": 0.05})
     point = [1.0, 1.0, 0.02, 0.0004, 0.0234]
     residuals = likelihood.residuals(point)
     known = np.isfinite(residuals)

@@ -19,7 +19,7 @@ from scipy import stats
 
 from fe_likelihoods import problems
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
-from fe_likelihoods.noise.gaussian import SharedGaussianNoise
+from fe_likelihoods.noise.gaussian import GaussianNoise
 from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.probability.posterior import Posterior
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
@@ -211,7 +211,7 @@ def test_credible_intervals_cover():
             step=step,
         )
         model = IsolatedBridge(_motion(), outputs=6, step=step, every=2)
-        noise = SharedGaussianNoise.of(measurements)
+        noise = GaussianNoise(measurements.channels, groups="all")
         prior = problems.isolated_bridge_prior(model.parameter_names, {"sigma": 1.0})
         posterior = Posterior(FELikelihood(model, measurements, noise), prior)
         sampler = SMCSampler(400, posterior.ndim, posterior, vectorize=True, seed=SEED + number)
