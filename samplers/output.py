@@ -24,7 +24,7 @@ from .judgement.verdict import Verdict
 from .record import Record
 from .reports import AnnealingResult, Stage
 
-__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file"]
+__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file", "stored_result"]
 
 logger = logging.getLogger(__name__)
 
@@ -60,26 +60,11 @@ class Output:
         self._backend, self._record = backend, record
         self._counts = int(backend.iteration), np.array(backend.accepted)
         self._summed = 0, 0  # steps, and their checksum
-        stored = self._read()
-        ladder = tuple(Stage(*values) for values in stored.get("ladder", ()))
-        check, founders, verdict = (stored.get(name) for name in ("check", "founders", "verdict"))
-        self.result = AnnealingResult(
-            ladder,
-            None if check is None else EvidenceCheck(*check),
-            None if founders is None else np.array(founders),
-        )
-        self.verdict = None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
+        stored = _read(backend)
+        self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
         # a kill may have come when the provisional step was removed, and the note of it was not
         self.provisional = stored.get("provisional", False) and int(backend.iteration) > self.first_step
-
-    def _read(self) -> dict[str, Any]:
-        backend = self._backend
-        if not isinstance(backend, HDFBackend):
-            return getattr(backend, "tempering", {})
-        with backend.open() as file:
-            group = file[backend.name]
-            return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
 
     def begin(self, run: str) -> None:
         """A new annealing begins: nothing is known of it."""
@@ -182,6 +167,41 @@ class Output:
             self.provisional = False
             self._write()
             self.step_stored()
+
+
+def stored_result(backend: Backend) -> tuple[AnnealingResult, Verdict | None]:
+    """Ladder with evidence, and verdict, as a run has stored them; the density is not called.
+
+    Parameters
+    ----------
+    backend : emcee Backend or HDFBackend
+        Of a tempered sampler; it may be open for reading only.
+
+    Returns
+    -------
+    AnnealingResult
+        Empty if the annealing has not ended, or the chain is of another sampler.
+    Verdict or None
+    """
+    return _parsed(_read(backend))
+
+
+def _read(backend: Backend) -> dict[str, Any]:
+    if not isinstance(backend, HDFBackend):
+        return getattr(backend, "tempering", {})
+    with backend.open() as file:
+        group = file[backend.name]
+        return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+
+
+def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
+    check, founders, verdict = (stored.get(name) for name in ("check", "founders", "verdict"))
+    result = AnnealingResult(
+        tuple(Stage(*values) for values in stored.get("ladder", ())),
+        None if check is None else EvidenceCheck(*check),
+        None if founders is None else np.array(founders),
+    )
+    return result, None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
 
 
 def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:

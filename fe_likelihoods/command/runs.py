@@ -261,8 +261,8 @@ def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tup
     report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
     caution = (
         "the model is a Python file or program that the settings name, which was not run: the report has no "
-        "responses, no predictions and no evidence. `fe-likelihoods report FOLDER --run-code` runs it; do that only "
-        "with code that you trust"
+        "responses and no predictions, and evidence and verdict as they are stored. `fe-likelihoods report FOLDER "
+        "--run-code` runs it; do that only with code that you trust"
     )
     return ("report.html", *write_tables(folder, run), samples), (caution,), not run.is_inconclusive
 

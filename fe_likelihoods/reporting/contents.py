@@ -4,6 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers import Verdict
+from samplers.output import stored_result
+
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
@@ -127,6 +130,8 @@ def _trust(run: FinishedRun, doubted: bool) -> str:
         if doubted and run.verdict is not None:
             text = words["not usable"]
         return f"{text} ({len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones)."
+    if (verdict := stored_result(run.sampler.backend)[1]) is not None:
+        return f"{len(run.samples)} samples. The verdict that the run has stored is “{verdict.status}”."
     if np.isfinite(run.effective_sample_size):
         return (
             f"{len(run.samples)} samples of a Markov chain are worth about {run.effective_sample_size:.0f} independent "
@@ -148,10 +153,18 @@ def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
     return sentences
 
 
+def _stored_verdict(verdict: Verdict | None) -> list[str]:
+    return [] if verdict is None else [f"Verdict of the sampler, as the run has stored it: {verdict}"]
+
+
 def evidence(run: FinishedRun) -> list[str]:
     """The evidence with its check, in sentences."""
     if not run.tempered:
-        return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
+        result, verdict = stored_result(run.sampler.backend)  # the chain alone of a tempered sampler
+        if not result.finished:
+            return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
+        value, error = result.evidence
+        return [f"Log-evidence {value:.2f} ± {error:.2f}, as the run has stored it.", *_stored_verdict(verdict)]
     sampler, check = run.sampler, run.check
     lines = [
         f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}. Only differences between models "

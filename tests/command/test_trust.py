@@ -1,6 +1,7 @@
 """The folder of a run may come from a stranger: a report of it runs no code that the folder names."""
 
 import pickle
+import re
 import sys
 
 import pytest
@@ -54,10 +55,15 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(kind, folder, monkeypat
         for reader in ("load", "loads", "Unpickler"):
             patched.setattr(pickle, reader, _refuse)
         said = call("report", "r")
-    assert "which was not run: the report has no responses, no predictions" in " ".join(said.split())
+    assert "which was not run: the report has no responses and no predictions" in " ".join(said.split())
     assert not (folder / "was_run").exists() and name not in sys.modules
     summary = (folder / "r" / "summary.txt").read_text()
-    assert "stiffness" in summary and "The evidence and the verdict are not known" in summary
+    assert "stiffness" in summary and "as they are stored; the model was not run" in summary
+    evidence = re.search(r"log-evidence \S+ \+- [\d.]+", whole)[0]
+    assert evidence in summary and "simulations." in summary  # the verdict
+    page = (folder / "r" / "report.html").read_text()
+    assert "gives no evidence" not in page and "as the run has stored it" in page
+    assert evidence.split()[1].lstrip("-") in page
     rows = [
         (folder / "r" / name).read_text().splitlines() for name in ("summary.csv", "report.html", "posterior.nc")[:2]
     ]

@@ -379,3 +379,14 @@ def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match=r"expected points of shape \(n, 3\); got shape \(3,\)"):
         queue.submit(SHORT[0])
     assert queue.submit(np.empty((0, 3))) == []
+
+
+@pytest.mark.parametrize("responses", [True, False])
+def test_without_a_pool_points_that_are_submitted_twice_are_simulated_once(responses):
+    posterior = posterior_of(Treacherous())
+    x = posterior.sample_prior(6, np.random.default_rng(3))
+    with posterior.evaluation_queue(responses=responses) as queue:
+        values = collect(queue, queue.submit(x) + queue.submit(x[:4]))
+    assert posterior.report()["simulations"] == 6
+    expected = posterior.log_prob(x)
+    np.testing.assert_array_equal(values, np.concatenate([expected, expected[:4]]))

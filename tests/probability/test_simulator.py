@@ -1,7 +1,8 @@
-"""Responses that are simulated on request: their statistics are cached as those of a log-likelihood are."""
+"""Simulations of a likelihood: run once, counted, and cached, whether their responses or their statistics are asked."""
 
 import pickle
 import signal
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.probability.failures import TooManyFailures
 from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.probability.simulator import Simulator
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
@@ -51,6 +53,13 @@ class Batched(Line):
         batch = [Line().simulate(np.append(theta[:1], min(theta[1], 1.0))) for theta in thetas]
         self.runs += len(thetas)
         return SimulationBatch(np.array(batch), ["too steep" if slope > 1.0 else "" for slope in thetas[:, 1]])
+
+
+class MapOnly:
+    """A pool that has map and nothing else."""
+
+    def map(self, function, items):
+        return list(map(function, items))
 
 
 def line(theta):
@@ -380,3 +389,59 @@ def test_known_statistics_are_recalled_without_a_simulation(thetas):
         second.simulator.recall(thetas, statistics, batch.reasons[1:])
     with pytest.raises(ValueError, match="for the same noise"):
         second.simulator.recall(thetas, statistics[:, :1], batch.reasons)
+
+
+def test_a_simulator_stands_on_its_own(thetas):
+    model = Line()
+    simulator = Simulator(model, likelihood_of(model).measurements)
+    likelihood = likelihood_of(Line())
+    np.testing.assert_array_equal(simulator.misfit(thetas), likelihood.misfit(thetas))
+    assert simulator.report().keys() == likelihood.report().keys()
+    assert simulator.report()["simulations"] == model.runs == len(thetas)
+
+
+@pytest.mark.parametrize("pool", [None, 2, "map"])
+def test_start_and_wait_are_one_way_with_and_without_a_pool(pool, thetas, path):
+    simulator = likelihood_of(Line(), pool=MapOnly() if pool == "map" else pool, cache=path).simulator
+    arrived = SimpleQueue()
+    waiting = simulator.start([theta.tobytes() for theta in thetas], thetas, True, arrived)
+    results = {}
+    while waiting:
+        for ended in simulator.wait(waiting, arrived):
+            waiting.remove(ended)
+            results[ended.key] = ended.result
+    expected = simulate_batch(Line(), thetas)
+    for theta, response, reason in zip(thetas, *expected, strict=True):
+        found = results[theta.tobytes()]
+        np.testing.assert_array_equal(found.response, response)
+        assert bool(found.reason) == bool(reason)
+    simulator.flush()
+    assert simulator.simulations == simulator.cache.info().simulations == len(thetas)
+    simulator.simulate(thetas)
+    assert simulator.simulations == len(thetas)
+
+
+def test_simulations_that_are_left_before_they_ran_cost_nothing(thetas):
+    model = Line()
+    simulator, arrived = likelihood_of(model).simulator, SimpleQueue()
+    waiting = simulator.start([theta.tobytes() for theta in thetas], thetas, False, arrived)
+    assert simulator.leave(waiting, arrived, running=True) == []
+    assert model.runs == simulator.simulations == 0
+
+
+def test_one_point_that_is_cached_takes_the_short_way_with_the_same_value(thetas):
+    likelihood = likelihood_of(Line())
+    points = np.hstack([thetas, np.full((len(thetas), 2), 0.3)])
+    points[:3, 2] = -1.0, np.nan, 0.0  # impossible noise parameters
+    batch = likelihood(points)
+    single = [likelihood(point) for point in points]
+    np.testing.assert_array_equal(single, batch)
+    assert np.isneginf(batch[:3]).all() and np.isneginf(batch[thetas[:, 1] > 1.0]).all()
+    known = likelihood.simulator.cache_hits
+    assert [likelihood(point) for point in points] == single
+    assert likelihood.simulator.cache_hits - known == len(points) - 3 and likelihood.simulations <= len(thetas)
+
+
+def test_a_likelihood_refuses_another_model():
+    with pytest.raises(AttributeError):
+        likelihood_of(Line()).model = Line()
