@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from samplers.output import stored_result
-
 from ..prediction.prediction import Prediction
 from ..probability.likelihood import FELikelihood
 from ..probability.posterior import Posterior
+from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
@@ -79,7 +78,7 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
         evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
         return [evidence, in_toml_terms(str(run.verdict))]
     if isinstance(run.posterior.likelihood.model, NotRun):
-        return _as_stored(run)
+        return [f"{len(run.samples)} samples; the model was not run.", *map(in_toml_terms, evidence(run))]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
@@ -97,18 +96,6 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
             'the same command again, or use kind = "smc".'
         )
     return lines
-
-
-def _as_stored(run: FinishedRun) -> list[str]:
-    """Evidence and verdict as the run has stored them, of a model that is not run, as lines of text."""
-    result, verdict = stored_result(run.sampler.backend)
-    if not result.finished or verdict is None:
-        return [f"{len(run.samples)} samples. The evidence and the verdict are not stored, and the model was not run."]
-    value, error = result.evidence
-    return [
-        f"log-evidence {value:.2f} +- {error:.2f}, and the verdict, as they are stored; the model was not run:",
-        in_toml_terms(str(verdict)),
-    ]
 
 
 def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
