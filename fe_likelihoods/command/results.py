@@ -75,8 +75,8 @@ def write_tables(folder: Path, run: FinishedRun) -> tuple[str, ...]:
 def _of_the_sampler(run: FinishedRun) -> list[str]:
     """Evidence and verdict, or the length of a Markov chain, as lines of text."""
     if run.tempered:
-        evidence = f"log-evidence {run.sampler.log_evidence:.2f} +- {run.sampler.log_evidence_error:.2f}"
-        return [evidence, in_toml_terms(str(run.verdict))]
+        value, error = run.sampler.log_evidence, run.sampler.log_evidence_error
+        return [f"log-evidence {value:.2f} +- {error:.2f}", in_toml_terms(str(run.verdict))]
     if isinstance(run.posterior.likelihood.model, NotRun):
         return [f"{len(run.samples)} samples; the model was not run.", *map(in_toml_terms, evidence(run))]
     used = run.sampler.iteration - run.discard
