@@ -93,7 +93,7 @@ class ModelGuard:
         seconds: float,
         last: bool = True,
     ) -> bool:
-        """Compare after simulations, if they were compared before them or took long.
+        """Compare after simulations, if they were compared before them or took long; return whether.
 
         Parameters
         ----------
@@ -108,11 +108,6 @@ class ModelGuard:
             Their wall time [s]; with a pool that runs without interruption, the time since the last comparison.
         last : bool
             Whether no other simulations run. While some do, a comparison before them is no reason for one.
-
-        Returns
-        -------
-        bool
-            Whether the model was compared.
 
         Raises
         ------

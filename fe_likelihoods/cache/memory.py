@@ -25,7 +25,7 @@ _ENTRY_BYTES = 250  # of an entry of the response memory besides its numbers
 
 
 def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
-    """Bytes of the distinct rows of a float array, in order of first appearance, and the index of every row in them."""
+    """Bytes of the distinct rows of a float array, by first appearance, and the index of every row in them."""
     first: dict[bytes, int] = {}
     which = [first.setdefault(row.tobytes(), len(first)) for row in rows + 0.0]  # adding zero makes 0.0 of -0.0
     return list(first), which
@@ -67,13 +67,7 @@ class MemoryCache:
         return len(self._misfits)
 
     def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
-        """Cached statistics of distinct keys.
-
-        Parameters
-        ----------
-        keys : sequence of n bytes
-        width : int
-            Numbers per simulation, such as n_channels.
+        """Cached statistics of n distinct keys.
 
         Returns
         -------
@@ -149,20 +143,10 @@ class ResponseMemory:
         return len(self._outcomes)
 
     def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
-        """Stored outcomes of simulations.
+        """Stored outcomes of simulations of the model with a fingerprint, by keys of `distinct_keys`.
 
-        Parameters
-        ----------
-        fingerprint : str
-            Of the model.
-        keys : sequence of n bytes
-            Of the structural parameters, see `distinct_keys`.
-
-        Returns
-        -------
-        list of n
-            The response (n_channels, n_steps) [SI], not to be changed; the reason (str) where the simulation failed;
-            None where nothing is stored.
+        The response (n_channels, n_steps) [SI], not to be changed; the reason (str) where the simulation failed; None
+        where nothing is stored.
         """
         with self._lock:
             return [self._outcomes.get((fingerprint, key)) for key in keys]
@@ -217,7 +201,7 @@ class FinishedRows(NamedTuple):
         Statistics.
     reasons : list of n str
         Reasons of failures.
-    response : (n, n_channels, n_steps) float, optional
+    response : (n, n_channels, n_steps) float, or None
         Responses, if they are stored.
     seconds : float
         Wall time [s].

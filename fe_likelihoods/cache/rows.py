@@ -147,7 +147,7 @@ class StoredLabel(NamedTuple):
 
 
 def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
-    """Keys of simulations.
+    """Keys of simulations, digests of 128 bits.
 
     Parameters
     ----------
@@ -157,11 +157,6 @@ def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -
         Structural parameters; -0.0 and 0.0 have the same key.
     generation : int
         See `StoredLabel`.
-
-    Returns
-    -------
-    list of n bytes
-        Digests of 128 bits.
     """
     start = hashlib.blake2b(f"{fingerprint}\0{generation}\0".encode(), digest_size=KEY_BYTES)
     keys = []
@@ -177,18 +172,9 @@ def source_number(fingerprint: str) -> int:
     return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
 
 
-def checksum(
-    key: bytes,
-    source: int,
-    theta: bytes,
-    misfit: bytes,
-    n_steps: int,
-    reason: bytes,
-    seconds: float,
-    generation: int,
-    label: int,
-) -> int:
-    """CRC-32 of a stored simulation, its key included, so that values of another key are found to be damaged."""
+def checksum(*values: Any) -> int:
+    """CRC-32 of the values of `COLUMNS`, its own left out: values of another key are found to be damaged."""
+    key, source, theta, misfit, n_steps, reason, seconds, generation, label = values
     # earlier releases stored no generation and no label
     numbers = NUMBERS.pack(source, n_steps, seconds) + (LABEL_NUMBERS.pack(generation, label) if generation else b"")
     return zlib.crc32(b"".join((key, numbers, theta, misfit, reason)))
@@ -287,19 +273,9 @@ def unpack_label(*row: Any) -> StoredLabel:
 
 
 def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tuple:
-    """A stored simulation as one of another identity and generation.
+    """A stored simulation, given by the values of `COLUMNS`, as one of another identity and generation.
 
-    Parameters
-    ----------
-    fingerprint, generation, label
-        Of the new row.
-    row : tuple
-        The values of `COLUMNS`.
-
-    Returns
-    -------
-    tuple
-        Key, source, checksum, generation, label, and the key that the row had.
+    Returns key, source, checksum, generation, label, and the key that the row had.
     """
     (key,) = simulation_keys(fingerprint, np.frombuffer(row[2], dtype="<f8")[None], generation)
     source = source_number(fingerprint)

@@ -3,25 +3,19 @@
 The sums of squared residuals of a simulation are stored, one number per channel. They depend neither on the noise nor
 on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
 simulation is a digest of the declared identity of model and measurements (fingerprints), of the generation, and of the
-structural parameters to the last bit. A generation contains the simulations of one state of the model's code; which
-labels of the code belong to it is in the table of labels (`fe_likelihoods.cache.verification` decides it). Rows of
-another generation stay in the file and are not used. Results that are no longer used are evicted in the end, oldest
-first.
-
-Hits are exact. They occur when only the noise parameters change, in resumed and repeated runs, for duplicates, and when
-samplers are compared from the same start.
+structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
+model's code (`fe_likelihoods.cache.adoption`); rows of another one stay in the file and are not used. The oldest rows
+are evicted in the end.
 
 Responses are stored where they were requested, as a guide does, or for every simulation. They depend on the model alone
-and are stored as computed, in double precision. In single precision, a response with an offset of a million times its
-noise would lose its digits, and the cache knows neither noise nor measurements. Compression without loss would save 10
-to 25 % of their size and is not used.
+and are stored in double precision: in single precision, a response with an offset of a million times its noise would
+lose its digits. Compression without loss would save 10 to 25 % of their size and is not used.
 
 Failures are stored as well if they are answers of the model: under a key of the model, so that they hold for any
 measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run simulates
-the point again. A simulation that was stopped at a time limit is stored together with this limit. A later run with a
-longer limit simulates it again. A run with the same or a shorter limit simulates it again once, because a busy machine
-may have been the cause. After the second stop at one limit, it fails without a simulation in all runs with this limit
-or a shorter one.
+the point again. A simulation that was stopped at a time limit is stored together with this limit: a later run with a
+longer limit simulates it again, and one with the same or a shorter limit does so once, because a busy machine may have
+been the cause.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
@@ -86,14 +80,12 @@ class CacheInfo(NamedTuple):
     ----------
     path : Path
         The file.
-    simulations, failures : int
-        Number of stored simulations, and of failed ones among them.
-    responses, response_bytes : int
-        Number of stored responses, and their size [bytes].
+    simulations, failures, responses : int
+        Number of stored simulations, of failed ones among them, and of stored responses.
+    response_bytes, file_bytes : int
+        Size of the responses, and of the file without its write-ahead log [bytes].
     seconds : float
         Wall time of the stored simulations [s].
-    file_bytes : int
-        Size of the file without its write-ahead log [bytes].
     hits, misses, evictions, damaged, verified : int
         Rows found, not found, evicted, found damaged, and simulated again without a difference, by this object in this
         process.
@@ -116,16 +108,8 @@ class CacheInfo(NamedTuple):
 def rows_to_compare(verify: bool | int | str) -> int:
     """Number of rows that are simulated again before rows of an unknown label are used.
 
-    Parameters
-    ----------
-    verify : bool, int or str
-        As for `SimulationCache`. A share such as "5 %" stands for the number of rows with which a change of that share
-        of the space is found with a probability of 95 %.
-
-    Raises
-    ------
-    ValueError
-        For anything else.
+    `verify` is that of `SimulationCache`: a share such as "5 %" stands for the number of rows with which a change of
+    that share of the space is found with a probability of 95 %. ValueError for anything else.
     """
     if isinstance(verify, bool):
         return rows_to_compare("5 %") if verify else 0
@@ -198,6 +182,12 @@ class SimulationCache:
         if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of a later
         release. Such a file is not changed. A file of an earlier release is completed; its rows are kept.
 
+    Notes
+    -----
+    Methods for rows have the arguments `fingerprint`, everything declared, but the parameters, that rows depend on
+    (`FELikelihood.simulation_key` for statistics, the model's own for responses and failures), `thetas`, the structural
+    parameters (n, n_structural), and `generation` and `label` of a `StoredLabel`; by default the latest generation.
+
     Examples
     --------
     >>> likelihood = FELikelihood(model, measurements, cache="column.sqlite")
@@ -258,23 +248,7 @@ class SimulationCache:
     def look_up(
         self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int, generation: int | None = None
     ) -> CachedRows:
-        """Look up simulations, with few queries for the whole batch.
-
-        Parameters
-        ----------
-        fingerprint : str
-            Everything declared, but the parameters, that the sums depend on, such as `FELikelihood.simulation_key`.
-        thetas : (n, n_structural) float
-            Structural parameters.
-        n_channels, n_steps : int
-            Shape of the measurements; rows of another shape count as damaged.
-        generation : int
-            See `StoredLabel`; by default the latest.
-
-        Returns
-        -------
-        CachedRows
-        """
+        """Look up simulations, with few queries for the whole batch; rows of another shape count as damaged."""
         keys = self._keys(fingerprint, thetas, generation)
         misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
         with self.file.lock:
@@ -311,10 +285,8 @@ class SimulationCache:
 
         Parameters
         ----------
-        fingerprint : str
-            As for `look_up`.
-        thetas : (n, n_structural) float
-            Structural parameters.
+        fingerprint, thetas, generation, label
+            See the notes of the class.
         n_steps : int
             Number of samples of the measurements.
         misfit : (n, n_channels) float
@@ -323,8 +295,6 @@ class SimulationCache:
             Reasons of failures; empty where the simulation succeeded.
         seconds : float
             Wall time of all simulations together [s].
-        generation, label : int
-            See `StoredLabel`; by default the latest.
         """
         generation = self._given_or_latest(fingerprint, generation)
         keys, source = simulation_keys(fingerprint, thetas, generation), source_number(fingerprint)
@@ -338,19 +308,7 @@ class SimulationCache:
     def store_responses(
         self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int | None = None, label: int = 0
     ) -> None:
-        """Store responses in double precision, in one transaction that also evicts.
-
-        Parameters
-        ----------
-        model : Model
-            The responses do not depend on the measurements.
-        thetas : (n, n_structural) float
-            Structural parameters.
-        responses : (n, n_channels, n_steps) float
-            [SI]. Responses that are not finite are not stored.
-        generation, label : int
-            See `StoredLabel`; by default the latest.
-        """
+        """Store finite responses (n, n_channels, n_steps) [SI], in one transaction that also evicts."""
         generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
         rows = [
@@ -358,26 +316,14 @@ class SimulationCache:
             for key, theta, response in zip(keys, thetas, responses, strict=True)
             if np.isfinite(response).all()
         ]
-        if rows:
-            self._write(STORE_RESPONSE, rows)
+        self._write(STORE_RESPONSE, rows)
 
     def look_up_responses(
         self, model: Model, thetas: np.ndarray, generation: int | None = None
     ) -> list[np.ndarray | None]:
-        """Look up responses of a model.
+        """Responses (n_channels, n_steps) [SI] of a model.
 
-        Parameters
-        ----------
-        model : Model
-        thetas : (n, n_structural) float
-            Structural parameters.
-        generation : int
-            See `StoredLabel`; by default the latest.
-
-        Returns
-        -------
-        list of n (n_channels, n_steps) float, or None
-            [SI]; None where the response is not stored, or in single precision, by an earlier version.
+        None where a response is not stored, or in single precision, by an earlier version.
         """
         shape = len(model.channels), model.n_steps
         size = 8 * shape[0] * shape[1]
@@ -393,21 +339,9 @@ class SimulationCache:
         return [found.get(key) for key in keys]
 
     def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
-        """Whether a simulation, a response or a failure is stored, under one of several fingerprints.
+        """Whether a simulation, a response or a failure is stored (n,), under one of several fingerprints.
 
-        Parameters
-        ----------
-        fingerprints : sequence of str
-            As for `look_up`.
-        thetas : (n, n_structural) float
-            Structural parameters.
-        generation : int
-            See `StoredLabel`; by default the latest.
-
-        Returns
-        -------
-        (n,) bool
-            The rows are neither verified nor checked for damage, and not counted.
+        The rows are neither verified nor checked for damage, and not counted.
         """
         stored = np.zeros(len(thetas), dtype=bool)
         for fingerprint in fingerprints:
@@ -423,39 +357,18 @@ class SimulationCache:
     ) -> None:
         """Store failures of a model for any measurements, and simulations that were stopped at a time limit.
 
-        Parameters
-        ----------
-        model : Model
-        thetas : (n, n_structural) float
-            Structural parameters.
-        reasons : sequence of n str
-            Reasons of failures; empty where the simulation succeeded. A `MisfitReason` is not stored, nor is a
-            `TransientReason` without a time limit.
-        generation : int
-            See `StoredLabel`; by default the latest.
+        Reasons are empty where the simulation succeeded. A `MisfitReason` is not stored, nor is a `TransientReason`
+        without a time limit.
         """
         generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
         rows = [pack_failure(key, source, reason) for key, reason in zip(keys, reasons, strict=True)]
-        if any(rows):
-            self._write(STORE_FAILURE, [row for row in rows if row is not None])
+        self._write(STORE_FAILURE, [row for row in rows if row is not None])
 
     def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int | None = None) -> list[str]:
-        """Look up failures of a model that are answers for any measurements.
+        """Reasons of stored failures that are answers for any measurements; empty where the simulation has to be run.
 
-        Parameters
-        ----------
-        model : Model
-            Its attribute ``time_limit`` [s], if there is one, is compared with that of the stored failures.
-        thetas : (n, n_structural) float
-            Structural parameters.
-        generation : int
-            See `StoredLabel`; by default the latest.
-
-        Returns
-        -------
-        list of n str
-            Reasons; empty where the simulation has to be run.
+        The model's ``time_limit`` [s], if there is one, is compared with that of the stored failures.
         """
         if self.retry_failures:
             return [""] * len(thetas)
@@ -514,7 +427,7 @@ class SimulationCache:
         Parameters
         ----------
         fingerprint : str or int
-            As for `look_up`, or the number of a source of an earlier release.
+            Or the number of a source of an earlier release.
         generation : int
         n_channels, n_steps : int
             Shape of the measurements.
@@ -549,11 +462,6 @@ class SimulationCache:
 
     def copy(self, path: str | os.PathLike) -> int:
         """Write a copy of the cache, with all rows, to a new file: to archive it, or to take it to another machine.
-
-        Parameters
-        ----------
-        path : path
-            The new file.
 
         Returns
         -------
@@ -649,13 +557,7 @@ class SimulationCache:
         return rows, rows - good
 
     def clear(self) -> None:
-        """Delete all rows, for all users of the file; the caches in memory of likelihoods are not affected.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
+        """Delete all rows, for all users of the file; caches in memory are not affected. OSError if that fails."""
 
         with self.file.lock:
             self.file.insist(lambda connection: _delete_rows(connection, "?", [(True,)]))
@@ -666,12 +568,8 @@ class SimulationCache:
     def forget(self, *fingerprints: str) -> int:
         """Delete the simulations and responses of some models, of all generations, for all users of the file.
 
-        The caches in memory of likelihoods are not affected: make a new likelihood.
-
-        Parameters
-        ----------
-        *fingerprints : str
-            As for `look_up`; ``cache.forget(*likelihood.simulator.cache_keys)`` deletes what a likelihood uses.
+        ``cache.forget(*likelihood.simulator.cache_keys)`` deletes what a likelihood uses. The caches in memory of
+        likelihoods are not affected: make a new likelihood.
 
         Returns
         -------
@@ -690,17 +588,7 @@ class SimulationCache:
             return self.file.insist(lambda connection: _delete_rows(connection, "source = ?", rows))
 
     def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
-        """Delete the rows of some simulations, if possible.
-
-        Parameters
-        ----------
-        thetas : (n, n_structural) float
-            Structural parameters.
-        *fingerprints : str
-            As for `look_up`.
-        generation : int
-            See `StoredLabel`; by default the latest.
-        """
+        """Delete the rows of some simulations, if possible."""
         keys = {key for fingerprint in fingerprints for key in self._keys(fingerprint, thetas, generation)}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row[0] not in keys]
@@ -741,6 +629,8 @@ class SimulationCache:
             )
 
     def _write(self, statement: str, rows: list[tuple]) -> None:
+        if not rows and statement is not STORE:  # which also writes the rows that wait
+            return
         with self.file.lock:
             if not self.file.writable:
                 self._warn_read_only()

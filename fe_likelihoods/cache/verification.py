@@ -64,14 +64,8 @@ PAUSE_RATIO = 20.0  # of the duration of the last attempt
 class StaleCache(ValueError):
     """A stored simulation differs from a new one with the same parameters. The message says what to do.
 
-    It is raised again, for any row, as long as that simulation is stored and the model is the same object.
-
-    Attributes
-    ----------
-    theta : (n_structural,) float
-        Structural parameters of the simulation.
-    ends_run : bool
-        True: samplers stop, since no other point can be evaluated either.
+    It is raised again, for any row, as long as that simulation is stored and the model is the same object. Samplers
+    stop (`ends_run`), since no other point can be evaluated either. `theta` (n_structural,) are the parameters.
     """
 
     ends_run = True
@@ -94,19 +88,10 @@ class VerifiedCache:
     cache : SimulationCache
         Its settings `verify` and `tolerance` apply.
     model : Model
-        As it is when the likelihood is made. Objects for the same model, pool and file share what they have verified.
+        As it is when the likelihood is made.
     pool : executor or None
     label : ModelLabel
         Label of the model.
-
-    Attributes
-    ----------
-    compared : int
-        Rows that were compared with a new simulation.
-    unverified : int
-        Rows whose new simulation was stopped for another reason than the model, so that it could not be compared.
-    seconds : float
-        Wall time of the simulations for verification [s].
     """
 
     def __init__(self, cache: SimulationCache, model: Model, pool: Any, label: ModelLabel) -> None:
@@ -132,7 +117,7 @@ class VerifiedCache:
 
     @property
     def unverified(self) -> int:
-        """Rows that could not be compared."""
+        """Rows whose new simulation was stopped for another reason than the model, so that it could not be compared."""
         return self._again.unverified
 
     @property
@@ -210,14 +195,6 @@ class VerifiedCache:
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
         """Rows of `SimulationCache.look_up`, of which some are verified.
 
-        Parameters
-        ----------
-        fingerprint : str
-            As for `SimulationCache.look_up`.
-        thetas : (n, n_structural) float
-            Structural parameters.
-        run : VerifyingRun
-
         Raises
         ------
         StaleCache
@@ -265,13 +242,7 @@ class VerifiedCache:
         return self._verify_due(table, fingerprint, len(known), candidates, run)
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
-        """Responses of `SimulationCache.look_up_responses`, of which some are verified by their statistics.
-
-        Raises
-        ------
-        StaleCache
-            If the statistics of a stored response and of a new simulation differ, although the label is known.
-        """
+        """Responses of `SimulationCache.look_up_responses`, of which some are verified by their statistics."""
         self._notice_other_model(run)
         fingerprint = run.model.fingerprint
         while True:
@@ -290,14 +261,9 @@ class VerifiedCache:
                 return responses
 
     def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
-        """Reasons of `SimulationCache.look_up_failures`, of which some are verified.
+        """Reasons of `SimulationCache.look_up_failures`, of which some are verified, as in `look_up`.
 
         Those that name a time limit are not, because each would take as long as the limit.
-
-        Raises
-        ------
-        StaleCache
-            If the new simulation succeeds.
         """
         self._notice_other_model(run)
         with self._trust.lock:
