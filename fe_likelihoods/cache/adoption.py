@@ -14,7 +14,14 @@ import numpy as np
 from .comparison import Repetition, VerifyingRun, difference_of, is_transient, row_of_response
 from .file import CacheFile
 from .labels import OWN, Trust, labels_of
-from .rows import COLUMNS, OF_EARLIER_RELEASES, StoredSimulation, is_undamaged, regenerated, transaction
+from .rows import (
+    COLUMNS,
+    OF_EARLIER_RELEASES,
+    StoredSimulation,
+    is_undamaged,
+    regenerated,
+    transaction,
+)
 from .simulation_cache import MAX_CANDIDATES, SimulationCache, rows_to_compare
 
 __all__ = ["LATEST", "MAX_ATTEMPTS", "Adoption", "choose_rows"]
@@ -107,7 +114,7 @@ class Adoption:
         """The generation of a known label, for which further rows are compared if there were few."""
         trust, stored, before = self.trust, self.trust.find(self.cache.file, run.model), self.trust.stored
         if stored.generation in present and stored.compared < n:
-            same = {each.id for each in labels_of(self.cache.file, run.model) if each.label == stored.label}
+            same = {each.id for each in labels_of(self.cache.file, stored.source) if each.label == stored.label}
             rows = self._rows(fingerprint, run, stored.generation, n + MAX_ATTEMPTS)
             left = min(n, sum(row.label not in same for row in rows)) - stored.compared
             if left > 0 and not self._adopts(fingerprint, run, stored.generation, left):

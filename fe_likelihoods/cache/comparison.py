@@ -23,7 +23,7 @@ from ..simulation.residual_statistics import Statistic, needs_response
 from ..simulation.user_code import is_of_user
 from .file import CacheFile
 from .labels import Trust, labels_of
-from .rows import StoredSimulation
+from .rows import StoredSimulation, source_number
 
 __all__ = [
     "DEFAULT_TOLERANCE",
@@ -167,7 +167,10 @@ class Repetition:
         same = response_tolerance(run.model) if run.tolerance is None else run.tolerance
         other = max(same, DEFAULT_TOLERANCE) if run.tolerance is None else same
         cpu = self.trust.cpu
-        found = {each.id: same if each.cpu == cpu != "" else other for each in labels_of(self.file, run.model)}
+        found = {
+            each.id: same if each.cpu == cpu != "" else other
+            for each in labels_of(self.file, source_number(run.model.fingerprint))
+        }
         return defaultdict(lambda: other, found | {0: same})
 
 

@@ -46,10 +46,10 @@ MAX_TRUSTS = 32
 # in the file ----------------------------------------------------------------------------------------------------------
 
 
-def labels_of(file: CacheFile, model: Model) -> list[StoredLabel]:
-    """Labels under which simulations of a model were stored or adopted."""
+def labels_of(file: CacheFile, source: int) -> list[StoredLabel]:
+    """Labels under which simulations of a model, given by its source number, were stored or adopted."""
     query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
-    rows = file.select(query, (source_number(model.fingerprint),))
+    rows = file.select(query, (source,))
     return [unpack_label(*row) for row in rows if is_undamaged_label(*row)]
 
 
@@ -144,7 +144,7 @@ class Trust:
             return self._of_others[source]
         if self.stored is not None:
             return self.stored
-        labels = labels_of(file, model)
+        labels = labels_of(file, source)
         paths = {path: "" for each in labels for path in each.files}
         self.label.add(Opened(paths).read_again(), here=False)
         known = [each for each in labels if each.label == self._text_with(each.files)]
@@ -250,7 +250,8 @@ def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats
         if known == key and all(refer() is each for refer, each in zip(referred, objects, strict=True)):
             _shared.append(_shared.pop(place))
             # the label is not in the file that another one has replaced
-            if trust.stored is None or trust.stored.id in {each.id for each in labels_of(cache.file, model)}:
+            stored = trust.stored
+            if stored is None or stored.id in {each.id for each in labels_of(cache.file, stored.source)}:
                 return trust
             _shared.pop()
             break

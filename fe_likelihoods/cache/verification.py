@@ -42,7 +42,7 @@ from .comparison import (
     simulate_again,
 )
 from .labels import Trust, labels_of, shared_trust
-from .rows import CachedRows, StoredLabel, StoredSimulation, simulation_keys
+from .rows import CachedRows, StoredLabel, StoredSimulation, simulation_keys, source_number
 from .simulation_cache import SimulationCache
 
 __all__ = ["StaleCache", "VerifiedCache"]
@@ -399,7 +399,7 @@ class VerifiedCache:
         scatter = self._scatter(row.theta, new, run)
         served = self._trust.served.total()
         self._trust.start_again()
-        stored, labels = self._trust.stored, labels_of(self.cache.file, run.model)
+        stored, labels = self._trust.stored, labels_of(self.cache.file, source_number(run.model.fingerprint))
         of_others = {each.id for each in labels if stored and each.label != stored.label}
         if label in of_others and not scatter:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
