@@ -5,7 +5,6 @@ those on the stack from `run_mcmc` (included) to the user's function (excluded),
 """
 
 import ast
-import re
 import sys
 import tempfile
 import threading
@@ -14,30 +13,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from inspect import Parameter, signature
-from itertools import pairwise
 from pathlib import Path
 
 import emcee
 import numpy as np
 
+from tests.prose import count, docstrings
+
 ROOT = Path.cwd()
 PACKAGES = ("samplers", "fe_likelihoods")
 WALKERS = 300  # enough that SMCSampler recycles
-DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 # ---------------------------------------------------------------- text
-
-
-def docstrings(tree: ast.Module) -> list[ast.Expr]:
-    """The docstrings of a module, its classes and its functions."""
-    bodies = [node.body for node in ast.walk(tree) if isinstance(node, DOCUMENTED)]
-    return [body[0] for body in bodies if body and isinstance(body[0], ast.Expr) and _text(body[0]) is not None]
-
-
-def _text(node: ast.Expr) -> str | None:
-    value = getattr(node.value, "value", None)
-    return value if isinstance(value, str) else None
 
 
 def lines_of(folder: str) -> tuple[int, int, int]:
@@ -52,19 +40,6 @@ def lines_of(folder: str) -> tuple[int, int, int]:
         lines += len(numbered)
         code += sum(bool(s := line.strip()) and s[0] != "#" and number not in prose for number, line in numbered)
     return len(files), lines, code
-
-
-def prose_of(package: str) -> tuple[int, float, float]:
-    """Words of docstrings, and two phrases per 1000 of them: "that of" and "... of ... of" (within six words)."""
-    trees = (ast.parse(path.read_text()) for path in sorted((ROOT / package).rglob("*.py")))
-    texts = [_text(node) for tree in trees for node in docstrings(tree)]
-    words = sum(len(text.split()) for text in texts)
-    pronouns = sum(len(re.findall(r"\b(?:that|those|the ones?) of\b", " ".join(text.split()), re.I)) for text in texts)
-    chains = 0
-    for text in texts:
-        places = [place for place, word in enumerate(re.findall(r"[\w'-]+", text)) if word == "of"]
-        chains += sum(second - first <= 6 for first, second in pairwise(places))
-    return words, 1000 * pronouns / words, 1000 * chains / words
 
 
 # ---------------------------------------------------------------- names and settings
@@ -214,10 +189,10 @@ def rows():
         paths = [path for path in paths if not {"api", "tutorials", "_build"} & set(path.parts[len(ROOT.parts) :])]
         yield f"{label}: files, words", f"{len(paths)}, {sum(len(path.read_text().split()) for path in paths)}"
     for package in PACKAGES:
-        words, pronouns, chains = prose_of(package)
-        yield f"{package}: words of docstrings", str(words)
-        yield '    "that of", "those of", "the one of" per 1000', f"{pronouns:.2f}"
-        yield '    "... of ... of" within six words per 1000', f"{chains:.2f}"
+        found = count(ROOT / package)
+        yield f"{package}: words of docstrings", str(found.words)
+        yield '    "that of", "those of", "the one of" per 1000', f"{found.pronouns:.2f}"
+        yield '    "of (the) noun of" per 1000', f"{found.chains:.2f}"
         yield f"{package}: public names", str(len(import_module(package).__all__))
     samplers = import_module("samplers")
     yield "settings that a user may change", str(count_fields(import_module("samplers.settings").Settings))
