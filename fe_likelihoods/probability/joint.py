@@ -19,19 +19,9 @@ from .distributions import Distribution, RandomState
 from .inputs import as_points
 from .likelihood import FELikelihood
 from .parameters import Parameter, channels_of_deviations
+from .simulator import COUNTS, reported
 
 __all__ = ["JointLikelihood"]
-
-_COUNTS = (  # of the report that are added
-    "simulations",
-    "verifications",
-    "unverified",
-    "cache_hits",
-    "disk_hits",
-    "failure_count",
-    "transient_failures",
-    "seconds",
-)
 
 
 class JointLikelihood:
@@ -214,17 +204,14 @@ class JointLikelihood:
             raise ValueError(f"the samples have no {', '.join(missing)}, which the likelihood {name!r} needs")
         return {each: np.asarray(samples[self._joint_name(name, each)]) for each in wanted}
 
-    # simulations of all likelihoods ------------------------------------------------------------------------------
-
-    @property
-    def simulations(self) -> int:
-        """Simulations run by this object in this process, of all models."""
-        return sum(likelihood.simulations for likelihood in self.likelihoods.values())
+    def __getattr__(self, name: str) -> Any:
+        """An entry of the report, such as ``simulations``."""
+        return reported(self, name)
 
     def report(self) -> dict:
         """Summary of all simulations, and under ``"likelihoods"`` that of each likelihood, see `Posterior.report`."""
         parts = {key: likelihood.report() for key, likelihood in self.likelihoods.items()}
-        total = {name: sum(part[name] for part in parts.values()) for name in _COUNTS}
+        total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
         total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
         total["failure_reasons"] = dict(sum((Counter(part["failure_reasons"]) for part in parts.values()), Counter()))
         return total | {"likelihoods": parts}

@@ -31,7 +31,7 @@ from .distributions import Distribution, RandomState, uniform_numbers
 from .inputs import as_points, check_model, check_noise, complete_repr, match_measurements
 from .multivariate import as_distribution
 from .parameters import Parameter, describe_parameters
-from .simulator import Simulator
+from .simulator import Simulator, reported
 
 __all__ = ["FELikelihood"]
 
@@ -92,6 +92,8 @@ class FELikelihood:
         Runs, counts and caches the simulations.
     n_samples : int or (n_channels,) ndarray
         Number of samples that are compared, in each channel if these differ.
+    simulations, cache_hits, disk_hits, failures, ...
+        The entries of `report`.
     shortened : list of FELikelihood
         Likelihoods of first parts of the measurements, see `first`.
 
@@ -167,10 +169,9 @@ class FELikelihood:
         """What responses are compared with: values (n_channels, n_steps), or a `Comparison` if samples are missing."""
         return self.simulator.measured
 
-    @property
-    def simulations(self) -> int:
-        """Number of simulations that this object has run in this process."""
-        return self.simulator.simulations
+    def __getattr__(self, name: str) -> Any:
+        """An entry of the report, such as ``simulations`` or ``failures``."""
+        return reported(self, name)
 
     @property
     def fingerprint(self) -> str:

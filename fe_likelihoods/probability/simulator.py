@@ -43,10 +43,28 @@ from .inputs import as_rows, check_statistic, name_of_statistic
 from .known_simulations import KnownSimulations, Requested, most_responses
 from .running_simulations import RunningRequests, RunningSimulation, Simulated, take_all
 
-__all__ = ["Simulator"]
+__all__ = ["COUNTS", "Simulator", "reported"]
+
+COUNTS = (  # numbers of the report, which are added for several simulators
+    "simulations",
+    "verifications",
+    "unverified",
+    "cache_hits",
+    "disk_hits",
+    "failure_count",
+    "transient_failures",
+    "seconds",
+)
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
+
+
+def reported(likelihood: Any, name: str) -> Any:
+    """An entry of the report of a likelihood that is read as an attribute; AttributeError for any other name."""
+    if name not in (*COUNTS, "failures", "failure_reasons"):
+        raise AttributeError(f"{type(likelihood).__name__!r} object has no attribute {name!r}")
+    return likelihood.report()[name]
 
 
 class _Pool:
