@@ -1,4 +1,4 @@
-"""Base classes of the models of this package.
+"""Base classes for the models of this package.
 
 `StructuralModel` checks the shape of the parameters and plots the response. `BuiltInModel` adds what the built-in
 structures share: parameters that are multiples of nominal values, and a fingerprint computed from the arguments. Models
@@ -57,13 +57,12 @@ class History:
 
 
 class StructuralModel:
-    """Base class of all models of this package; a subclass defines `_respond`.
+    """Base class for all models of this package; a subclass defines `_respond`.
 
     Attributes
     ----------
     path_dependent : bool
-        Whether the response to an excitation depends on earlier ones. False for linear structures, whose free vibration
-        decays.
+        Whether a response depends on earlier excitations. False for linear structures, whose free vibration decays.
     """
 
     parameter_names: tuple[str, ...]
@@ -105,7 +104,7 @@ class StructuralModel:
 
 
 class BuiltInModel(StructuralModel):
-    """Base class of frozen dataclasses that describe a structure with nominal values.
+    """Base class for frozen dataclasses that describe a structure with nominal values.
 
     A subclass has the field `parameters` and the property `nominal`.
     """
@@ -117,7 +116,7 @@ class BuiltInModel(StructuralModel):
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the elements of theta, which are multiples of the values in `nominal`."""
+        """Names of the elements in theta, which are multiples of the values in `nominal`."""
         return self.parameters
 
     @property
@@ -132,7 +131,7 @@ class BuiltInModel(StructuralModel):
 
     @property
     def fingerprint(self) -> str:
-        """Digest of everything that is declared: arguments and excitation, not the code of this library."""
+        """Digest of the declared arguments and the excitation; the code of this library is not part of it."""
         parts = [type(self).__name__, repr([channel.name for channel in self.channels])]
         for field in fields(self):
             if field.name not in self._display_fields:
@@ -153,7 +152,7 @@ class BuiltInModel(StructuralModel):
 
 
 def remark_on_range(model: BuiltInModel, text: str) -> None:
-    """Log the first warning about simulations of a model beyond the range of its laws; "" forbids further ones."""
+    """Log the first warning about a model beyond the range of its laws; an empty text forbids further warnings."""
     if model not in _REMARKS:
         _REMARKS[model] = text
         if text:

@@ -1,13 +1,13 @@
 """Geometry of a circular reinforced-concrete section: fibers, confinement of the core, and Gauss-Lobatto points.
 
-The default mesh consists of strips of equal height. The part of a strip inside the hoops is a core fiber, the rest is a
-cover fiber. Each fiber is at its radius of gyration about the axis of bending, y = sqrt(I/A), so that area and second
-moment of area of the section are exact for any number of strips. Circular patches (rings and wedges), the usual mesh,
-are also available, but integrate much less accurately: with 20 wedges the error of the acceleration of the tested
-column is 10 to 18 %, with 40 strips 0.6 % (``docs/theory/fiber_section.rst``).
+The default mesh consists of strips with equal heights. The part of a strip inside the hoops is a core fiber, the rest
+is a cover fiber. Each fiber is at its radius of gyration about the axis of bending, y = sqrt(I/A), so that the
+section's area and second moment of area are exact for any number of strips. Circular patches (rings and wedges), the
+usual mesh, are also available, but integrate much less accurately: the acceleration of the tested column has an error
+of 10 to 18 % with 20 wedges, and of 0.6 % with 40 strips (``docs/theory/fiber_section.rst``).
 
 Confinement follows Mander et al. (1988): effective lateral pressure of circular hoops or spirals, then strength and
-strain at the peak. The ultimate strain is the approximation of the energy balance by Priestley et al. (1996).
+strain at the peak. The ultimate strain follows from the approximate energy balance by Priestley et al. (1996).
 
 References
 ----------
@@ -38,7 +38,7 @@ def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def circular_strips(radius: float, core_radius: float, n_strips: int) -> tuple[np.ndarray, np.ndarray]:
-    """Make core and cover fibers from strips of equal height.
+    """Make core and cover fibers from strips with equal heights.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Confinement(NamedTuple):
     strength_ratio : float
         Confined strength divided by the unconfined strength, fcc/fc.
     strain_ratio : float
-        Strain at the confined strength divided by that at the unconfined strength, eps_cc/eps_c0.
+        Strain at the confined strength divided by the strain at the unconfined strength, eps_cc/eps_c0.
     ultimate_strain : float
         Compressive strain at the fracture of the hoops.
     """
@@ -176,7 +176,7 @@ def mander_confinement(
     fyh, ultimate_hoop_strain : float
         Yield strength [Pa] and strain at fracture of the hoops.
     spiral : bool
-        Whether the reinforcement is a spiral, for which the arching reduction enters once, or hoops (squared).
+        Whether the reinforcement is a spiral, for which the arching reduction enters once; for hoops it is squared.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Stiffness and damping that depend on the amplitude of the response: the equivalent-linear method.
 
-A structure is linear within one motion, with the stiffness and the damping that belong to the level of its response in
-this motion (Idriss & Seed 1968; Schnabel, Lysmer & Seed 1972, for soil). With the level ``l`` and a reference level
+A structure is linear within one motion, with the stiffness and the damping that belong to its response level in this
+motion (Idriss & Seed 1968; Schnabel, Lysmer & Seed 1972, for soil). With the level ``l`` and a reference level
 ``l_0``, ::
 
     K(l) = K_0 (l / l_0)^-p,        zeta(l) = zeta_0 (l / l_0)^q,        l = level of the response with K(l) and zeta(l)
@@ -42,14 +42,14 @@ _OWN = ("softening", "damping_growth")
 
 
 class Settled(NamedTuple):
-    """A structure whose properties belong to the level of its own response.
+    """A structure whose stiffness and damping agree with its response level.
 
     Attributes
     ----------
     level : float
         Energy-weighted root mean square of the relative displacement [m]; 0 under a motion of zeros.
     stiffness_factor, damping_factor : float
-        Stiffness and damping ratios as multiples of those at the reference level.
+        Stiffness and damping ratios as multiples of their values at the reference level.
     system : LinearSystem
         The matrices.
     """
@@ -62,11 +62,11 @@ class Settled(NamedTuple):
 
 @dataclass(frozen=True)
 class EquivalentLinear:
-    """Parts of a `LinearStructure` with stiffness and damping that depend on the level of the response.
+    """Parts of a `LinearStructure` with stiffness and damping that depend on the response level.
 
-    The parameters are those of `parts`, whose frequencies, stiffnesses and damping ratios are those at the reference
-    level, and two more: ``softening`` p, by which all stiffnesses are multiplied by (level / reference)^-p, and
-    ``damping_growth`` q, by which all damping ratios are multiplied by (level / reference)^q. With p = q = 0 the
+    The parameters are the parameters of `parts`, whose frequencies, stiffnesses and damping ratios hold at the
+    reference level, and two more: ``softening`` p, by which all stiffnesses are multiplied by (level / reference)^-p,
+    and ``damping_growth`` q, by which all damping ratios are multiplied by (level / reference)^q. With p = q = 0 the
     structure is linear, with the same response to the last bit.
 
     Parameters
@@ -74,11 +74,11 @@ class EquivalentLinear:
     parts : BridgeDeck, ShearFrame, or an object with the interface `Parts`
         The structure at the reference level.
     reference : float
-        Reference level [m]. A value in the middle of the levels of the measured events keeps the other parameters
-        almost independent of `softening` and `damping_growth`.
+        Reference level [m]. A value in the middle of the measured events' levels keeps the other parameters almost
+        independent of `softening` and `damping_growth`.
     channel : str, optional
-        Channel whose displacement relative to the (quasi-static) motion of the supports is the level. Needed if there
-        are several; for a building, that of the roof.
+        Channel whose displacement relative to the (quasi-static) motion of the supports is the level. Required if there
+        are several channels; for a building, use the roof channel.
 
     Raises
     ------
@@ -87,9 +87,9 @@ class EquivalentLinear:
 
     Notes
     -----
-    One level holds for the whole record: the properties do not change within a motion, and not from one motion to the
-    next except by its own level. The structure has no memory and no residual displacement. Where all fixed points of a
-    motion matter, see `fixed_points`.
+    One level holds for the whole record: the properties do not change within a motion, and differ between motions only
+    through their levels. The structure has no memory and no residual displacement. `fixed_points` finds all levels that
+    agree with a motion.
 
     Examples
     --------
@@ -119,7 +119,7 @@ class EquivalentLinear:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Those of the parts, ``softening`` and ``damping_growth``."""
+        """Parameters of the parts, then ``softening`` and ``damping_growth``."""
         return (*self.parts.parameter_names, *_OWN)
 
     @property
@@ -133,14 +133,14 @@ class EquivalentLinear:
         return self.parts.channel_names
 
     def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Compute the matrices at the reference level; errors as those of the parts."""
+        """Compute the matrices at the reference level; raises the errors of the parts."""
         return self.parts.assemble(np.asarray(theta, dtype=float)[:-2])
 
     def settle(self, theta: np.ndarray, support_acceleration: np.ndarray, dt: float) -> Settled:
-        """Find the level whose stiffness and damping give a response of this level.
+        """Find the level whose stiffness and damping give a response with this level.
 
-        The search goes from the reference level towards the level of the response, in steps of a factor of 1.65, until
-        that is passed, and then finds the fixed point in between to a relative error of 1e-13 (Brent's method).
+        The search goes from the reference level towards the response level, each time by a factor of 1.65, until it
+        passes the response level. Brent's method then finds the fixed point in between to a relative error of 1e-13.
 
         Parameters
         ----------
@@ -181,9 +181,9 @@ class EquivalentLinear:
     def fixed_points(self, theta: np.ndarray, support_acceleration: np.ndarray, dt: float) -> np.ndarray:
         """Find all levels that agree with their own properties, from 1/1000 to 1000 times the reference level.
 
-        There are several where the response grows faster than the level while the frequency moves through a peak of the
-        response spectrum. `settle` uses the first one in its direction of search, and the likelihood may jump where it
-        disappears. Two fixed points within a factor of 1.65 of each other may be missed.
+        There are several levels where the response grows faster than the level while the frequency moves through a peak
+        of the response spectrum. `settle` uses the first one in its direction of search, and the likelihood may jump
+        where it disappears. Two fixed points within a factor of 1.65 of each other may be missed.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class EquivalentLinear:
     def _excess(
         self, theta: np.ndarray, support_acceleration: np.ndarray, dt: float
     ) -> tuple[LinearSystem, Callable[[float], float]]:
-        """The structure at the reference level, and ln(level of the response / level) over ln(level / reference)."""
+        """The structure at the reference level, and ln(response level / level) over ln(level / reference)."""
         theta = np.asarray(theta, dtype=float)
         reference = self.assemble(theta)
         names = self.parts.channel_names

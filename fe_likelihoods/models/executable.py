@@ -1,7 +1,7 @@
 """Model defined by an external program: it reads input files that contain the parameters, and writes an output file.
 
-Each run has its own temporary folder. A program that hangs, crashes, writes too much or returns an unusable response is
-a failed simulation, with a reason and the last lines of its standard error. The folders of failed runs can be kept.
+Each run has a temporary folder. A program that hangs, crashes, writes too much or returns an unusable response is a
+failed simulation, with a reason and the last lines of its standard error. The folders of failed runs can be kept.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ class ExecutableModel(UserModel):
     parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
     the run, without a shell and without standard input.
 
-    After the program has ended or was stopped, everything that it has started is killed: on Linux also processes in a
-    session of their own with another environment, on other systems its process group. Not found are processes that a
-    service starts for it, such as a container or a job of a queue, and those of a program that kills its supervisor.
+    After the program has ended or was stopped, all processes that it started are killed: on Linux also processes in
+    another session with another environment, on other systems the process group. Containers and queued jobs that a
+    service starts for the program are not found, nor are the processes of a program that kills its supervisor.
 
     Parameters
     ----------
     command : sequence of str
         Program and its arguments.
     templates : mapping of str to str or Path
-        Input files: name in the folder of the run, and text with placeholders, or a Path of a file that contains it.
+        Input files: name in the run folder, and a text with placeholders, or the Path of a file that contains the text.
     output : str or callable
-        Name of the file in the folder of the run that contains the response [SI]: one column per channel, separated by
-        blanks or commas; text after # is ignored. Or a function of the folder (a Path) that returns the response
+        Name of the file in the run folder that contains the response [SI]: one column per channel, separated by blanks
+        or commas; text after # is ignored. Or a function that takes the folder (a Path) and returns the response
         (n_channels, n_steps).
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
@@ -64,43 +64,43 @@ class ExecutableModel(UserModel):
     dt : float, optional
         Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of samples of the response. With a record it follows from `dt`.
+        Number of response samples. With a record it follows from `dt`.
     time_limit : float
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     columns : sequence of int, optional
         Columns of the output file that are the channels, counted from 0. By default the file has one column per channel
         and no others.
     record : Record, optional
-        Excitation. Its samples [m/s²] are written into the file `record_file` of the folder of the run, one per line,
-        and ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments. The model can then be
-        simulated under other records (`with_record`, ``propagate(..., record=)``, `fragility`).
+        Excitation. Its samples [m/s²] are written into the file `record_file` in the run folder, one per line, and
+        ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments. The model can then be simulated
+        under other records (`with_record`, ``propagate(..., record=)``, `fragility`).
     record_file : str
         Name of this file.
     path_dependent : bool
         Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
         another record then need no `from_state`.
     files : mapping of str to Path, optional
-        Further files, copied into the folder of the run under the given names.
+        Further files, copied into the run folder under the given names.
     keep_failures : path, optional
         Folder into which the folders of failed runs are moved, each with a file ``reason.txt``.
     max_kept : int
         Largest number of folders that are kept there.
     max_output : int
-        Largest amount that a run may write into its folder and to standard output and error [bytes].
+        Largest amount that a run may write into the run folder and to standard output and error [bytes].
     env : mapping of str to str, optional
         All environment variables of the program; they are part of the fingerprint. By default the program has the
-        variables of this process at each run, which are not part of the fingerprint: name those that matter in
+        variables of this process at each run, which are not part of the fingerprint: name the variables that matter in
         `depends_on`, since a cache compares only some of its rows with new runs.
     hash_executable : bool
         Whether the label contains the content of the program, and of files that an argument names by an absolute
         path, alone or as in ``--script=/path``. For large installations use `version` instead.
     written : sequence of Path, optional
-        Files among these that the program itself writes, such as a log; the label does not contain them.
+        Files among `files` that the program itself writes, such as a log; the label does not contain them.
     version : str, optional
         Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
         files do not show. If `output` is a function, it replaces the code of the function.
     depends_on : sequence, optional
-        Files and values that the response depends on besides, such as a library or a material table that the program
+        Other files and values that the response depends on, such as a library or a material table that the program
         reads; see `FunctionModel`.
 
     Raises
@@ -190,7 +190,7 @@ class ExecutableModel(UserModel):
         self.fingerprint = self._digest(output, self.columns, self.version, *stated)
 
     def code_parts(self) -> dict[str, Any]:
-        """Program, input files and code of the user as they are now, for the label of stored simulations."""
+        """Program, input files and user code as they are now, for the label of stored simulations."""
         contents = {f"file {path.name}": content_digest(path) for path in self._named}
         copied = {f"copied {name}": content_digest(path) for name, path in self.files.items()}
         templates = {f"template {name}": text for name, text in self.templates.items()}

@@ -1,9 +1,9 @@
-"""Base classes that validate inputs and outputs of external models: code of the user, programs, assembled matrices.
+"""Base classes that validate inputs and outputs of external models: user code, programs, assembled matrices.
 
 `UserModel` adds an excitation, a `Record` that the external code receives, so that the model works under other records.
 
-The reason of a failed simulation ends in its duration, so that a report of failures shows whether runs fail in their
-first second or after an hour.
+The reason of a failed simulation ends with the simulation's duration, so that a report of failures shows whether runs
+fail in their first second or after an hour.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class ExternalModel(StructuralModel):
     dt : float
         Time step of the response [s].
     n_steps : int
-        Number of samples of the response.
+        Number of response samples.
     depends_on : sequence, optional
-        What the response depends on besides the code, as part of the fingerprint: a Path stands for the content of a
-        file or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
+        Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
+        or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
 
     Raises
     ------
@@ -118,7 +118,7 @@ class ExternalModel(StructuralModel):
         ------
         SimulationFailed
             If the external code raises an exception, or its response has a wrong shape, is complex or is not finite.
-            The reason ends in the duration of the simulation. It is a `TransientReason` if the cause is not the model
+            The reason ends with the duration of the simulation. It is a `TransientReason` if the cause is not the model
             (see `fe_likelihoods.simulation.faults`).
         ValueError
             If `theta` has another shape.
@@ -151,7 +151,7 @@ class ExternalModel(StructuralModel):
 
 
 class UserModel(ExternalModel):
-    """Model of the user's own code, which receives a `Record` if one is given.
+    """Model made of user code, which receives a `Record` if one is given.
 
     A subclass defines `_respond`, and `_prepare`, which is called after each change of the record.
 
@@ -162,12 +162,12 @@ class UserModel(ExternalModel):
     dt : float or None
         Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
     n_steps : int or None
-        Number of samples of the response. With a record it follows from `dt`.
+        Number of response samples. With a record it follows from `dt`.
     record : Record or None
         Excitation that the code receives. The response has a sample at the first sample of the record, and then every
         `dt` until its end.
     path_dependent : bool
-        Whether the response to an excitation depends on earlier ones; False for a linear structure.
+        Whether the response to an excitation depends on earlier excitations; False for a linear structure.
 
     Raises
     ------
@@ -196,8 +196,8 @@ class UserModel(ExternalModel):
         Parameters
         ----------
         record : Record
-            The excitation. If the step of the response is a multiple of that of the present record, it is the same
-            multiple of the new one.
+            The excitation. If the response step is a multiple of the present record's step, it is the same multiple of
+            the new record's step.
 
         Returns
         -------
@@ -224,10 +224,10 @@ class UserModel(ExternalModel):
         return other
 
     def followed_by(self, record: Record, rest: float = 10.0) -> UserModel:
-        """Return the same model under its own record, a pause of `rest` [s] and a further record.
+        """Return the same model under its present record, a pause of `rest` [s] and a further record.
 
-        The pause is lengthened to whole steps of the response, which ends with the samples of ``with_record(record)``.
-        Errors are those of `with_record` and of `Record.followed_by`.
+        The pause is lengthened to a whole number of response steps. The response ends with the samples of
+        ``with_record(record)``. Errors are as for `with_record` and `Record.followed_by`.
         """
         self.with_record(record)
         n_zeros = rest_samples(rest, self.record.dt)
@@ -245,7 +245,7 @@ class UserModel(ExternalModel):
 
 
 def _sampling(kind: str, dt: float | None, n_steps: int | None, record: Record | None) -> tuple[Any, Any]:
-    """Step and number of samples of a response; raise ValueError if they are missing or do not fit the record."""
+    """Step and length of a response; raise ValueError if they are missing or do not fit the record."""
     if record is None:
         if dt is None or n_steps is None:
             raise ValueError(f"{kind}: give dt and n_steps of the response, or record=, which determines them")

@@ -47,22 +47,22 @@ class FunctionModel(UserModel):
     dt : float, optional
         Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of samples of the response. With a record it follows from `dt`.
+        Number of response samples. With a record it follows from `dt`.
     record : Record, optional
         Excitation, which the function receives as its second argument. The model can then be simulated under other
         records (`with_record`, ``propagate(..., record=)``, `fragility`).
     path_dependent : bool
-        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
-        another record then need no `from_state`.
+        Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
+        under another record then need no `from_state`.
     version : str, optional
-        Text in the fingerprint; with another text, no simulation that is stored in a cache is used. Without it, a
-        change of the code, or of anything that it uses or opens, is noticed by the label of the model
+        Text in the fingerprint; cached simulations are used only if their text is the same. Without it, a change of the
+        code, or of anything that it uses or opens, is noticed by the label of the model
         (`fe_likelihoods.simulation.label`), and stored simulations are used where some of them agree with new ones.
     depends_on : sequence, optional
-        What the response depends on besides the code, as part of the fingerprint: a Path stands for the content of a
-        file or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
+        Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
+        or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
     isolated : bool
-        Run the function in a separate process. A setting below implies it.
+        Run the function in a separate process. Each setting below implies it.
     time_limit : float, optional
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
@@ -136,7 +136,7 @@ class FunctionModel(UserModel):
             )
 
     def code_parts(self) -> dict[str, Any]:
-        """Code of the user, for the label of stored simulations."""
+        """User code, for the label of stored simulations."""
         return {"function": self.function}
 
     def _respond(self, theta: np.ndarray) -> Any:

@@ -7,7 +7,7 @@ except friction and the higher terms of the rubber is linear and is integrated e
 (`fe_likelihoods.kernels.isolated_bridge`).
 
 The equations, the laws of the devices and the channels are in ``docs/theory/isolated_bridge.rst``. Most nominal values
-are assumed, so the results are those of a bridge *like* the tested one.
+are assumed, so the results describe a bridge *like* the tested one.
 
 References
 ----------
@@ -77,8 +77,8 @@ class BridgeHistory(History):
     values : ndarray[n_rows, n_steps]
         The histories.
     beyond_range : ndarray[2]
-        Largest bearing displacement at each pier, divided by the displacement up to which the law of the rubber holds.
-        Above 1, the rubber device was continued along its tangent.
+        Largest bearing displacement at each pier, divided by the displacement up to which the rubber law holds. Above
+        1, the rubber law was continued along its tangent.
     iterations : float
         Newton iterations per step.
     """
@@ -94,8 +94,8 @@ class IsolatedBridge(ThreadedModel):
     Parameters
     ----------
     record : Record
-        Acceleration of the table, linear between its samples, at the scale of the model: for a quarter-scale model the
-        time of a prototype record is halved.
+        Table acceleration, linear between its samples, at the scale of the model: for a quarter-scale model the time of
+        a prototype record is halved.
     deck_mass : float
         Mass of the deck [kg].
     piers, bearings, dampers : pairs of Pier, Bearing, Damper
@@ -103,13 +103,13 @@ class IsolatedBridge(ThreadedModel):
     rubber : Rubber
         Rubber devices, the same at both piers; they have no parameters in theta.
     outputs : tuple of str, int or None
-        Names of the channels (see the notes), or the number of channels of a measured set: 5 for those of pier 1, 6 for
-        these and ``Ub_2``, 10 for those of both piers. None: all twelve channels that are not means.
+        Names of the channels (see the notes), or the size of a measured set: 5 for the channels of pier 1, 6 for these
+        and ``Ub_2``, 10 for the channels of both piers. None: all twelve channels that are not means.
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (see the notes).
     friction : str
-        "bouc-wen" (regularised, the default), "elastic-plastic" (the law of the sliders in other codes), or "coulomb"
-        (exact stick and slip, with isolator forces that are constant over a step, hence of first order).
+        "bouc-wen" (regularised, the default), "elastic-plastic" (the slider law in other codes), or "coulomb" (exact
+        stick and slip, with isolator forces that are constant over a step, hence of first order).
     step : float or None
         Integration step [s]; it divides the step of the record. None: the longest such step up to 0.25 ms for
         "bouc-wen", 0.05 ms for "elastic-plastic" and 0.025 ms for "coulomb" (`integration_step`; see the notes for the
@@ -119,8 +119,8 @@ class IsolatedBridge(ThreadedModel):
     p_delta : bool
         Whether the piers have the geometric stiffness of the weight they carry.
     vertical : Record or None
-        Vertical acceleration of the table, positive upwards [m/s²], at the samples of the record and linear between
-        them. It multiplies the load on the bearings by 1 + a_v/g, or by zero at the instants at which that is negative.
+        Vertical table acceleration, positive upwards [m/s²], at the samples of the record and linear between them. It
+        multiplies the load on the bearings by 1 + a_v/g, or by zero while this factor is negative.
     gravity : float
         Acceleration of gravity [m/s²].
     tolerance : float
@@ -146,20 +146,20 @@ class IsolatedBridge(ThreadedModel):
     ``coulomb``          0.03 %          0.05 %              0.1 % (0.21 %)   0.11 %
     ===================  ==============  ==================  ===============  ========
 
-    Values in parentheses are those of the accelerations of the piers under the record of 0.04 g, in which the bearings
-    slide by 1 mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick. This instant
-    is found to within one step; a sample in between differs by the jump.
-    With "elastic-plastic", many simulations fail (6 of 60 at -1.1 g, 48 of 60 at -2 g) where a `vertical` acceleration
-    below -g removes the load of a bearing; their log-likelihood is -inf. Use "bouc-wen" or "coulomb" for such records.
+    Values in parentheses are for the pier accelerations under the record of 0.04 g, in which the bearings slide by 1
+    mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick. This instant is found to
+    within one step; a sample in between differs by the jump. With "elastic-plastic", many simulations fail (6 of 60 at
+    -1.1 g, 48 of 60 at -2 g) where a `vertical` acceleration below -g removes the load of a bearing; their
+    log-likelihood is -inf. Use "bouc-wen" or "coulomb" for such records.
 
     The channels of the two piers and of the deck are:
 
     ========================  ================================================================================
     ``Ub_1``, ``Ub_2``        displacement of the bearing [m]
     ``Fb_1``, ``Fb_2``        force of the isolator: friction, rubber and dampers [N]
-    ``drift_1``, ``drift_2``  displacement of the top of the block relative to the table [m]
+    ``drift_1``, ``drift_2``  displacement of the block's top relative to the table [m]
     ``shear_1``, ``shear_2``  elastic shear force of the pier [N]
-    ``acc_p1``, ``acc_p2``    absolute acceleration of the top of the block [m/s²]
+    ``acc_p1``, ``acc_p2``    absolute acceleration of the block's top [m/s²]
     ``Ud``, ``acc_d``         displacement of the deck relative to the table [m], absolute acceleration [m/s²]
     ========================  ================================================================================
 
@@ -168,11 +168,11 @@ class IsolatedBridge(ThreadedModel):
     Each value of theta is a multiple of a nominal value (`nominal`). The parameters of the two piers are:
 
     ======================  ==================================================================
-    ``fmin_1``, ``fmin_2``  coefficient of friction at rest [-]
-    ``df_1``, ``df_2``      increase of the coefficient of friction at high velocity [-]
+    ``fmin_1``, ``fmin_2``  friction coefficient at rest [-]
+    ``df_1``, ``df_2``      increase of the friction coefficient at high velocity [-]
     ``a_1``, ``a_2``        rate of this increase with velocity [s/m]
-    ``Kd_1``, ``Kd_2``      stiffness of the spring of one damper [N/m]
-    ``C0_1``, ``C0_2``      coefficient of the dashpot of one damper [N s/m]
+    ``Kd_1``, ``Kd_2``      spring stiffness of one damper [N/m]
+    ``C0_1``, ``C0_2``      dashpot coefficient of one damper [N s/m]
     ======================  ==================================================================
     """
 
@@ -233,7 +233,7 @@ class IsolatedBridge(ThreadedModel):
 
     @property
     def n_steps(self) -> int:
-        """Number of samples of the response."""
+        """Number of response samples."""
         return (self.record.n_steps - 1) // self.every + 1
 
     @property
@@ -254,7 +254,7 @@ class IsolatedBridge(ThreadedModel):
         )
 
     def with_record(self, record: Record | tuple[Record, Record]) -> IsolatedBridge:
-        """Return the same bridge under another acceleration of the table.
+        """Return the same bridge under another table acceleration.
 
         Parameters
         ----------
@@ -269,20 +269,20 @@ class IsolatedBridge(ThreadedModel):
         return replace(self, record=horizontal, vertical=vertical)
 
     def followed_by(self, record: Record | tuple[Record, Record], rest: float = 10.0) -> IsolatedBridge:
-        """Return the same bridge under its own records, a pause and further accelerations of the table.
+        """Return the same bridge under its present records, a pause and further table accelerations.
 
         Parameters
         ----------
         record : Record or pair of Record
             As for `with_record`.
         rest : float
-            Length of the pause [s], lengthened to whole steps of the response.
+            Length of the pause [s], lengthened to a whole number of response steps.
 
         Returns
         -------
         IsolatedBridge
-            Its response ends with the samples of ``with_record(record)``. Where one of the two excitations has a
-            vertical acceleration, that of the other one is its own or zero.
+            Its response ends with the samples of ``with_record(record)``. If only one of the two excitations has a
+            vertical acceleration, the vertical acceleration is zero during the other.
 
         Raises
         ------
@@ -309,7 +309,7 @@ class IsolatedBridge(ThreadedModel):
         Returns
         -------
         IsolatedBridge
-            Its response is the first part of the response of this model.
+            Its response is the first part of this model's response.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class IsolatedBridge(ThreadedModel):
     def history(self, theta: np.ndarray) -> BridgeHistory:
         """Simulate and return states, hysteretic variables and all channels.
 
-        Parameters and errors are those of `simulate`.
+        Parameters and errors as for `simulate`.
         """
         prepared = self._prepared
         run = run_bridge(self, prepared, check_theta(theta, self.parameters), None)
@@ -342,7 +342,7 @@ class IsolatedBridge(ThreadedModel):
         theta : ndarray[n_parameters]
             As for `simulate`.
         state : ndarray, optional
-            The state that this method returned for the same theta, and the same bridge under the beginning of its
+            State that this method returned for the same theta and the same bridge, under the first part of its
             excitation. Default: the bridge at rest.
 
         Returns
@@ -356,7 +356,7 @@ class IsolatedBridge(ThreadedModel):
         SimulationFailed
             As for `simulate`.
         ValueError
-            If `state` is not one of this bridge.
+            If `state` is not a state of this bridge.
         """
         theta = check_theta(theta, self.parameters)
         run = run_bridge(self, self._prepared, theta, state)
@@ -384,7 +384,7 @@ class IsolatedBridge(ThreadedModel):
         return self._outputs_of(run_bridge(self, self._prepared, theta, None), theta)
 
     def _outputs_of(self, run: BridgeRun, theta: np.ndarray) -> np.ndarray:
-        """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber."""
+        """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber law."""
         prepared = self._prepared
         largest = np.abs(prepared.linear.kinematics @ run.values[:5]).max()
         if largest > prepared.rubber_range:

@@ -1,7 +1,7 @@
 """Channels of the isolated bridge: their names, the measured sets, and how they follow from the state.
 
-Channels of pier i are the bearing displacement ``Ub_i``, the isolator force ``Fb_i``, the drift of the top of the block
-``drift_i``, the elastic shear force of the pier ``shear_i`` and the absolute acceleration of the top of the block
+Channels of pier i are the bearing displacement ``Ub_i``, the isolator force ``Fb_i``, the drift of the block's top
+``drift_i``, the elastic shear force of the pier ``shear_i`` and the absolute acceleration of the block's top
 ``acc_pi``. Channels of the deck are its displacement ``Ud`` and its absolute acceleration ``acc_d``. ``mean_Ub``,
 ``mean_Fb``, ``mean_drift``, ``mean_shear`` and ``mean_acc_p`` are means over the two piers; they do not identify which
 pier is which.
@@ -32,7 +32,7 @@ _OF_A_PIER = {
 
 
 def _at_pier(name: str, i: int) -> str:
-    """Name of a channel of pier `i`."""
+    """Name of a channel at pier `i`."""
     return f"{name}{i}" if name == "acc_p" else f"{name}_{i}"
 
 
@@ -49,11 +49,11 @@ ALL_CHANNELS = tuple(name for name in CHANNELS if not name.startswith("mean_"))
 
 _PIER_1, _PIER_2 = (tuple(_at_pier(name, i) for name in _OF_A_PIER) for i in (1, 2))
 CHANNEL_SETS = {5: _PIER_1, 6: (*_PIER_1, "Ub_2"), 10: _PIER_1 + _PIER_2}
-"""Sets of measured channels: five of pier 1, these with the bearing displacement of pier 2, and ten of both piers."""
+"""Sets of measured channels: five at pier 1, these with the bearing displacement at pier 2, and ten at both piers."""
 
 
 def channel_matrix(matrices: BridgeMatrices, piers: Sequence[Pier], names: Sequence[str]) -> np.ndarray:
-    """Matrix that gives channels from the state, the forces F of the isolators and the acceleration of the table.
+    """Matrix that gives the channels from the state, the isolator forces F and the table acceleration.
 
     Accelerations follow from the equations of motion.
 
@@ -69,7 +69,7 @@ def channel_matrix(matrices: BridgeMatrices, piers: Sequence[Pier], names: Seque
     Returns
     -------
     ndarray[n_channels, 15]
-        The columns are 5 displacements, 5 velocities, 2 damper forces, 2 forces F and the acceleration of the table.
+        The columns are 5 displacements, 5 velocities, 2 damper forces, 2 isolator forces F and the table acceleration.
     """
     mass, damping, stiffness, b = matrices.mass, matrices.damping, matrices.stiffness, matrices.kinematics
     q, ground = np.eye(15)[:5], np.eye(15)[14]

@@ -1,6 +1,6 @@
 """Parts of the isolated bridge: piers, bearings, dampers and rubber devices. Arguments are checked when a part is made.
 
-The defaults are those of the quarter-scale bridge of Tsopelas et al., NCEER 94-0002 (1994), as far as it could be
+The defaults describe the quarter-scale bridge of Tsopelas et al., NCEER 94-0002 (1994), as far as it could be
 reconstructed. Most values are **assumed**, or taken from related reports without verification;
 ``docs/theory/isolated_bridge.rst`` says which.
 """
@@ -71,7 +71,7 @@ class Pier:
         return 2.0 * self.damping_ratio / lowest * self.stiffness
 
     def geometric_stiffness(self, load: float, gravity: float) -> np.ndarray:
-        """Geometric stiffness (2, 2) to be added, for the `load` [N] on the block and the weight of the block itself.
+        """Geometric stiffness (2, 2) to be added, for the `load` [N] on the block and the block weight.
 
         The slider is on the block, and the sliding plate on the deck.
         """
@@ -83,14 +83,14 @@ class Pier:
 
 @dataclass(frozen=True)
 class Bearing:
-    """Flat sliding bearing with the coefficient of friction ``mu(v) = f_min + df (1 - exp(-a |v|))``.
+    """Flat sliding bearing with the friction coefficient ``mu(v) = f_min + df (1 - exp(-a |v|))``.
 
     Attributes
     ----------
     load : float
         Weight on the bearing [N].
     f_min, df : float
-        Coefficient of friction at rest, and its increase at high velocity.
+        Friction coefficient at rest, and its increase at high velocity.
     a : float
         Rate of the increase with velocity [s/m].
     yield_displacement : float
@@ -121,9 +121,9 @@ class Damper:
     Attributes
     ----------
     stiffness : float
-        Stiffness of the spring of one damper [N/m].
+        Spring stiffness of one damper [N/m].
     viscosity : float
-        Coefficient of the dashpot of one damper [N s/m].
+        Dashpot coefficient of one damper [N s/m].
     count : int
         Number of dampers at the pier.
     """
@@ -146,8 +146,8 @@ class Rubber:
     skeleton : tuple of 6 floats
         Coefficients A_1, A_3, ..., A_11 [N] of the skeleton curve, sum of A_n s^n.
     half_loop : tuple of 3 floats
-        Coefficients B_0, B_2, B_4 [N] of half the difference between the branches of loading and unloading, sum of
-        B_m s^m.
+        Coefficients B_0, B_2, B_4 [N] of half the difference between the loading and unloading branches, sum of B_m
+        s^m.
     scale : float
         Displacement at s = 1 [m].
     limit : float

@@ -33,8 +33,8 @@ class PreparedBridge(NamedTuple):
     to_channels: csr_array
     weights: np.ndarray  # (n_steps, 2) load on the bearings at the samples of the record, negative in uplift [N]
     law: RubberLaw
-    tolerance: float  # of a correction of the isolator forces [N]
-    rubber_range: float  # bearing displacement up to which the law of the rubber holds [m]
+    tolerance: float  # of a correction to the isolator forces [N]
+    rubber_range: float  # bearing displacement up to which the rubber law holds [m]
 
 
 class BridgeRun(NamedTuple):
@@ -45,7 +45,7 @@ class BridgeRun(NamedTuple):
     values : ndarray[16, n]
         State, isolator forces F and Z at the samples of the record, up to the last sample of the response.
     drivers : ndarray[15, n]
-        State, isolator forces F and acceleration of the table, of which the channels are linear.
+        State, isolator forces F and table acceleration; the channels are linear combinations of these rows.
     iterations : float
         Newton iterations per step.
     state : ndarray
@@ -83,8 +83,8 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     prepared : PreparedBridge
     theta : ndarray[n_parameters]
     state : ndarray or None
-        State at a sample of the response, from which the simulation goes on; the results begin with the next sample of
-        the response. None: from rest.
+        State at a response sample, from which the simulation goes on; the results begin with the next response sample.
+        None: from rest.
 
     Returns
     -------

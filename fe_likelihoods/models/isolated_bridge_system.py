@@ -30,7 +30,7 @@ class BridgeMatrices(NamedTuple):
     Attributes
     ----------
     mass, damping, stiffness : ndarray[5, 5]
-        Matrices of the degrees of freedom q [kg, N s/m, N/m and products with m].
+        Matrices for the degrees of freedom q [kg, N s/m, N/m and products with m].
     kinematics : ndarray[2, 5]
         B: bearing displacements from q, deck minus top of the block.
     rubber_stiffness : float
@@ -85,7 +85,7 @@ class BridgeStateSpace(NamedTuple):
 
     @classmethod
     def of(cls, matrices: BridgeMatrices) -> BridgeStateSpace:
-        """State-space form of the matrices of deck and piers."""
+        """State-space form of the deck and pier matrices."""
         b = matrices.kinematics
         inverse = np.linalg.inv(matrices.mass)
         a, inputs = np.zeros((N_STATES, N_STATES)), np.zeros((N_STATES, 3))

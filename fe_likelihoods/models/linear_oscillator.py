@@ -91,7 +91,7 @@ class LinearOscillator(StructuralModel):
         Returns
         -------
         LinearOscillator
-            Its response is the first part of the response of this model.
+            Its response is the first part of this model's response.
 
         Raises
         ------

@@ -1,16 +1,16 @@
 """Linear structures on several moving supports, solved exactly.
 
-Slowly growing support displacements g cause displacements R g of the degrees of freedom, with the influence matrix R.
-The total displacements are x = R g + u, and the dynamic part u satisfies ::
+Slowly growing support displacements g displace the degrees of freedom by R g, with the influence matrix R. The total
+displacements are x = R g + u, and the dynamic part u satisfies ::
 
     M u'' + C u' + K u = -M R a(t),        x'' = u'' + R a = -M^-1 (C u' + K u)
 
-with the accelerations a of the supports (Chopra 2012, section 9.7; damping forces of the quasi-static part are
-neglected, as usual). C need not be diagonalised by the modes of M and K. In the state (u, u') the equations are of
-first order and uncouple in the complex modes, q' = lam q + f(t). With accelerations that are linear between their
-samples, each mode has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
+with the support accelerations a (Chopra 2012, section 9.7; damping forces of the quasi-static part are neglected, as
+usual). C need not be diagonalised by the modes of M and K. In the state (u, u') the equations are of first order and
+uncouple in the complex modes, q' = lam q + f(t). With accelerations that are linear between their samples, each mode
+has a closed-form solution without time-stepping error (``docs/theory/time_integration.rst``).
 
-`LinearStructure` is a model of any object that computes these matrices from parameters: a bridge deck and a frame
+`LinearStructure` makes a model from any object that computes these matrices from parameters: a bridge deck and a frame
 (`fe_likelihoods.models.linear_structure_parts`), tall buildings (`fe_likelihoods.models.tall_buildings`), or one of
 these with stiffness and damping that depend on the amplitude (`fe_likelihoods.models.equivalent_linear`).
 
@@ -105,14 +105,14 @@ class LinearStructure(ExternalModel):
         self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports])
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
-        """Return the same structure under other accelerations of its supports; errors as for a new one.
+        """Return the same structure under other support accelerations; errors as for a new structure.
 
         The lead is kept, `until` is not.
         """
         return type(self)(self.parts, record, self.unit, self.lead)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
-        """Return the same structure under its own motions, a pause of `rest` [s] and further motions of its supports.
+        """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
 
         Its response ends with the samples of ``with_record(record)``.
 
@@ -143,7 +143,7 @@ class LinearStructure(ExternalModel):
         Returns
         -------
         LinearStructure
-            Its response is the first part of the response of this model.
+            Its response is the first part of this model's response.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class LinearStructure(ExternalModel):
         """
         last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
         until = last * self.dt
-        if isinstance(self.parts, EquivalentLinear):  # the level is that of the whole record
+        if isinstance(self.parts, EquivalentLinear):  # the level belongs to the whole record
             return type(self)(self.parts, self.supports, self.unit, self.lead, until)
         return self.with_record([support.trim(0.0, until) for support in self.supports])
 

@@ -21,15 +21,15 @@ __all__ = ["BridgeDeck", "ShearFrame"]
 class BridgeDeck:
     """Transverse vibration of a two-span deck in one shape, on a column in the middle and on its two ends.
 
-    With the acceleration a_c of the base of the column and a_1, a_2 of the ends, the absolute acceleration y of the
-    middle of the deck is ::
+    With the accelerations a_c of the column base and a_1, a_2 of the deck ends, the middle of the deck has the absolute
+    acceleration y ::
 
         x'' + 2 zeta omega x' + omega^2 x = -[w (a_1 + a_2) / 2 + (1 - w) a_c],    y = -2 zeta omega x' - omega^2 x
 
     w is the share of the ends in the stiffness that supports the middle: the stiffness of the ends through the deck,
-    divided by the sum of this stiffness and that of the column. A point in the first span has the acceleration
-    (1 - s) a_1 + s y, a point in the second span (1 - s) a_2 + s y. At the middle of a span, s = 1/2 if the halves of
-    the deck remain straight, and s = sin(pi / 4) if the deck vibrates as half a sine.
+    divided by the sum of this stiffness and the column stiffness. A point in the first span has the acceleration (1 -
+    s) a_1 + s y, a point in the second span (1 - s) a_2 + s y. At the middle of a span, s = 1/2 if the halves of the
+    deck remain straight, and s = sin(pi / 4) if the deck vibrates as half a sine.
 
     The supports are the base of the column, the first end and the second end. The parameters are ``frequency``
     omega / 2 pi [Hz], ``damping`` zeta, and ``share`` w and ``shape`` s unless they are given here.
@@ -66,7 +66,7 @@ class BridgeDeck:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``frequency``, ``damping``, and those of ``share`` and ``shape`` that are not given."""
+        """``frequency``, ``damping``, and ``share`` and ``shape`` unless they are given."""
         free = ["share"] if self.share is None else []
         free += ["shape"] if self.shape is None and (self.first_span or self.second_span) else []
         return ("frequency", "damping", *free)

@@ -23,7 +23,7 @@ __all__ = [
     "superpose",
 ]
 
-_LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half of the digits are lost
+_LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half the digits are lost
 
 
 class LinearSystem(NamedTuple):
@@ -34,11 +34,11 @@ class LinearSystem(NamedTuple):
     mass, damping, stiffness : ndarray[n, n]
         Matrices in any consistent units: only M^-1 C [1/s] and M^-1 K [1/s²] matter.
     influence : ndarray[n, n_supports]
-        Static displacements under unit displacements of the supports [-]; ones for a structure on a single support.
+        Static displacements under unit support displacements [-]; ones for a structure on a single support.
     shape : ndarray[n_channels, n]
-        Weight of the absolute acceleration of each degree of freedom in each channel [-].
+        Weight in each channel of each degree of freedom's absolute acceleration [-].
     direct : ndarray[n_channels, n_supports]
-        Weight of the acceleration of each support in each channel [-].
+        Weight in each channel of each support acceleration [-].
     """
 
     mass: np.ndarray
@@ -72,7 +72,7 @@ class Parts(Protocol):
 
 
 class StructureResponse(NamedTuple):
-    """Response of the degrees of freedom.
+    """Response at the degrees of freedom.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ class ComplexModes(NamedTuple):
     eigenvalues : ndarray[m]
         Eigenvalues [1/s].
     participation : ndarray[m, n_supports]
-        Forcing of the mode under unit accelerations of the supports.
+        Forcing of the mode under unit support accelerations.
     shapes : ndarray[m, 3, n]
         Shapes in displacement, velocity and absolute acceleration.
     """

@@ -42,7 +42,7 @@ class OpenSeesModel(FunctionModel):
     build_and_run : callable
         Function of the wiped module ``openseespy.opensees``, of theta (n_parameters,), and of the record if one is
         given, that returns the response (n_channels, n_steps) in SI units. It must be defined at the top level of a
-        module. It should raise an exception if ``ops.analyze`` does not return 0, because OpenSees itself only prints a
+        module. It should raise an exception if ``ops.analyze`` does not return 0, because OpenSees only prints a
         message.
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
@@ -51,20 +51,20 @@ class OpenSeesModel(FunctionModel):
     dt : float, optional
         Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of samples of the response. With a record it follows from `dt`.
+        Number of response samples. With a record it follows from `dt`.
     record : Record, optional
         Excitation, which the function receives as its third argument. The model can then be simulated under other
         records (`with_record`, ``propagate(..., record=)``, `fragility`).
     path_dependent : bool
-        Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
-        another record then need no `from_state`.
+        Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
+        under another record then need no `from_state`.
     time_limit : float, optional
         Longest duration of a run [s]. A longer run is stopped and counts as failed.
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
     runs_per_process : int or None
         Number of runs after which the process is replaced by a new one; None for never. OpenSees leaks memory: in
-        version 3.7.1, ``ops.eigen`` leaks about 14 kB per run of a model of 90 degrees of freedom.
+        version 3.7.1, ``ops.eigen`` leaks about 14 kB per run of a model with 90 degrees of freedom.
     version : str, optional
         Text that replaces the code in the fingerprint; see `FunctionModel`.
     depends_on : sequence, optional
@@ -132,5 +132,5 @@ class OpenSeesModel(FunctionModel):
         )
 
     def code_parts(self) -> dict[str, Any]:
-        """Code of the user and version of OpenSees, for the label of stored simulations."""
+        """User code and OpenSees version, for the label of stored simulations."""
         return {"function": self.function.build_and_run, "openseespy": metadata.version("openseespy")}

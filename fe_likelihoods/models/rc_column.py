@@ -114,10 +114,11 @@ class RCColumn(ThreadedModel):
         Rayleigh damping: factor of the mass [1/s], and of the tangent stiffness of the last converged step [s].
     penetration : float
         Length of strain penetration below the base [m]: the deformations of the base section continue over this
-        length, because the bars slip out of the foundation, and their rotation and elongation are added to those of the
-        column. Zero is a rigid anchorage. A common estimate is 0.022 fy d [MPa, m] (Priestley, Seible & Calvi, Seismic
-        Design and Retrofit of Bridges, 1996). With 2 elements of 3 points it completes their plastic hinge,
-        0.08 height + 0.022 fy d, because the end section of such an element represents height/12.
+        length, because the bars slip out of the foundation, and the rotation and elongation over this length are added
+        to the column deformations. Zero is a rigid anchorage. A common estimate is 0.022 fy d [MPa, m] (Priestley,
+        Seible & Calvi, Seismic Design and Retrofit of Bridges, 1996). With 2 elements of 3 points, this estimate
+        completes the plastic hinge, 0.08 height + 0.022 fy d, because the end section of such an element represents
+        height/12.
     fatigue : LowCycleFatigue or None
         Low-cycle fatigue of the bars. None: bars neither lose strength nor fracture.
     buckling : BarBuckling or None
@@ -125,7 +126,7 @@ class RCColumn(ThreadedModel):
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (see the notes).
     n_elements, n_points : int
-        Number of elements, and of Gauss-Lobatto points per element (2 to 7).
+        Number of elements, and number of Gauss-Lobatto points per element (2 to 7).
     mesh : int or Patches
         Number of strips (even), or rings and wedges.
     geometry : str
@@ -135,7 +136,7 @@ class RCColumn(ThreadedModel):
     max_increment : float or None
         Largest increment of an imposed displacement [m]; larger ones are divided. None: height/5000.
     outputs : tuple of str or None
-        Names of the channels, that is, of the sensors (see the notes). None: those of the top.
+        Names of the channels, that is, of the sensors (see the notes). None: the default channels at the top.
     units : dict or tuple of pairs
         Display units of the channels, by name or by the part of the name before the ``@``.
     tolerance, element_tolerance : float
@@ -167,8 +168,8 @@ class RCColumn(ThreadedModel):
     ==================  ==========================================================================================
 
     Curvatures, rotations, moments and shear forces are positive where the column bends towards positive displacements.
-    Strains and axial forces are positive in tension and include the effect of gravity. Strains and curvatures are
-    those of a section at the heights `section_heights`, and interpolated in between (``docs/sensors.rst``).
+    Strains and axial forces are positive in tension and include the effect of gravity. Strains and curvatures belong to
+    a section at the heights `section_heights`, and are interpolated in between (``docs/sensors.rst``).
 
     Each value of theta is a multiple of a nominal value (`nominal`). The parameters are:
 
@@ -185,7 +186,7 @@ class RCColumn(ThreadedModel):
     ``mass``          mass at the top [kg]
     ``penetration``   length of strain penetration into the foundation [m]
     ``Cf``            coefficient of Coffin and Manson, with `fatigue`
-    ``Cd``            coefficient of the loss of strength, with `fatigue`
+    ``Cd``            coefficient of strength loss, with `fatigue`
     ``slenderness``   unsupported length of the bars by their diameter, with `buckling`
     ================  ============================================================
     """
@@ -235,7 +236,7 @@ class RCColumn(ThreadedModel):
         loading : Record or DisplacementHistory
             Base acceleration, or lateral displacement of the top.
         **changes
-            Any argument of `RCColumn`, instead of the value of the tested column.
+            Arguments of `RCColumn` that replace the values of the tested column.
 
         Returns
         -------
@@ -276,12 +277,12 @@ class RCColumn(ThreadedModel):
 
     @property
     def n_steps(self) -> int:
-        """Number of samples of the response."""
+        """Number of response samples."""
         return self.loading.n_steps
 
     @property
     def section_heights(self) -> np.ndarray:
-        """Heights of the integration points above the base [m], where curvatures and strains are those of a section."""
+        """Heights of the integration points above the base [m], where curvatures and strains are not interpolated."""
         return section_heights(self._sections)
 
     @property
@@ -316,10 +317,10 @@ class RCColumn(ThreadedModel):
         return replace(self, loading=record)
 
     def followed_by(self, record: Record, rest: float = 10.0) -> RCColumn:
-        """Return the same column under its own record, a pause of `rest` [s] and a further record.
+        """Return the same column under its present record, a pause of `rest` [s] and a further record.
 
-        Its response ends with the samples of the response to the further record, of the column that the first one has
-        damaged. Errors are those of `Record.followed_by`; a column under imposed displacement raises ValueError.
+        Its response ends with the response to the further record, of the column that the first record has damaged.
+        Errors are as for `Record.followed_by`; a column under imposed displacement raises ValueError.
         """
         if not isinstance(self.loading, Record):
             raise invalid(
@@ -341,7 +342,7 @@ class RCColumn(ThreadedModel):
         Returns
         -------
         RCColumn
-            Its response is the first part of the response of this model.
+            Its response is the first part of this model's response.
 
         Raises
         ------
@@ -356,13 +357,13 @@ class RCColumn(ThreadedModel):
     def history(self, theta: np.ndarray) -> ColumnHistory:
         """Simulate and return all histories that the kernels record, and the outputs of the column by their names.
 
-        Parameters and errors are those of `simulate`.
+        Parameters and errors as for `simulate`.
 
         Notes
         -----
-        The histories of the kernels, such as "base moment" and "base curvature", have the signs of the element, whose
-        second axis points against the direction of loading. Outputs, such as "base_moment" and "curvature@0", are
-        positive where the column bends towards positive displacements: ``history["base_moment"]`` is
+        The kernel histories, such as "base moment" and "base curvature", have the signs of the element, whose second
+        axis points against the direction of loading. Outputs, such as "base_moment" and "curvature@0", are positive
+        where the column bends towards positive displacements: ``history["base_moment"]`` is
         ``-history["base moment"]``.
         """
         history, outputs, _ = run_column(self, self._prepared, check_theta(theta, self.parameters), None)
@@ -390,7 +391,7 @@ class RCColumn(ThreadedModel):
         theta : ndarray[n_parameters]
             As for `simulate`.
         state : ndarray, optional
-            The state that this method returned for the same theta, and the same column under the beginning of this
+            State that this method returned for the same theta and the same column, under the first part of this
             excitation. Default: the beginning, before the gravity load.
 
         Returns
@@ -404,7 +405,7 @@ class RCColumn(ThreadedModel):
         SimulationFailed
             As for `simulate`.
         ValueError
-            For a column under imposed displacement, or a state that is not one of this column.
+            For a column under imposed displacement, or a `state` that is not a state of this column.
         """
         if not isinstance(self.loading, Record):
             raise invalid(

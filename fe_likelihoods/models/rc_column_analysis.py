@@ -68,11 +68,11 @@ class ColumnHistory(History):
         Number of steps that were repeated with half their size.
     beyond_range : float
         Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
-        fracture, whereas the law of the steel was continued along its tangent. A warning about this is logged once per
-        model, also where simulations come from a cache on disk.
+        fracture, whereas the steel law was continued along its tangent. A warning about this is logged once per model,
+        also if simulations come from a cache on disk.
     bar_damage : ndarray[n_bars] or None
         Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. The
-        bars are those of ``model.section.fibers()[2]``: two at the same position count as one. None without fatigue.
+        bars are listed in ``model.section.fibers()[2]``: two at the same position count as one. None without fatigue.
     lowerings : int
         Number of times the column could not carry the axial load at an imposed displacement, and its top came down
         until the cracks were closed (``docs/theory/time_integration.rst``). 0 under a base acceleration.
@@ -120,7 +120,7 @@ class BaseMotion(NamedTuple):
     substeps : int
         Integration steps per sample of the response.
     n_steps : int
-        Number of samples of the response.
+        Number of response samples.
     """
 
     acceleration: np.ndarray
@@ -154,8 +154,8 @@ class BaseMotion(NamedTuple):
         record_sections : bool
             Whether the deformations of all sections are returned too.
         first : int
-            0 for an analysis from the beginning. Otherwise the sample of the response whose state `column` and
-            `energies` hold; the histories are those of the samples after it.
+            0 for an analysis from the beginning. Otherwise the response sample whose state `column` and `energies`
+            hold; the histories begin after this sample.
         energies : ndarray[4]
             Written, as by `newmark`.
 
@@ -274,9 +274,9 @@ def checked_history(
     theta: np.ndarray,
     bar_damage: np.ndarray | None = None,
 ) -> ColumnHistory:
-    """History of a simulation; warns once per model where bars exceed the strain at which they fracture.
+    """History of a simulation; warns once per model if bars exceed the strain at which real bars fracture.
 
-    There is no warning where a bar has fractured, which the model then describes.
+    There is no warning if a bar has fractured in the simulation.
     """
     strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
     limit = steel.ultimate_strain
@@ -296,7 +296,7 @@ def checked_history(
 
 
 def expect_fracture(model: BuiltInModel) -> None:
-    """Give no warning where bars of this model exceed the strain at which they fracture: it is pushed to failure."""
+    """Give no warning if bars of this model exceed the strain at which real bars fracture: it is pushed to failure."""
     remark_on_range(model, "")
 
 

@@ -1,7 +1,7 @@
-"""Curves of the parts of a reinforced-concrete column: stress-strain of its materials, moment-curvature of its section.
+"""Curves of a reinforced-concrete column: stress-strain curves of its materials, moment-curvature curve of its section.
 
-They show what the laws do at the parameters of a simulation, before the column is simulated.
-`fe_likelihoods.plot_material` and `fe_likelihoods.plot_moment_curvature` draw them.
+They show the behaviour of the laws at given parameters, before the column is simulated. `fe_likelihoods.plot_material`
+and `fe_likelihoods.plot_moment_curvature` draw them.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def material_curves(
 def moment_curvature(
     column: RCColumn, theta: np.ndarray, curvature: np.ndarray, *, axial_force: float | None = None
 ) -> MomentCurvature:
-    """Compute the moment of the section of a column under a history of curvature.
+    """Compute the moment in a column's section under a history of curvature.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class _Section:
             if width > _LARGEST_STRAIN:
                 raise _failure(axial_force, curvature)
         found = brentq(excess, low, high, xtol=1e-16)
-        if not abs(excess(found)) <= tolerance:  # a jump of the stress, such as that of crushed cover
+        if not abs(excess(found)) <= tolerance:  # a jump of the stress, such as from crushed cover
             raise _failure(axial_force, curvature)
         self.axial_strain = found
         self.forces(found, curvature, self.bars)

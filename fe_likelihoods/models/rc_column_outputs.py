@@ -6,17 +6,17 @@ An output is named by its quantity and its place, ``quantity@place``, with heigh
 * ``base_moment``, ``base_shear`` and ``axial_force`` at the base;
 * ``curvature@height`` of the section at a height;
 * ``strain@height:position`` of the concrete or of a bar at a position in that section, as a strain gauge measures it;
-* ``rotation@lower:upper`` of the section at one height relative to that at another, as a pair of displacement
-  transducers over a gauge length measures it.
+* ``rotation@lower:upper`` of the section at the upper height relative to the section at the lower height, as a pair of
+  displacement transducers over a gauge length measures it.
 
 Positions are measured from the axis of the column in the direction of loading. Curvatures, rotations, moments and shear
 forces are positive where the column bends towards positive displacements; strains and axial forces are positive in
 tension. Plane sections stay plane, so concrete and bars at the same position have the same strain.
 
-The element knows the deformations of its sections at the integration points, where outputs are those of the section
-itself. In between, axial strain and curvature are the polynomial through the points of the element (Neuenhofer &
-Filippou 1998). The integral of this polynomial over an element is the sum that the element itself uses, so that the
-rotation between two nodes is the difference of their rotations. ``docs/sensors.rst`` describes the outputs.
+Outputs at the integration points are section deformations. In between, axial strain and curvature follow the polynomial
+through the points of the element (Neuenhofer & Filippou 1998). The integral of this polynomial over an element is the
+sum that the element uses, so that the rotation between two nodes is the difference of their rotations.
+``docs/sensors.rst`` describes the outputs.
 
 References
 ----------
@@ -40,7 +40,7 @@ __all__ = ["Output", "Sections", "check_units", "display_channels", "parse_outpu
 
 
 class _Row(NamedTuple):
-    """Output that is a row of the history of a simulation, times a sign."""
+    """Output that is a row of a simulation's history, times a sign."""
 
     quantity: str
     si_unit: str
@@ -59,10 +59,10 @@ _ROWS = {
 _AT_TOP = ("acceleration", "displacement", "force")
 """Outputs at the top, which depend on the type of loading."""
 _LOCATED = {"curvature": ("curvature", "1/m", 1), "strain": ("strain", "1", 2), "rotation": ("rotation", "rad", 2)}
-"""Outputs with a place: quantity, SI unit and number of values of the place."""
+"""Outputs with a place: quantity, SI unit, and how many values the place has."""
 
 _ROUNDING = 1e-9
-"""Share of the height and of the radius by which a place may be outside the column, as a result of its rounding."""
+"""How far rounding may put a place outside the column, as a share of the column's height or radius."""
 
 _NUMBER = r"([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?|[+-]?\.\d+(?:[eE][+-]?\d+)?)"
 _PLACE = re.compile(rf"(\w+)@{_NUMBER}(?::{_NUMBER})?")
@@ -80,7 +80,7 @@ class Sections(NamedTuple):
     height, radius : float
         Height of the column and radius of its section [m].
     n_elements : int
-        Number of elements of equal length.
+        Number of elements, which have equal lengths.
     points : ndarray[n_points]
         Integration points of an element, on [0, 1].
     """
@@ -140,7 +140,7 @@ class Output(NamedTuple):
     name, quantity, si_unit : str
         Name of the channel, its quantity, and the SI unit of its values.
     row : str or None
-        Row of the history that it is, or None for an output with a place.
+        Row of the history with this output, or None for an output with a place.
     factor : float
         Factor of that row.
     strain, curvature : ndarray[n_sections] or None

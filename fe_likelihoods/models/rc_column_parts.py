@@ -92,10 +92,10 @@ class Steel:
 
 
 def hardening_fault(fy: float, fu: float, es: float, esh: float, eps_sh: float, eps_u: float) -> str:
-    """Return why the law of the steel has no hardening branch at these constants, or an empty text.
+    """Return why the steel law has no hardening branch at these constants, or an empty text.
 
-    The arguments are those of `fe_likelihoods.kernels.reinforcing_steel.constants`, with fy/es < eps_sh < eps_u. The
-    law is written in natural strains and stresses. There, fu > fy and Esh > 0 are not sufficient for a hardening branch
+    Arguments as for `fe_likelihoods.kernels.reinforcing_steel.constants`, with fy/es < eps_sh < eps_u. The law is
+    written in natural strains and stresses, for which fu > fy and Esh > 0 are not sufficient for a hardening branch
     that rises from the end of the plateau to the ultimate strain.
     """
     length = math.log1p(eps_u) - math.log1p(eps_sh)
@@ -130,10 +130,10 @@ class LowCycleFatigue:
     ----------
     cf, alpha : float
         Coefficient and exponent of Coffin and Manson, for the plastic strain of a half cycle from one reversal to the
-        next. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from
-        tests of Brown & Kunnath (2000) with bars of a slenderness of 6.
+        next. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests
+        of Brown & Kunnath (2000) with bars whose slenderness was 6.
     cd : float
-        Coefficient of the loss of strength, at least `cf`; a large one means no loss before fracture.
+        Coefficient of strength loss, at least `cf`; a large coefficient means no loss before fracture.
     """
 
     cf: float = 0.26
@@ -157,8 +157,8 @@ class BarBuckling:
     Attributes
     ----------
     slenderness : float or None
-        Unsupported length of the bars divided by their diameter. None: the spacing of the hoops divided by the diameter
-        of the bars. Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
+        Unsupported length of the bars divided by their diameter. None: the hoop spacing divided by the bar diameter.
+        Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
     alpha : float
         1 for steel that hardens linearly, 0.75 for steel that does not (``docs/theory/reinforcing_steel.rst`` has a
         formula for steels between them).
@@ -182,7 +182,7 @@ class Bars:
     diameter : float
         Diameter of one bar [m].
     area : float or None
-        Area of one bar [m²]. None: that of a circle of `diameter`.
+        Area of one bar [m²]. None: from `diameter`.
     first_angle : float
         Angle between the direction of negative displacements and the first bar [rad]. It matters only where the bars
         are not symmetric to the axis of bending, such as an odd number of bars.
@@ -217,7 +217,7 @@ class Hoops:
     fy : float
         Yield strength [Pa].
     area : float or None
-        Area of one set [m²]; bundled hoops have more than one bar. None: that of a circle of `diameter`.
+        Area of one set [m²]; bundled hoops have more than one bar. None: one bar, from `diameter`.
     ultimate_strain : float
         Strain at fracture.
     spiral : bool

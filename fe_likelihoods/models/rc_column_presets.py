@@ -13,8 +13,8 @@ __all__ = ["lhpost_arguments"]
 def lhpost_arguments() -> dict[str, Any]:
     """Arguments of the full-scale column tested on the LHPOST shake table (UC San Diego, 2010).
 
-    Height, diameter, Ec, Es, ft, damping and weight are those of Ramancha et al. (2022); the other values are those of
-    a published model of the same column.
+    Height, diameter, Ec, Es, ft, damping and weight are from Ramancha et al. (2022), the other values from a published
+    model of the same column.
 
     Returns
     -------

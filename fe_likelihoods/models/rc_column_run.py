@@ -84,8 +84,8 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     prepared : PreparedColumn
     theta : ndarray[n_parameters]
     state : ndarray or None
-        State at a sample of the response, from which the simulation goes on; the results are those after this sample.
-        None: from the beginning.
+        State at a response sample, from which the simulation goes on; the results begin after this sample. None: from
+        the beginning.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
 
 
 def _restore(column: Column, energies: np.ndarray, state: np.ndarray, n_steps: int) -> int:
-    """Write a state into the memory of the column and the energies; return the sample of the response it is for."""
+    """Write a state into the memory of the column and the energies; return its response sample."""
     parts = committed_state(column)
     state = check_state(state, 1 + energies.size + sum(part.size for part in parts), n_steps)
     energies[:] = state[1 : 1 + energies.size]

@@ -1,7 +1,7 @@
 """Bar of reinforcing steel in a testing machine: strain history in, stress history out.
 
-The law is that of the bars of `RCColumn` (``docs/theory/reinforcing_steel.rst``). A cyclic test of a coupon of the same
-steel can therefore give a prior for the bars of a column, or check the posterior found from a column. The law fixes the
+The law is the same as for the bars in `RCColumn` (``docs/theory/reinforcing_steel.rst``). A cyclic coupon test can
+therefore give a prior for column bars of the same steel, or check the posterior found from a column. The law fixes the
 shape of the curves between reversals and the loss of stiffness at a reversal; for a steel that behaves differently, the
 other parameters compensate for the difference.
 """
@@ -121,7 +121,7 @@ class SteelCoupon(BuiltInModel):
         Returns
         -------
         SteelCoupon
-            Its response is the first part of the response of this model.
+            Its response is the first part of this model's response.
 
         Raises
         ------

@@ -200,15 +200,15 @@ class GroupedFrame:
 class ShearFlexuralBeam:
     """Building as a uniform cantilever, a shear beam and a flexural beam side by side (Miranda & Taghavi 2005).
 
-    The parameters are ``frequency``, that of the first mode [Hz]; ``alpha``, the ratio of shear to flexural stiffness
-    H sqrt(GA / EI); and ``damping``, the ratio of critical damping of all modes. alpha = 0 is a flexural beam (shear
-    walls), alpha above about 20 a shear beam (moment frames), in between are buildings with both. Modes above the
-    last one move with the base.
+    The parameters are ``frequency``, the first natural frequency [Hz]; ``alpha``, the ratio of shear to flexural
+    stiffness H sqrt(GA / EI); and ``damping``, the ratio of critical damping of all modes. alpha = 0 is a flexural beam
+    (shear walls), alpha above about 20 a shear beam (moment frames), in between are buildings with both. Modes above
+    the last one move with the base.
 
     Parameters
     ----------
     heights : dict of str to float, or sequence of pairs
-        Names of the channels, and their heights above the base as shares of the height of the building, above 0 to 1.
+        Names of the channels, and their heights above the base as shares of the building height, above 0 to 1.
     n_modes : int
         Number of modes.
 
@@ -294,7 +294,7 @@ def beam_modes(alpha: float, n_modes: int, heights: np.ndarray) -> BeamModes:
     n_modes : int
         Number of modes.
     heights : ndarray[n_heights]
-        Heights as shares of that of the building.
+        Heights as shares of the building height.
 
     Returns
     -------
@@ -312,7 +312,7 @@ def beam_modes(alpha: float, n_modes: int, heights: np.ndarray) -> BeamModes:
             + alpha**2 / (gamma * beta) * math.sin(gamma) * math.tanh(beta)
         )
 
-    # one root in each interval of pi: between that of the shear beam, (k + 1/2) pi, and that of the flexural one
+    # one root in each interval of pi: between the root of the shear beam, (k + 1/2) pi, and of the flexural beam
     roots = [brentq(characteristic, max(k * math.pi, 1e-3), (k + 1) * math.pi, xtol=1e-14) for k in range(n_modes)]
     gamma = np.array(roots)
     beta = np.hypot(gamma, alpha)
@@ -324,8 +324,8 @@ def _beam_shapes(gamma: np.ndarray, beta: np.ndarray, heights: np.ndarray) -> np
     """Mode shapes times participation factors (n_heights, n_modes) at the roots gamma and beta (n_modes,).
 
     phi = sin(gamma x) - eta cos(gamma x) + eta cosh(beta x) - gamma / beta sinh(beta x), written with decaying
-    exponentials only. The integral of phi follows from its differential equation, that of its square from those of the
-    products of its four terms.
+    exponentials only. The differential equation gives the integral of phi; the integral of phi^2 is a sum over products
+    of the four terms.
     """
     small = np.exp(-beta)
     sine, cosine = np.sin(gamma), np.cos(gamma)

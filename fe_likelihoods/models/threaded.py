@@ -1,4 +1,4 @@
-"""Base class of the built-in models whose simulations are compiled kernels: batches are run on threads."""
+"""Base class for the built-in models whose simulations are compiled kernels: batches are run on threads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["ThreadedModel"]
 
 
 class ThreadedModel(BuiltInModel):
-    """Built-in model with compiled kernels, which release the lock of the interpreter.
+    """Built-in model with compiled kernels, which release the interpreter lock.
 
     A subclass defines `_prepare`, the work that is the same for every theta, and `_respond`, which uses its result,
     `_prepared`.

@@ -1,4 +1,4 @@
-"""Model that runs on servers of UM-Bridge, in any language, in a container or on another machine."""
+"""Model that runs on UM-Bridge servers, in any language, in a container or on another machine."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class UMBridgeModel(ExternalModel):
     """Model of an UM-Bridge server.
 
     The parameters are sent in the order of `parameter_names`, divided into vectors of the sizes that the server asks
-    for. The response has one vector per channel, or `output` computes it from the vectors of the server.
+    for. The response has one vector per channel, or `output` computes it from the vectors that the server returns.
 
-    An error that the server answers is a failed simulation, with its text. A server that cannot be reached, or that
-    dies during a simulation, is a fault of the infrastructure: the simulation is repeated `retries` times. If that
-    does not help, it counts as a transient failure, which no cache stores (docs/own_model.rst).
+    If the server answers with an error, the simulation has failed, and the error text is the reason. A server that
+    cannot be reached, or that dies during a simulation, is a fault of the infrastructure: the simulation is repeated
+    `retries` times. If all attempts fail, no cache stores the failure (docs/own_model.rst).
 
-    Several servers are asked at the same time with a pool of as many threads, ``FELikelihood(..., pool=
-    ThreadPoolExecutor(3))`` for three; each simulation goes to the least busy one. A load balancer has one address, and
-    as many threads as it has servers.
+    For several servers, use a pool with one thread per server, such as
+    ``FELikelihood(..., pool=ThreadPoolExecutor(3))`` for three; each simulation goes to the least busy server. A load
+    balancer has one address; use as many threads as it has servers.
 
     Parameters
     ----------
@@ -54,25 +54,25 @@ class UMBridgeModel(ExternalModel):
     dt : float
         Time step of the response [s].
     n_steps : int, optional
-        Number of samples of the response; by default the length of the vectors of the server.
+        Number of response samples; by default the length of the server's vectors.
     config : mapping, optional
-        Configuration that is sent with every request, of values that JSON can represent.
+        Configuration that is sent with every request; its values must be representable in JSON.
     output : callable, optional
-        Function of the list of vectors (one-dimensional arrays) of the server that returns the response (n_channels,
-        n_steps) [SI]. It is needed where the server does not return one vector [SI] per channel.
+        Function that takes the server's list of vectors (one-dimensional arrays) and returns the response (n_channels,
+        n_steps) [SI]. It is required if the server does not return one vector [SI] per channel.
     version : str
-        Text that enters the fingerprint. No digest of the code on a server is known here: change the text whenever the
-        served model changes, and give different models of the same name different texts.
+        Text that enters the fingerprint. The code on a server has no digest here: change the text whenever the served
+        model changes, and give different models with the same name different texts.
     depends_on : sequence, optional
-        Files and values that the response depends on besides; see `FunctionModel`.
+        Other files and values that the response depends on; see `FunctionModel`.
     time_limit : float, optional
         Longest time until the answer [s], which includes the time that a simulation waits at the server for others. A
-        longer simulation counts as failed. The server does not learn of it, and goes on.
+        longer simulation counts as failed; the server is not told and continues to run it.
     retries : int
         Number of further attempts after a fault of the infrastructure.
     retry_wait : float
-        Time between the first two attempts [s]; it is doubled each time, up to 60 s. The defaults repeat a simulation
-        for half a minute, in which a server can be started again.
+        Time between the first two attempts [s]; it is doubled each time, up to 60 s. The defaults leave half a minute
+        in which a server can be restarted.
 
     Raises
     ------
@@ -141,7 +141,7 @@ class UMBridgeModel(ExternalModel):
         self.fingerprint = self._digest(self.name, self.config, *sizes, self.version)
 
     def code_parts(self) -> dict[str, Any]:
-        """Code of the user, for the label of stored simulations."""
+        """User code, for the label of stored simulations."""
         return {"output": self.output}
 
     def _common_sizes(self) -> tuple[list[int], list[int]]:
@@ -186,7 +186,7 @@ class UMBridgeModel(ExternalModel):
         return vectors if self.output is None else self.output(vectors)
 
     def _vectors(self, answer: Any) -> list[np.ndarray]:
-        """Vectors of an answer; SimulationFailed if they are not vectors of numbers of the sizes that were stated."""
+        """Vectors of an answer; SimulationFailed if they are not vectors of numbers with the stated sizes."""
         try:
             vectors = [np.asarray(vector, dtype=float) for vector in answer]
         except (TypeError, ValueError) as error:

@@ -87,7 +87,7 @@ def check_fields(
     positive, non_negative, finite : sequence of str
         Names of the fields to check with the function of the same name.
     optional : sequence of str
-        Those of them that may be None.
+        Those fields among them that may be None.
     of : str
         Appended to the names in messages, such as ``"of a pier"``.
 
@@ -130,7 +130,7 @@ def check_nominal(names: Sequence[str], nominal: Mapping[str, float]) -> None:
 
 
 def check_values(values: Mapping[str, float], may_be_zero: Collection[str] = ()) -> None:
-    """Raise SimulationFailed if a physical value is not finite and positive; those in `may_be_zero` may be zero."""
+    """Raise SimulationFailed if a physical value is not finite and positive; values in `may_be_zero` may be zero."""
     for name, value in values.items():
         if not math.isfinite(value) or value < 0.0 or (value == 0.0 and name not in may_be_zero):
             raise SimulationFailed(f"{name} = {value:.4g} is outside the range of the model: it must be positive")
@@ -167,7 +167,7 @@ def check_measured(measured: np.ndarray, channels: Sequence[Channel], n_steps: i
 
 
 def check_state(state: np.ndarray, size: int, n_steps: int) -> np.ndarray:
-    """Return a state as floats (size,); ValueError if it is not that of a sample before the last of `n_steps`."""
+    """Return a state as floats (size,); ValueError unless it belongs to a sample before the last of `n_steps`."""
     state = np.asarray(state, dtype=float)
     if state.shape != (size,) or not 0 < state[0] < n_steps - 1:
         raise invalid(
