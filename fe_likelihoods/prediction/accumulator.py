@@ -24,7 +24,7 @@ class Accumulator:
     Parameters
     ----------
     members : list of ndarray
-        Indices of the samples of each distinct theta.
+        Sample indices for each distinct theta.
     noise : SampleNoise, ModelError or None
         Noise of every sample, None for a prediction without noise.
     evaluate : callable or None
@@ -32,13 +32,13 @@ class Accumulator:
     rows : list of int or None
         Rows of the response whose histories are wanted, None for another quantity.
     result_of_sample : ndarray, shape (n,)
-        Index of the result of each sample.
+        Index of each sample's result.
     probabilities : tuple of float
         Probabilities of the quantiles.
     memory_bytes : int or None
         Largest size of the retained results [bytes], None for no limit.
     seeds : numpy.random.SeedSequence
-        Seeds of the noise and of the choice of retained samples.
+        Seeds for the noise and for choosing the retained samples.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Accumulator:
         histories = self.rows is not None
         if histories and not self.probabilities:
             return
-        # Numbers are retained whatever the limit. Of arrays without quantiles all are retained if they fit.
+        # Numbers are retained whatever the limit; arrays without quantiles only if all of them fit.
         limit = None if shape == () else self.memory_bytes
         n_results = int(self.result_of_sample.max()) + 1
         fits = limit is None or 8 * int(np.prod(shape)) * n_results <= limit
@@ -97,7 +97,7 @@ class Accumulator:
         responses : ndarray, shape (m, n_channels, n_steps)
             The responses [SI].
         reasons : list of str
-            Reason of failure of each simulation, empty for successful ones.
+            Why each simulation failed, empty for successful ones.
         """
         members = self.members[start : start + len(responses)]
         usable = []

@@ -2,7 +2,7 @@
 
 If several models explain the data, each with its posterior probability, the prediction is the mixture of their
 predictions. By the law of total variance its variance is the sum of two parts: the mean variance within the models, and
-the variance between the means of the models. See ``docs/theory/prediction.rst``.
+the variance between the models' means. See ``docs/theory/prediction.rst``.
 
 References
 ----------
@@ -33,9 +33,9 @@ class AveragedPrediction(NamedTuple):
     variance : ndarray, shape (...)
         Variance of the mixture, ``within + between``.
     within : ndarray, shape (...)
-        Mean of the variances of the models.
+        Mean of the models' variances.
     between : ndarray, shape (...)
-        Variance of the means of the models.
+        Variance of the models' means.
     standard_error : ndarray, shape (...)
         Monte Carlo error of `mean` for the given probabilities.
     probabilities : dict of str to float

@@ -1,12 +1,12 @@
 r"""Damage as a quantity of the posterior: presence, location and extent.
 
 The presence of a limit state is the probability that its measure exceeds its limit, estimated by the fraction of the
-samples (`fe_likelihoods.prediction.reliability`). Where a limit is one of strain, its location is the same probability
-at each section and side of a column. The extent is given by quantiles of the measures.
+samples (`fe_likelihoods.prediction.reliability`). For a strain limit, the location is the same probability at each
+section and side of a column. The extent is given by quantiles of the measures.
 
-The samples are those of the parameters. The error of the model, which is often larger, is in ratios of measured to
-fitted values of the measures (``ratios=``). Without them a probability of 0 or 1 means that all samples of the
-parameters agree, and a warning says so.
+The samples contain the uncertainty of the parameters only. The model error, which is often larger, enters as ratios of
+measured to fitted values (``ratios=``). Without them a probability of 0 or 1 means that all parameter samples agree,
+and a warning says so.
 
 References
 ----------
@@ -50,7 +50,7 @@ _DECREASING = ("stiffness ratio",)
 
 
 class LimitState(NamedTuple):
-    """A limit of a measure of damage.
+    """Limit state: a damage measure and its limit.
 
     Attributes
     ----------
@@ -102,8 +102,7 @@ class Damage(NamedTuple):
         The limit states.
     presence : dict of str to Exceedance
         For each limit state, the probability that it is reached anywhere, arrays of shape (n_events,), with its Monte
-        Carlo error and interval. Strains, energy and index count from the beginning of the response; drifts are those
-        of the event.
+        Carlo error and interval. Strains, energy and index count from the start of the response, drifts per event.
     location : dict of str to Exceedance
         For each limit state of strains, the probability at each place, arrays of shape (n_events, n_sections, 2).
     extent : dict of str to ndarray
@@ -164,7 +163,7 @@ class Damage(NamedTuple):
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
 
         A probability of 0 or 1 is given with the bound of its interval, others with their Monte Carlo error. Strains
-        are those of the place with the largest quantile.
+        are given for the place with the largest quantile.
         """
         events = [event[:23] for event in self.events]
         rows = [("probability of", events)]
@@ -233,17 +232,17 @@ def damage(
     limits : sequence of LimitState, optional
         The limit states. Default: `limit_states`.
     ratios : EventRatios, LevelRatios, or mapping of str to these, optional
-        The error of the model: ratios of measured to fitted values in several events, for each measure by its name, or
-        the same for all. Measures without ratios have no error of the model. Strains are rarely measured; a stated
-        guess is ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
+        The model error: ratios of measured to fitted values in several events, for each measure by its name, or the
+        same for all. Measures without ratios have no model error. Strains are rarely measured; a stated guess is
+        ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
     noise : bool, optional
-        False states that the error of the model is left out on purpose. Default: a warning if there are no ratios.
+        False states that the model error is left out on purpose. Default: a warning if there are no ratios.
     effective_sample_size : float, optional
-        Effective number of independent samples. Default: that of the prediction.
+        Effective number of independent samples. Default: as in the prediction.
     level : float
-        Probability of the intervals of the probabilities, between 0 and 1.
+        Level of the probabilities' intervals, between 0 and 1.
     seed : int
-        Seed of the draws of the ratios.
+        Seed for drawing the ratios.
 
     Returns
     -------
@@ -252,14 +251,14 @@ def damage(
     Raises
     ------
     ValueError
-        If the prediction is of another quantity, contains noise or has no values of the samples, or a limit is of an
+        If the prediction is of another quantity, contains noise or has no values of the samples, or a limit has an
         unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample; if
-        ratios are of an unknown measure or of several quantities; and for ``noise=True``.
+        ratios are for an unknown measure or for several quantities; and for ``noise=True``.
 
     Warns
     -----
     UserWarning
-        If limit states have no ratios, so that the error of the model is left out.
+        If limit states have no ratios, so that the model error is left out.
 
     Notes
     -----

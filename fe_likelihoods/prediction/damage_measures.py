@@ -1,8 +1,8 @@
-r"""Measures of damage: what a response says about the state of a structure after each event.
+r"""Damage measures: what a response says about the state of a structure after each event.
 
 `damage_measures` makes the quantity that `fe_likelihoods.propagate` evaluates for every sample, and
 `fe_likelihoods.damage` turns the prediction into probabilities of limit states. The definitions are in
-``docs/damage.rst``. They need force, displacement and strain channels; `damage_outputs` names those of a column.
+``docs/damage.rst``. They need force, displacement and strain channels; `damage_outputs` names a column's channels.
 
 The response of an event is described by the equivalent linear oscillator, the least-squares fit
 
@@ -56,7 +56,7 @@ class Sensors(NamedTuple):
         Displacement relative to the base [m], restoring force that belongs to it [N] and absolute acceleration [m/s²];
         an empty text for a channel that does not exist.
     heights : ndarray, shape (n_sections,)
-        Heights of the sections with strains [m].
+        Section heights at which strains are known [m].
     strains : tuple of tuple of str
         For each section from the base up: bar and surface at the negative side, bar and surface at the positive side.
     """
@@ -69,7 +69,7 @@ class Sensors(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """Samples of one event: first, after the last, and after the last of the pause that follows."""
+    """Sample indices of one event: its first, one past its last, and one past the last in the pause that follows."""
 
     name: str
     first: int
@@ -129,7 +129,7 @@ class DamageMeasures:
         Raises
         ------
         ValueError
-            If the response has another length than that of the model for which the measures were made.
+            If the response and the model for which the measures were made differ in length.
         """
         if response.shape[-1] != self.n_steps:
             raise ValueError(
@@ -247,7 +247,7 @@ def damage_measures(
         Length by which displacements of another model are divided [m]. 1: they remain displacements.
     events : Events, optional
         Excitation of another model, for measures after each event. Default: ``model.record``, if the model has it; one
-        event otherwise. That of a column is its loading.
+        event otherwise. A column needs none: its events are known from its loading.
     park_ang : ParkAng, optional
         Constants of the damage index. Default for a column: `park_ang_constants` at nominal parameters.
     settle : float
@@ -321,7 +321,7 @@ def damage_measures(
 
 
 def _excitation(model: Any, events: Any) -> Any:
-    """Excitation whose events are the windows; ValueError if `events` is not that of the model."""
+    """Excitation whose events are the windows; ValueError if `events` is not the model's excitation."""
     own = getattr(model, "record", None)
     own = own if isinstance(own, Record) else None
     if events is None:

@@ -1,6 +1,6 @@
 r"""Ratios of measured to predicted values in several events, and the distribution of the ratio in a new event.
 
-A ratio contains what a model cannot fit in an event. The logarithms of the ratios of K events are described by
+A ratio contains what a model cannot fit in an event. The log ratios in K events are described by
 
 .. math:: \ln r_k = f(\ln g_k) + s\, z_k, \qquad z_k \sim N(0, 1),
 
@@ -38,16 +38,16 @@ _REACH = 1e-9
 
 
 class RatioPopulations(NamedTuple):
-    """Draws from the posterior of what is unknown of the ratios: their median as a function of the level, and s.
+    """Posterior draws of the ratio distribution: its median as a function of the level, and s.
 
     Attributes
     ----------
     log_levels : ndarray, shape (n_levels,)
         Logarithms of the predicted value in equal steps, or a single one for a constant.
     center : ndarray, shape (n, n_levels)
-        Logarithm of the median of the ratio at these levels.
+        Logarithm of the median ratio at these levels.
     sd : ndarray, shape (n,)
-        Standard deviation of the logarithm of the ratio between events.
+        Standard deviation of log ratios between events.
     """
 
     log_levels: np.ndarray
@@ -55,7 +55,7 @@ class RatioPopulations(NamedTuple):
     sd: np.ndarray
 
     def center_at(self, log_predicted: np.ndarray) -> np.ndarray:
-        """Logarithm of the median of the ratio at logarithms of predicted values (n, ...), a row for each draw."""
+        """Log median ratio at logarithms of predicted values (n, ...), a row for each draw."""
         draws = np.arange(len(self.sd)).reshape(-1, *(1,) * (log_predicted.ndim - 1))
         if len(self.log_levels) == 1:
             return self.center[draws, 0]
@@ -91,7 +91,7 @@ def _checked_ratios(kind: str, values: Any, prior_sd: float, prior_events: float
 
 
 def standardised(difference: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Differences divided by a scale; for a scale of zero infinite, and negative for a difference of zero."""
+    """Differences divided by a scale. If the scale is zero: infinite, with negative sign for a difference of zero."""
     positive = np.asarray(scale) > 0.0
     return np.where(positive, difference / np.where(positive, scale, 1.0), np.where(difference > 0.0, np.inf, -np.inf))
 
@@ -105,10 +105,9 @@ class EventRatios:
     values : (n_events,) or (n_events, n_quantities) array_like
         Positive ratios, one row per calibration event, see `event_ratio`.
     prior_sd : float
-        Guess of the standard deviation of the logarithm of the ratio between events, made before these events.
+        Guess, made before these events, of how much log ratios scatter between events (standard deviation).
     prior_events : float
-        Number of events that this guess is worth; 0 for none. Where there is one event only, the ratio of a new one
-        depends on the guess, which must then be given.
+        Number of events that this guess is worth; 0 for none. A guess is required if there is one event only.
 
     Raises
     ------
@@ -122,15 +121,15 @@ class EventRatios:
 
     Notes
     -----
-    The logarithms of the ratios are normal with unknown mean and variance. With a flat prior of the mean and a scaled
-    inverse chi-squared prior of the variance (`prior_events` degrees of freedom, scale `prior_sd`), the logarithm of
-    the ratio of a new event has Student's t distribution (Gelman et al. 2013, section 3.2-3.3) with
+    The log ratios are normal with unknown mean and variance. With a flat prior for the mean and a scaled inverse
+    chi-squared prior for the variance (`prior_events` degrees of freedom, scale `prior_sd`), the log ratio in a new
+    event has Student's t distribution (Gelman et al. 2013, section 3.2-3.3) with
 
     .. math:: \nu = \nu_0 + K - 1, \qquad s^2 = \frac{\nu_0 s_0^2 + \sum_k (\ln r_k - m)^2}{\nu}
 
     degrees of freedom, the mean m of the K logarithms as its center and the scale :math:`s \sqrt{1 + 1 / K}`. The ratio
     itself has no mean and no variance, because the tails of its logarithm are heavier than exponential: use medians and
-    other quantiles. The CRPS, a mean of distances, is that of the draws, and large by chance where K is small.
+    other quantiles. The CRPS, a mean of distances, is computed from the draws; for small K it may be large by chance.
 
     References
     ----------
@@ -160,17 +159,17 @@ class EventRatios:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of Student's t distribution."""
+        """Degrees of freedom for Student's t distribution."""
         return self.prior_events + len(self.values) - 1.0
 
     @property
     def median(self) -> np.ndarray:
-        """Median of the ratio of a new event, of the shape of one row: the geometric mean of the ratios."""
+        """Median ratio in a new event, shaped like one row: the geometric mean of the ratios."""
         return np.exp(np.log(self.values).mean(axis=0))
 
     @property
     def scale(self) -> np.ndarray:
-        """Scale of the t distribution of the logarithm of the ratio of a new event."""
+        """Scale of the t distribution for the log ratio in a new event."""
         return self._sd() * np.sqrt(1.0 + 1.0 / len(self.values))
 
     @property
@@ -179,11 +178,11 @@ class EventRatios:
         return self.values.shape[1:]
 
     def of_quantity(self, k: int) -> "EventRatios":
-        """Ratios of one of several quantities."""
+        """Ratios for quantity `k` of several."""
         return EventRatios(self.values[:, k], self.prior_sd, self.prior_events)
 
     def factor(self, level: float = 0.9) -> np.ndarray:
-        """Ratio of the upper end of the central interval of a level to the median; the lower end is as far below."""
+        """Factor by which the ends of the central interval at a level are above and below the median."""
         if not 0.0 < level < 1.0:
             raise ValueError(f"EventRatios.factor: level must be between 0 and 1; got {level!r}")
         return np.exp(special.stdtrit(self.degrees_of_freedom, 0.5 + 0.5 * level) * self.scale)
@@ -201,7 +200,7 @@ class EventRatios:
         return special.stdtr(self.degrees_of_freedom, standardised(np.log(self.median) - np.log(ratio), self.scale))
 
     def draw_populations(self, n: int, rng: np.random.Generator, log_predicted: np.ndarray) -> RatioPopulations:
-        """Draw mean and standard deviation of the logarithm of the ratio from their posterior; one quantity."""
+        """Draw the mean and the standard deviation of log ratios from their posterior; one quantity."""
         if self.shape:
             raise ValueError(f"expected the ratios of one quantity, (n_events,); got {self.values.shape}")
         nu = self.degrees_of_freedom
@@ -254,7 +253,7 @@ class _Regression(NamedTuple):
     log_evidence: float
 
     def predict(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean of f (m,), its covariances with the events (m, K), and the weight (m,) of the error of the mean."""
+        """Mean of f (m,), its covariances with the events (m, K), and the weight (m,) of the mean's error."""
         covariance = self.kernel.matrix(z, self.z)
         left = (1.0 - covariance @ self.inverse.sum(axis=1)) / np.sqrt(self.inverse.sum())
         return self.mean + covariance @ self.inverse @ self.residuals, covariance, left
@@ -286,9 +285,9 @@ class LevelRatios:
     levels : (n_events,) array_like
         Predicted values of the quantity in these events, see `event_level`; positive.
     form : {"constant", "linear", "smooth"}, optional
-        How the logarithm of the ratio depends on the logarithm of the level: not, along a straight line, or along a
-        smooth curve (a Gaussian process). Default: all that the number of events permits, weighted by their evidence:
-        "constant", with 4 events "linear" and with 10 events "smooth".
+        How the log ratio depends on the logarithm of the level: not, along a straight line, or along a smooth curve (a
+        Gaussian process). Default: all that the number of events permits, weighted by their evidence: "constant", with
+        4 events "linear" and with 10 events "smooth".
     prior_sd, prior_events : float
         As for `EventRatios`: a guess of the standard deviation of the logarithm around the curve.
 
@@ -309,7 +308,7 @@ class LevelRatios:
     :math:`\nu_0 + K - 1` degrees of freedom, whose scale grows with the distance from the levels of the events. The
     distribution is the mixture over four amplitudes (0.25 to 16 times s) and, for smooth curves, three lengths (0.7,
     1.5 and 3 standard deviations of the log levels). The three forms have equal prior probabilities. With
-    ``form="constant"`` it is that of `EventRatios`. See ``docs/theory/prediction.rst``.
+    ``form="constant"`` the distribution is the same as with `EventRatios`. See ``docs/theory/prediction.rst``.
 
     Examples
     --------
@@ -366,7 +365,7 @@ class LevelRatios:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of the t distributions."""
+        """Degrees of freedom for the t distributions."""
         return self.prior_events + len(self.values) - 1.0
 
     @property
@@ -388,7 +387,7 @@ class LevelRatios:
         return self._above(logs.ravel(), self._components(predicted.ravel())).reshape(logs.shape)
 
     def quantile(self, probability: float, predicted: ArrayLike) -> np.ndarray:
-        """Quantile of the ratio of a new event at predicted values, of their shape.
+        """Quantile of the ratio in a new event, at predicted values and in their shape.
 
         Raises
         ------
@@ -438,13 +437,13 @@ class LevelRatios:
         return RatioPopulations(grid, center, sd)
 
     def _above(self, logs: np.ndarray, components: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Probability of the mixture above logarithms of ratios (m,)."""
+        """Probability of the mixture above log ratios (m,)."""
         nu = self.degrees_of_freedom
         parts = zip(self._weights, components, strict=True)
         return sum(w * special.stdtr(nu, standardised(c - logs, s)) for w, (c, s) in parts)
 
     def _components(self, log_predicted: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Center and scale of the t distribution of each part of the mixture, at log levels (m,)."""
+        """Center and scale of each t distribution in the mixture, at log levels (m,)."""
         z, found = (log_predicted - self._center) / self._width, []
         for part in self._parts:
             mean, covariance, left = part.predict(z)

@@ -1,9 +1,9 @@
-r"""Probability of an exceedance in a new event: per sample, and for draws of what is unknown of the events.
+r"""Probability of an exceedance in a new event: per sample, and per draw of the event population.
 
-The value in a new event is :math:`r\, g(\theta)`, with the ratio r of the error of the model and parameters that are
-those of the structure, or those of one event of a population. Given the population :math:`h`, the probability of an
-exceedance is a number :math:`P_h`. Its mean over the posterior of :math:`h` is the probability that is reported, and
-its quantiles are the interval. See ``docs/theory/prediction.rst``.
+The value in a new event is :math:`r\, g(\theta)`, with a ratio r for the model error, and parameters that belong to the
+structure, or to one event drawn from a population. Given the population :math:`h`, the probability of an exceedance is
+a number :math:`P_h`. Its mean over the posterior of :math:`h` is the probability that is reported, and its quantiles
+are the interval. See ``docs/theory/prediction.rst``.
 """
 
 from typing import NamedTuple
@@ -20,17 +20,17 @@ _CHUNK = 2**20  # values of a temporary array
 
 
 class EventSpread(NamedTuple):
-    """What the probability of an exceedance in a new event depends on, and is not known exactly.
+    """Unknowns on which the probability of an exceedance in a new event depends.
 
     Attributes
     ----------
     values : ndarray, shape (n_samples, ...)
         Values of the samples, before they are multiplied by a ratio.
     weights : ndarray, shape (n_populations, n_samples), or None
-        Weights by which the samples are draws of each of several populations (`Hierarchy.population_weights`). None if
-        the samples are those of the parameters of the structure, which are the same in all events.
+        Importance weights of the samples under each of several populations (`Hierarchy.population_weights`). None if
+        the parameters are the same in all events.
     ratios : EventRatios, LevelRatios or None
-        Ratios of the error of the model, None for none.
+        Ratios that contain the model error, None for none.
     """
 
     values: np.ndarray
@@ -131,7 +131,7 @@ def exceedance_draws(
 def _given_populations(
     values: np.ndarray, limits: np.ndarray, populations: RatioPopulations, below: bool
 ) -> np.ndarray:
-    """Probability that values (n_draws, m, ...) times a ratio of the population of their draw exceed limits."""
+    """Probability that values (n_draws, m, ...) times a ratio from their draw's population exceed limits."""
     positive = values > 0.0
     logs = np.log(np.where(positive, values, 1.0))
     sd = populations.sd.reshape(-1, *(1,) * (values.ndim - 1))

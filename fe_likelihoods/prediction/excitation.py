@@ -30,9 +30,9 @@ class Excitation(NamedTuple):
     model : Model
         The model under the whole excitation.
     first : int
-        Sample of its response at which the prediction begins.
+        Index of the response sample at which the prediction begins.
     n_steps : int
-        Number of samples of the prediction.
+        Number of samples in the prediction.
     from_state : str
         State at the beginning of the prediction, "virgin" or "end".
     """
@@ -45,8 +45,8 @@ class Excitation(NamedTuple):
     def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
 
-        With `stored`, they are looked up and stored there, those of the whole excitation. New ones are then simulated
-        from its beginning: a simulation from a kept state has only the last part of the response.
+        With `stored`, responses to the whole excitation are looked up and stored there. New responses are then
+        simulated from the beginning, because a simulation from a kept state has only the last part of the response.
         """
         if stored is not None:
             responses, reasons = stored.simulate(thetas)
@@ -64,7 +64,7 @@ def chosen_state(model: Model, record: Any, from_state: str | None, stacklevel: 
     model : Model
         The model. Without an attribute ``path_dependent`` it counts as path dependent.
     record : Record or None
-        The new excitation, None for that of the model.
+        The new excitation, None for the model's own.
     from_state : {"virgin", "end"} or None
         The state, None for the default.
     stacklevel : int
@@ -108,7 +108,7 @@ def excite(model: Model, record: Any, from_state: str, rest: float) -> Excitatio
     model : Model
         The model.
     record : Record or None
-        The new excitation, None for that of the model.
+        The new excitation, None for the model's own.
     from_state : {"virgin", "end"}
         State at the beginning of the prediction.
     rest : float

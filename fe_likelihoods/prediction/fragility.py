@@ -1,8 +1,8 @@
 """Fragility: probability that a response exceeds a limit, against the intensity of the shaking.
 
 Under each record the probability of an exceedance is the mean over the samples of the posterior, or over draws of a new
-event (`Hierarchy`), of the probability that each exceeds. It contains the error of the model, from ratios of measured
-to fitted values or from a noise that follows the response. A lognormal curve is fitted to these points
+event (`Hierarchy`), of the probability that each exceeds. It contains the model error, from ratios of measured to
+fitted values or from a noise that follows the response. A lognormal curve is fitted to these points
 (`fe_likelihoods.prediction.fragility_curve`). See ``docs/theory/prediction.rst``.
 """
 
@@ -50,7 +50,7 @@ class Fragility(NamedTuple):
     Attributes
     ----------
     names : tuple of str
-        Names of the records; those of the components of an excitation are joined by a comma.
+        Names of the records; component names of one excitation are joined by a comma.
     intensity : ndarray, shape (n_records,)
         Intensities of the records.
     probability : ndarray, shape (n_records,)
@@ -69,8 +69,8 @@ class Fragility(NamedTuple):
         State of the structure at the beginning of each record, "virgin" or "end", as in
         `fe_likelihoods.prediction.propagation.propagate`.
     draws : ndarray, shape (n_draws, n_records), or None
-        Probabilities for draws of what is unknown of the ratios and of the population of events, from which intervals
-        and bands are made. None if there are neither ratios nor a population.
+        Probabilities for posterior draws of the ratio distribution and the event population, from which intervals and
+        bands are made. None if there are neither ratios nor a population.
     uncertainty : str
         What the probabilities contain.
     unit : str
@@ -153,7 +153,7 @@ def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
 
 
 def _components(record: Record | Sequence[Record]) -> tuple[Record, ...]:
-    """The records of one excitation: one, or those of its directions or supports."""
+    """The records of one excitation: one, or one per direction or support."""
     return (record,) if isinstance(record, Record) else tuple(record)
 
 
@@ -188,13 +188,13 @@ def fragility(
     Parameters
     ----------
     posterior_or_model, samples
-        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: `n` draws of the
-        parameters of a new event are then simulated under each record, and the intervals contain what is unknown of the
+        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: `n` parameter draws
+        for a new event are then simulated under each record, and the intervals contain the uncertainty of the
         population.
-    records : sequence of Record, or of tuples of Record
+    records : sequence of (Record or tuple of Record)
         Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions. Each is a
         tuple if the model has several components: the horizontal and the vertical record of an `IsolatedBridge`, or the
-        records of the supports of a `LinearStructure`.
+        support records of a `LinearStructure`.
     quantity : ChannelQuantity or callable
         A quantity that is one number, such as ``peak("displacement")``.
     threshold : float
@@ -202,17 +202,17 @@ def fragility(
     part : str, optional
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model predicts.
     unit : str, optional
-        Unit of the threshold. It must have the dimension of the channel of the quantity. Default: SI.
+        Unit of the threshold, with the dimension of the quantity's channel. Default: SI.
     ratios : EventRatios or LevelRatios, optional
-        Ratios of measured to fitted values of the quantity in several events: the error of the model.
+        Ratios of measured to fitted values of the quantity in several events: the model error.
     noise : bool or str, optional
-        The error of the model from the noise of the calibration, as for `propagate`. Default: "model" if there are no
-        ratios, the noise follows the response (`GaussianNoise` with shares) and the samples have its parameters.
-        Otherwise the error of the model is left out, with a warning; False states that this is on purpose.
+        The model error from the noise of the calibration, as for `propagate`. Default: "model" if there are no ratios,
+        the noise follows the response (`GaussianNoise` with shares) and the samples have its parameters. Otherwise the
+        model error is left out, with a warning; False states that this is on purpose.
     n : int
         Number of draws from a `Hierarchy`.
     intensity : callable
-        Function of an element of `records` that returns a positive number. Default: peak acceleration [m/s²], of the
+        Function that returns a positive number for an element of `records`. Default: peak acceleration [m/s²], of the
         first record of a tuple (the horizontal component, or the first support).
     failures_exceed : bool
         Count a failed simulation as an exceedance, for models whose simulation fails at collapse. Default: failed
@@ -225,8 +225,8 @@ def fragility(
     level : float
         Probability of the intervals, between 0 and 1.
     seed : int, optional
-        Seed of the noise, of the draws of a new event and of the ratios' population, and of the resampling for the
-        errors of the curve.
+        Seed for the noise, for drawing new events and ratio distributions, and for the resampling that gives the errors
+        of the curve.
     **settings
         Further arguments of `propagate`: batch, pool, progress.
 
@@ -246,8 +246,8 @@ def fragility(
     Warns
     -----
     UserWarning
-        If the error of the model is left out without ``noise=False``. As `propagate`; with a `Hierarchy`, for peaks
-        outside of the range of all its tests, if their `StoredPosterior` have their measurements.
+        If the model error is left out without ``noise=False``. As `propagate`; with a `Hierarchy`, also if peaks are
+        outside the range of all its tests, where each `StoredPosterior` has its measurements.
     """
     if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
@@ -272,7 +272,7 @@ def fragility(
     intensities = np.array([float(intensity(record)) for record in records])
     if not np.all((intensities > 0.0) & (intensities < np.inf)):
         raise ValueError(f"intensities must be positive and finite; got {intensities}")
-    if isinstance(samples, Hierarchy):  # the range of amplitudes is that of all its tests
+    if isinstance(samples, Hierarchy):  # all its tests together give the range of amplitudes
         settings = of_hierarchy(samples) | settings
     n = len(thetas)
     effective = check_effective_sample_size(effective_sample_size, n)
@@ -337,7 +337,7 @@ def _chosen(
     n: int,
     seed: int | None,
 ) -> tuple[Any, Any, bool | str, np.ndarray | None]:
-    """The object to predict with, its samples, the noise to predict with, and the weights of draws of a new event."""
+    """The object to predict with, its samples, the noise to predict with, and the weights of the new-event draws."""
     if ratios is not None and noise:
         raise ValueError("ratios contain the error of the model already: leave out noise, or give noise=False")
     of_population = isinstance(samples, Hierarchy)
@@ -367,7 +367,7 @@ def _chosen(
 
 
 def _with_noise(posterior: Any, samples: Any, part: str | None, source: PredictionSource) -> Any:
-    """The samples with the parameters of the noise, None if they have structural parameters only."""
+    """The samples with the noise parameters, None if they have structural parameters only."""
     try:
         rows = part_of(posterior, samples, part, True)[1]
     except ValueError:  # of a joint likelihood, without the parameters of the noise

@@ -33,11 +33,11 @@ class FragilityCurve(NamedTuple):
     median : float
         Intensity at which the probability is one half.
     dispersion : float
-        Standard deviation of the logarithm of the capacity in terms of intensity [-].
+        Standard deviation of the log capacity in terms of intensity [-].
     median_error, dispersion_error : float
-        Errors for fixed records: from what is unknown of the ratios and of the population of events, if there are any;
-        otherwise Monte Carlo errors, by resampling the samples (which all records share). They do not include the
-        effect of other records. They are inf if more than a tenth of the resamplings do not determine a curve.
+        Errors for fixed records: from the uncertainty of ratios and event population, if there are any; otherwise Monte
+        Carlo errors, by resampling the samples (which all records share). They do not include the effect of other
+        records. They are inf if more than a tenth of the resamplings do not determine a curve.
     unit : str
         Unit of the intensities; empty where it is not known.
     """

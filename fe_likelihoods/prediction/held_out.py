@@ -25,11 +25,11 @@ class HeldOutScore(NamedTuple):
     Attributes
     ----------
     scores : HistoryScores or QuantityScores
-        Of the prediction against the measurements of the event.
+        Scores of the prediction against the event's measurements.
     log_density : float
-        Logarithm of the predictive density of all data of the event, see `LeftOut`; NaN without its evidence.
+        Log predictive density of all data in the event, see `LeftOut`; NaN without the event's evidence.
     prediction : Prediction
-        The prediction; its number of samples is that of the simulations.
+        The prediction; its number of samples is the number of simulations.
     """
 
     scores: HistoryScores | QuantityScores
@@ -38,7 +38,7 @@ class HeldOutScore(NamedTuple):
 
     @property
     def cells(self) -> dict[str, str]:
-        """The scores as texts by headings, for `score_left_out`: of each number, or of each channel of histories."""
+        """The scores as texts by headings, for `score_left_out`: per number, or per channel for histories."""
         scores, found = self.scores, {}
         if isinstance(scores, QuantityScores):
             for k, (name, unit) in enumerate(zip(scores.names, scores.units, strict=True)):
@@ -78,12 +78,12 @@ def score_left_out(
     left_out : mapping of str to LeftOut
         Result of `leave_one_out`, or some of it.
     posteriors : mapping of str to Posterior
-        The posterior of each of these events, with its model and its measurements.
+        The posterior for each of these events, with its model and its measurements.
     quantity : optional
         As for `propagate`: numbers such as ``peak(channel)``, or histories (default).
     ratios : mapping of str to array_like, optional
-        The `event_ratio` of each event, by name; each prediction is corrected with those of the other events, two or
-        more.
+        The `event_ratio` of each event, by name; each prediction is corrected with the ratios of the other events, two
+        or more.
     noise, n, options
         As for `predict_new_event`; `n` simulations for each event.
     seed : int

@@ -142,9 +142,9 @@ def split_samples(
         All parameters, or without `noise` the structural parameters alone.
     noise : bool or str
         Whether the noise is wanted; the name of an event for the noise that was calibrated with it
-        (``groups="event"``); "model" for the error of the model alone (`model_error`).
+        (``groups="event"``); "model" for the model error alone (`model_error`).
     other_record : bool
-        Whether the prediction is of another record than that of the likelihood.
+        Whether the prediction is under a record that differs from the likelihood's record.
 
     Returns
     -------
@@ -156,8 +156,8 @@ def split_samples(
     Raises
     ------
     ValueError
-        If the samples have another shape, are not finite, or give an impossible noise; or if noise is wanted of a
-        model, or of a noise without ``standard_deviations``.
+        If the samples have another shape, are not finite, or give an impossible noise; or if noise is wanted for a bare
+        model, or the noise has no ``standard_deviations``.
     """
     model, noise_model = source.model, source.noise
     structural = tuple(model.parameter_names)
@@ -195,7 +195,7 @@ def split_samples(
 
 
 def distinct_rows(thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct rows in the order of their first appearance, and the index among them of each row."""
+    """Return the distinct rows in the order of first appearance, and for each row its index among them."""
     keys, row_of_sample = distinct_keys(thetas)
     return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), -1).copy(), np.array(row_of_sample)
 
@@ -209,7 +209,7 @@ def samples_of_rows(row_of_sample: np.ndarray, n_rows: int) -> list[np.ndarray]:
 def _noise_of_events(
     noise_model: GaussianNoise, parameters: np.ndarray, model: Model, noise: bool | str, other_record: bool
 ) -> SampleNoise:
-    """Noise with levels per event: each at its steps, or those of one event at all steps."""
+    """Noise with levels per event: each level at its steps, or one event's levels at all steps."""
     known = [each.name for each in noise_model.events]
     names = ", ".join(map(repr, known))
     rows = [[channel.name for channel in noise_model.channels].index(channel.name) for channel in model.channels]

@@ -1,13 +1,12 @@
-r"""Error of a model in the response of a structure, without the noise of the sensors.
+r"""Model error in the response of a structure, without the sensor noise.
 
 A noise whose standard deviation follows the response (`GaussianNoise` with ``level="measured"`` or ``"response"``) has
-two parts: the noise of the sensor, which is no motion of the structure, and the error of the model. Their variances
-add, :math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest
-of many independent errors adds to each peak, while the errors of a model are motions of a structure and change as
-slowly as its response. A draw of the error of the model therefore has the amplitudes of the spectrum of the response,
-random phases, and the standard deviation :math:`\sigma_m` at each step. A noise with a spectrum of its own (bands of
-frequency) keeps it, from which the white noise of the sensor is taken out per frequency. See
-``docs/theory/prediction.rst``.
+two parts: the sensor noise, which is no motion of the structure, and the model error. Their variances add,
+:math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest of
+many independent errors adds to each peak, while model errors are motions of a structure and change as slowly as its
+response. A draw of the model error therefore has the Fourier amplitudes of the response, random phases, and the
+standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself (frequency bands) keeps it, and the
+white sensor noise is subtracted per frequency. See ``docs/theory/prediction.rst``.
 """
 
 from typing import Any, NamedTuple
@@ -20,14 +19,14 @@ __all__ = ["ModelError", "model_error"]
 
 
 class ModelError(NamedTuple):
-    """Error of the model of every sample; the members that a prediction uses are those of `SampleNoise`.
+    """Model error of every sample; a prediction uses it like a `SampleNoise`.
 
     Attributes
     ----------
     noise : Noise
         The noise.
     deviations : ndarray, shape (n, n_noise)
-        Parameters of the noise.
+        Noise parameters.
     dt : float
         Time step of the responses [s].
     """
@@ -37,7 +36,7 @@ class ModelError(NamedTuple):
     dt: float
 
     def of_response(self, parameters: np.ndarray, response: np.ndarray) -> np.ndarray:
-        """Standard deviations (n_channels, n_steps) [SI] of one sample, without the noise of the sensors."""
+        """Standard deviations (n_channels, n_steps) [SI] of one sample, without the sensor noise."""
         total = self.noise.response_deviations(parameters, response, dt=self.dt)
         sensor = getattr(self.noise, "sensor", None)
         if sensor is None:
@@ -56,7 +55,7 @@ class ModelError(NamedTuple):
 
 
 def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
-    """Error of the model of samples of the parameters of a noise.
+    """Return the model error for samples of the noise parameters.
 
     Parameters
     ----------
@@ -64,7 +63,7 @@ def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
         With a method ``response_deviations``, such as `GaussianNoise` with ``level="response"``, and ``sensor``, the
         known standard deviations of the sensors, or None.
     parameters : (n, n_noise) float
-        Parameters of the noise.
+        Noise parameters.
     dt : float
         Time step of the responses [s].
 
@@ -75,7 +74,7 @@ def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
     Raises
     ------
     ValueError
-        If the noise does not follow the response: its levels do not tell the error of the model from that of sensors.
+        If the noise does not follow the response: its levels do not tell the model error from sensor noise.
     """
     if not follows_response(noise):
         raise ValueError(

@@ -1,14 +1,14 @@
 r"""Prediction of an event that the structure has not seen yet, from several events that it has.
 
-Parameters of a structure differ from event to event: frequency and damping change with the amplitude, the season and
-the years. The posterior of one event, or the common posterior of all, is narrower than these differences. The
-prediction of a new event therefore draws its parameters from the population of the events (`Hierarchy.new_test`), and
-corrects quantities such as peaks by the ratio of measured to fitted values in the calibration events:
+Structural parameters differ from event to event: frequency and damping change with the amplitude, the season and the
+years. The posterior of one event, or the common posterior of all, is narrower than these differences. The prediction of
+a new event therefore draws its parameters from the event population (`Hierarchy.new_test`), and corrects quantities
+such as peaks by the ratio of measured to fitted values in the calibration events:
 
 .. math:: g_\mathrm{new} = r_\mathrm{new}\, g(\theta_\mathrm{new}), \qquad
    \ln r_\mathrm{new} \sim t_\nu\!\left(m,\ s \sqrt{1 + 1 / K}\right).
 
-Where the errors of ratio and parameters depend on each other, `predict_from_median` has both in one ratio.
+Where fitting errors and parameters are correlated, `predict_from_median` has both in one ratio.
 Equations are on the page ``docs/theory/prediction.rst``.
 """
 
@@ -47,7 +47,7 @@ def event_level(
     Returns
     -------
     ndarray, shape () or (n_quantities,)
-        Median of the response of the samples [SI], without noise.
+        Median over the samples' responses [SI], without noise.
 
     Raises
     ------
@@ -77,8 +77,8 @@ def event_ratio(
     Returns
     -------
     ndarray, shape () or (n_quantities,)
-        Measured value divided by the median of the response of the samples, without noise: the error of the model in
-        this quantity where the model fits best.
+        Measured value divided by the median over the samples' responses, without noise: the model error in this
+        quantity where the model fits best.
 
     Raises
     ------
@@ -109,41 +109,41 @@ def predict_new_event(
     seed: int | None = None,
     **options: Any,
 ) -> Prediction:
-    """Predict an event that is not among those of a hierarchical model.
+    """Predict an event that is not among the events of a hierarchical model.
 
     Parameters
     ----------
     hierarchy : Hierarchy
-        The population of the parameters of the calibration events. Its varying and common parameters must contain those
-        of the model, unless their priors are the same in all events.
+        The parameter population over the calibration events. Its varying and common parameters must include the model's
+        parameters, except those whose prior is the same in all events.
     posterior_or_model : Posterior, FELikelihood or Model
-        The model to predict with, such as the posterior of one of the events; with a noise for ``noise=True``.
+        The model to predict with, such as one event's posterior; with a noise for ``noise=True``.
     record : Record, or sequence of Record
         Excitation of the new event.
     quantity : optional
         As for `propagate`. Default: the histories of all channels.
     ratios : EventRatios or LevelRatios, optional
         Ratios of measured to fitted values of the quantity in the calibration events, for numbers such as
-        ``peak(name)`` or several of them. The prediction is that of the measured value. With `LevelRatios` (one number
-        only) the ratio of each draw is that at its predicted value.
+        ``peak(name)`` or several of them. The measured value is then predicted. With `LevelRatios` (one number only)
+        each draw has the ratio at its predicted value.
     noise : bool or str
-        Whether histories are predicted with noise, as for `propagate`. The parameters of the noise must be varying,
-        common, or have the same prior in all events. Shares of the response (`GaussianNoise`)
+        Whether histories are predicted with noise, as for `propagate`. The noise parameters must be varying, common, or
+        have the same prior in all events. Shares of the response (`GaussianNoise`)
         transfer between events, levels in SI units do not.
     n : int
         Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more of
         ``level="measured"``, are left out.
     seed : int, optional
-        Seed of the draws of parameters, ratios and noise.
+        Seed for drawing parameters, ratios and noise.
     **options
         Further options of `propagate`, such as ``quantiles=`` and ``from_state=``.
 
     Returns
     -------
     Prediction
-        Its spread contains that between events. With ratios, mean, variance and standard error are NaN: the exponential
-        of Student's t has no mean; use quantiles. `exceedance` of it has intervals that contain what is unknown of the
-        population and of the ratios.
+        Its spread contains the spread between events. With ratios, mean, variance and standard error are NaN: the
+        exponential of Student's t has no mean; use quantiles. The intervals that `exceedance` derives from it contain
+        the uncertainty of the population and the ratios.
 
     Raises
     ------
@@ -155,8 +155,8 @@ def predict_new_event(
     -----
     UserWarning
         As `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. As `propagate` for peaks
-        outside of the range of all events, if their `StoredPosterior` have their measurements. The residuals of the
-        single calibrations are not checked here.
+        outside the range of all events, if each `StoredPosterior` has its measurements. Residuals of the single
+        calibrations are not checked.
 
     Examples
     --------
@@ -210,30 +210,30 @@ def predict_from_median(
     seed: int | None = None,
     **options: Any,
 ) -> Prediction:
-    r"""Predict the measured peaks of a new event by the parameters in the middle of the population, and a ratio.
+    r"""Predict the measured peaks of a new event from the population's median parameters and a ratio.
 
-    The ratios are those of the measured values to the values at these parameters, :math:`r_k = y_k / g_k(\bar\theta)`.
-    They contain the difference of each event from the middle as well as the error of its fit, with all that these have
-    to do with each other. `predict_new_event` adds both as if they were independent, which makes intervals too wide
-    where a fit that is too low goes with parameters whose response is too low.
+    Each ratio divides a measured value by the value at these parameters, :math:`r_k = y_k / g_k(\bar\theta)`. It
+    combines the event's deviation from the median and its fitting error, including their correlation.
+    `predict_new_event` adds both as if they were independent, so that intervals are too wide where both cancel: where
+    events whose parameters give a low response are also fitted too low.
 
     Parameters
     ----------
     hierarchy : Hierarchy
-        The population of the parameters of the calibration events.
+        The parameter population over the calibration events.
     posteriors : mapping of str to Posterior or FELikelihood
         The likelihood with the measurements of each event of the hierarchy; others are not used.
     posterior_or_model : Posterior, FELikelihood or Model
         The model to predict with. All its parameters must be varying or common.
     record : Record, or sequence of Record
-        Excitation of the new event; None for that of the model.
+        Excitation of the new event; None for the model's excitation.
     quantity : ChannelQuantity or list of ChannelQuantity
         Positive numbers, such as ``peak("deck")``.
     prior_sd, prior_events : float
-        Guess of the standard deviation of the logarithm of the ratio, and the number of events that it is worth, as for
-        `EventRatios`. Needed for one event.
+        Guess of the log ratios' standard deviation, and the number of events that it is worth, as for `EventRatios`.
+        Needed for one event.
     n : int
-        Number of draws of the ratio. Each event of the hierarchy, and the new one, is simulated once.
+        Number of ratio draws. Each event of the hierarchy, and the new one, is simulated once.
     seed : int, optional
         Seed of the draws.
     **options
@@ -242,7 +242,7 @@ def predict_from_median(
     Returns
     -------
     Prediction
-        Its values are those of measurements. `exceedance` of it has intervals that contain what is unknown of the
+        Its values predict measurements. The intervals that `exceedance` derives from it contain the uncertainty of the
         ratio.
 
     Raises
@@ -256,7 +256,7 @@ def predict_from_median(
     Warns
     -----
     UserWarning
-        As `predict_new_event`, of peaks outside of the range of all events.
+        As `predict_new_event`, if peaks are outside the range of all events.
 
     Notes
     -----
@@ -291,7 +291,7 @@ def predict_from_median(
 
 
 def _with_spread(prediction: Prediction, weights: np.ndarray, ratios: EventRatios | LevelRatios | None) -> Prediction:
-    """The prediction with what is unknown of the events; histories, whose values are not kept, as they are."""
+    """The prediction with its event spread; histories, whose values are not kept, are returned unchanged."""
     if prediction.values is None:
         return prediction
     weights = np.delete(weights, prediction.failed, axis=1)
@@ -339,7 +339,7 @@ def of_hierarchy(hierarchy: Hierarchy) -> dict[str, Any]:
 
 
 def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]:
-    """Leave out draws whose noise is impossible: a population has no bounds, shares of the response have."""
+    """Leave out draws whose noise is impossible: a population has no bounds, but shares of the response have."""
     if not hasattr(noise, "standard_deviations"):
         return draws
     deviations = noise.standard_deviations(np.stack([draws[name] for name in noise.parameter_names], axis=1))
@@ -356,7 +356,7 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
 
 
 def _corrected(prediction: Prediction, ratios: EventRatios | LevelRatios, rng: np.random.Generator) -> Prediction:
-    """The prediction times draws of the ratio of a new event."""
+    """The prediction times draws of a new event's ratio."""
     if ratios.shape != prediction.mean.shape:
         raise ValueError(
             f"predict_new_event: expected ratios (n_events, ...) of a quantity of shape {prediction.mean.shape}; got "

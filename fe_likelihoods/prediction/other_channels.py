@@ -1,8 +1,8 @@
-"""Predictions of channels that were not measured, with the noise of those that were.
+"""Predictions of channels that were not measured, with noise from the measured channels.
 
-A calibrated model predicts every floor of a building, but the posterior has parameters of the noise for the measured
-floors only. Those of another channel are taken to be the mean of those of the measured channels of its quantity. This
-is an assumption, which every such prediction states.
+A calibrated model predicts every floor of a building, but the posterior has noise parameters for the measured floors
+only. An unmeasured channel gets the mean noise parameters of the measured channels with the same quantity. This is an
+assumption, which every such prediction states.
 """
 
 from typing import Any
@@ -45,8 +45,8 @@ def predict_channels_of(
     Raises
     ------
     ValueError
-        If there is no likelihood; the model has other parameters; or, if the noise is wanted, a channel has the
-        quantity of no measured one, a measured channel has another quantity, or the noise has no method
+        If there is no likelihood; the model has other parameters; or, if the noise is wanted, a channel shares its
+        quantity with no measured channel, a measured channel has another quantity, or the noise has no method
         ``with_channels``. As `split_samples` for samples that do not fit.
     """
     if source.likelihood is None:
@@ -77,7 +77,7 @@ def predict_channels_of(
 
 
 def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, str]:
-    """Weights (n_channels, n_measured) of the measured channels in those of a model, and the remark on them."""
+    """Weights (n_channels, n_measured) of the measured channels in each channel of a model, and the remark on them."""
     measured = noise_channels(source.noise, source.model.channels)
     rows = {channel.name: k for k, channel in enumerate(measured)}
     weights, of_quantity = np.zeros((len(model.channels), len(measured))), {}

@@ -68,18 +68,18 @@ class Prediction:
     dt : float or None
         Time step of the histories [s], None for other quantities.
     noise : bool
-        Whether the measurement noise, or the error of the model, is included.
+        Whether the measurement noise, or the model error, is included.
     from_state : str
-        State of the structure at the beginning: "virgin", that of the model before any excitation, or "end", that after
-        the excitation with which the model was made.
+        State of the structure at the beginning: "virgin", before any excitation, or "end", after the excitation with
+        which the model was made.
     shifted : tuple of str
         Channels of the measurements with unknown time shifts (``time_shifts=`` of `fe_likelihoods.FELikelihood`). The
-        histories are those of the response, without a shift.
+        histories are responses without a shift.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
     spread : EventSpread or None
-        What is unknown of the events, for the intervals of `fe_likelihoods.exceedance`; None unless the prediction is
-        that of a new event (`fe_likelihoods.predict_new_event`).
+        Uncertainty of ratios and event population, for the intervals of `fe_likelihoods.exceedance`; None unless a new
+        event is predicted (`fe_likelihoods.predict_new_event`).
     remarks : tuple of str
         What speaks against the prediction, as `fe_likelihoods.propagate` has warned.
     """
@@ -112,7 +112,7 @@ class Prediction:
 
     @property
     def has_ratios(self) -> bool:
-        """Whether the values are those of measurements, by ratios of measured to simulated values in other events."""
+        """Whether the values predict measurements, by ratios of measured to simulated values in other events."""
         return self.spread is not None and self.spread.ratios is not None
 
     @property
@@ -127,7 +127,7 @@ class Prediction:
         return np.arange(self.mean.shape[1]) * self.dt
 
     def quantile(self, probability: float) -> np.ndarray:
-        """Return the quantile, shape (...), of one of the `probabilities`; raise ValueError for another one."""
+        """Return the quantile, shape (...), for one of the `probabilities`; raise ValueError for another one."""
         if probability not in self.probabilities:
             raise ValueError(
                 f"no quantile {probability!r} in this prediction, it has {self.probabilities}: propagate with "
@@ -163,7 +163,7 @@ class Prediction:
         ------
         ValueError
             If the prediction has no histories, a shift of `shifted` is not given, the measurements lack a channel or
-            have samples outside of the histories, or a measured channel is zero, or has no sample, in the part.
+            have samples outside the histories, or a measured channel is zero, or has no sample, in the part.
         """
         compared = self._compared(measurements, time_shifts)
         measured, mean = _values_of(compared), _at_samples(compared, self.mean)
@@ -229,12 +229,12 @@ class Prediction:
         Parameters
         ----------
         measured : Measurements or array_like
-            Measurements of all channels, as for `rrmse`. For quantities that are no histories also the measured values
-            themselves [SI], in the shape of the quantity. Of `Measurements`, the same function of the same channels is
-            taken, such as the peak.
+            Measurements of all channels, as for `rrmse`. For quantities other than histories also the measured values
+            themselves [SI], in the shape of the quantity. From `Measurements` the quantity, such as a peak, is computed
+            as it was from the responses.
         level : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
-            with the probabilities (1 - level) / 2 and (1 + level) / 2; the default has those of 0.9.
+            with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
         part : slice
             The samples of the histories to score. Default: all.
         time_shifts : mapping of str to float, optional
@@ -261,8 +261,8 @@ class Prediction:
 
         Notes
         -----
-        Measurements contain the error of the model and of the sensors: score a prediction with ``noise=True``, unless
-        the quantity is known to be free of them. Of histories, CRPS, log score and PIT are those of the normal
+        Measurements contain the model error and sensor noise: score a prediction with ``noise=True``, unless the
+        quantity is known to be free of them. For histories, CRPS, log score and PIT are computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
         """
         if not 0.0 < level < 1.0:
@@ -331,7 +331,7 @@ class Prediction:
         return score_values(names, units, values, observed.ravel(), level, self.effective_sample_size)
 
     def _near_quantile(self, probability: float) -> np.ndarray:
-        """The quantile of a probability that is known up to round-off."""
+        """The quantile for a probability that is known up to round-off."""
         return self.quantile(next((p for p in self.probabilities if abs(p - probability) < 1e-9), probability))
 
     def __repr__(self) -> str:

@@ -108,10 +108,10 @@ def propagate(
     part : str, optional
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model and noise predict.
     model : Model, optional
-        A model with the same parameters and other channels, such as floors that were not measured, which may have
-        another excitation; default: that of the posterior. With noise, a channel that was not measured has the mean of
-        the parameters of the noise of the measured channels of the same quantity: of shares if the noise is in shares
-        of the response, of standard deviations [SI] otherwise. `Prediction.remarks` states it.
+        A model with the same parameters and other channels, such as unmeasured floors, and possibly another excitation.
+        Default: the posterior's model. With noise, an unmeasured channel gets the mean noise parameters of the measured
+        channels with the same quantity: the mean share if the noise is in shares of the response, the mean standard
+        deviation [SI] otherwise. `Prediction.remarks` states it.
     quantity : optional
         None for the histories of all channels, the name of a channel or several names for their histories,
         ``peak(name)`` or another `fe_likelihoods.prediction.quantities.ChannelQuantity` or several of them, or a
@@ -131,11 +131,10 @@ def propagate(
         Predict measurements: the response plus the noise of each sample, with its correlation in time. For histories,
         mean and variance are exact in the noise (the law of total variance adds the mean variance of the noise), and
         quantiles use one draw of the noise per sample. For other quantities, one draw per sample is added to the
-        response. "model" predicts the response of the structure with the error of the model and without the noise of
-        the sensors, for a noise that follows the response (`GaussianNoise` with shares); the errors have the spectrum
-        of the response, or that of the bands, because white errors make peaks too large. A noise with levels per event
-        has those of each event in that event; under another `record`, give the name of the event whose levels hold for
-        it.
+        response. "model" predicts the response of the structure with the model error and without the sensor noise, for
+        a noise that follows the response (`GaussianNoise` with shares); the errors have the spectrum of the response or
+        of the noise's bands, because white errors make peaks too large. A noise with levels per event has in each event
+        the levels of that event; under another `record`, give the name of the event whose levels hold for it.
     quantiles : sequence of float
         Probabilities of the quantiles, between 0 and 1. An empty sequence for none.
     effective_sample_size : float, optional
@@ -157,18 +156,19 @@ def propagate(
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
     cache : SimulationCache or path, optional
-        Where responses are looked up and stored as soon as they are simulated, so that a prediction which was
-        interrupted, or is made again, repeats none of them but one or two that are compared. Those of the whole
-        excitation are stored, also for "end", so that new ones need it simulated from its beginning: without `cache`
-        kept states save that (`state_bytes`). Default: responses are not stored.
+        Where responses are looked up, and stored as soon as they are simulated. A prediction that was interrupted, or
+        is made again, repeats only one or two of them, to compare. Responses to the whole excitation are stored, also
+        for "end", so that new ones are simulated from the beginning; without `cache`, kept states avoid this
+        (`state_bytes`). Default: responses are not stored.
     calibrated : sequence of Measurements, optional
-        Measurements of the events with which the parameters were calibrated, whose amplitudes a prediction under
-        another record is compared with. Default: those of the likelihood. An empty sequence for no comparison.
+        Measurements of the calibration events, with whose amplitudes a prediction under another record is compared.
+        Default: the likelihood's measurements. An empty sequence for no comparison.
     check : bool
-        Whether the residuals of the calibration are compared with the noise, where samples of all parameters are
-        given. A warning says it once for each likelihood, `Prediction.remarks` with every prediction. Under another
-        record this needs one simulation of that of the calibration, which the likelihood counts, or none if it has
-        stored responses or earlier samples of this likelihood were compared: then what these have shown is repeated.
+        Whether the calibration residuals are compared with the noise, where samples of all parameters are given. If
+        they disagree, one warning per likelihood says so, and the `Prediction.remarks` of every prediction. Under
+        another record this needs one simulation under the calibration record, which the likelihood counts. No
+        simulation is needed if the likelihood has stored responses, or if earlier samples of this likelihood were
+        compared: that result is then repeated.
     seed : int, optional
         Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
         except for round-off.
@@ -184,8 +184,8 @@ def propagate(
     ------
     ValueError
         Before any simulation: for samples of another shape, without rows, or not finite; unknown channels; noise of a
-        bare model, or impossible parameters of the noise; a model with one excitation only, or one that cannot continue
-        from the end of its excitation; settings out of range; a `model` with other parameters, or with a channel whose
+        bare model, or impossible noise parameters; a model with one excitation only, or one that cannot continue from
+        the end of its excitation; settings out of range; a `model` with other parameters, or with a channel whose
         quantity was not measured and whose noise is wanted.
         Later: for a function that returns arrays of different shapes.
     SimulationFailed
@@ -198,14 +198,13 @@ def propagate(
         If the median of the predicted peak of a channel, under another record or of another `model`, is more than twice
         the largest measured peak of the calibration, or less than half of the smallest one.
         If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
-        SI units, and their level is more than three times that of the measurements of the calibration, or less than a
-        third.
-        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and their
-        median is more than 1.1 times that of the response. Once for each likelihood, if its residuals are correlated
-        and `GaussianNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent, or the
-        whitened residuals of shares or bands are correlated; and if less than 0.75 times the simulated response fits
-        the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of this
-        response.
+        SI units, and their level is more than three times the level of the calibration measurements, or less than a
+        third. If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and the
+        median peak is more than 1.1 times as large as without noise. Once for each likelihood, if its residuals are
+        correlated and `GaussianNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent,
+        or the whitened residuals of shares or bands are correlated; and if less than 0.75 times the simulated response
+        fits the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of
+        this response.
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
@@ -307,7 +306,7 @@ def propagate(
 
 
 def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:
-    """Compute the squared relative error of the response of each sample.
+    """Compute the squared relative error of each sample's response.
 
     The error is sum (simulated - measured)^2 / sum measured^2, the square of the RRMSE. It needs misfits only, so that
     no response is stored and simulations cached by the likelihood are not repeated.
@@ -325,7 +324,7 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     Returns
     -------
     ndarray, shape (n, n_channels)
-        The errors [-] in the order of the channels of the model. The row of a failed simulation is NaN.
+        The errors [-] in the order of the model's channels. Failed simulations have rows of NaN.
 
     Raises
     ------

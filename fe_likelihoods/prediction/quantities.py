@@ -1,7 +1,8 @@
 r"""Quantities of a response: histories of channels, numbers from the histories of channels, or any function of it.
 
 A `ChannelQuantity` has a channel and therefore a dimension, so that a threshold in a unit of another dimension is
-refused. Two of them are energies: of an acceleration, and of a force that moves through a displacement.
+refused. Two are energy measures: the Arias intensity of an acceleration, and the work of a force through a
+displacement.
 
 .. math:: I_A = \frac{\pi}{2 g} \int a^2\, dt, \qquad W = \int F\, du.
 """
@@ -50,8 +51,8 @@ class ChannelQuantity:
     timed : bool
         Whether the last argument of the function is the time step [s].
     describe : callable, optional
-        Function of the `Channel` that returns the `Channel` with name, dimension and display unit of the number, or
-        raises ValueError for a channel that has no such number. Default: those of the channel.
+        Function that returns a `Channel` with the number's name, dimension and display unit for the `Channel` of the
+        history, or raises ValueError for a channel that has no such number. Default: the channel itself.
     name : str
         What the number is, such as "peak"; ``str(quantity)`` is "peak of deck".
     """
@@ -128,12 +129,12 @@ def rms(channel: str, part: slice = slice(None)) -> ChannelQuantity:
 
 
 def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
-    r"""Return the quantity "Arias intensity of an acceleration", a measure of the energy of the motion.
+    r"""Return the quantity "Arias intensity of an acceleration", a measure of the motion's energy.
 
     Parameters
     ----------
     channel : str
-        Name of a channel of acceleration.
+        Name of an acceleration channel.
     part : slice
         Samples of the history. Default: all.
 
@@ -155,10 +156,10 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
     Parameters
     ----------
     force : str
-        Name of a channel of force, of moment (with a rotation), or of stress (with a strain; energy per volume).
+        Name of a channel: force, moment (with a rotation) or stress (with a strain; energy per volume).
     displacement : str or (n_steps,) array_like
-        Name of the channel of the displacement that belongs to it, or the imposed displacement of a test [SI], with one
-        value per sample of the force.
+        Name of the displacement channel that belongs to it, or the imposed displacement of a test [SI], with one value
+        per force sample.
     part : slice
         Samples of both histories. Default: all.
 
@@ -197,7 +198,7 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
     channel : str
         Name of the channel.
     samples : int
-        Number of last samples. Take those of a whole number of periods where the structure still vibrates.
+        Number of last samples. Where the structure still vibrates, choose a whole number of periods.
 
     Raises
     ------
@@ -239,7 +240,7 @@ def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
 
 
 def _measured(quantity: ChannelQuantity, measurements: Measurements) -> float:
-    """The number of the measurements of its channels."""
+    """The quantity, computed from measurements."""
     quantity.check_length(measurements.n_steps)
     quantity.described(measurements.channels[0])
     if len(measurements.channels) > 1 and not measurements.simultaneous:
@@ -308,7 +309,7 @@ def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_step
     dt : float
         Time step of the model [s].
     n_steps : int, optional
-        Number of steps of the histories, to check the arrays of a quantity before the simulations.
+        Number of history steps, to check the arrays of a quantity before the simulations.
 
     Returns
     -------

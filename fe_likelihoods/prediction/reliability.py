@@ -1,11 +1,11 @@
 """Probability that a response exceeds a limit, given the data.
 
-The posterior probability of an exceedance is estimated by the mean over the samples of the probability that each of
-them exceeds the threshold: the robust reliability of Papadimitriou, Beck & Katafygiotis (2001). Without an error of the
-model this is the fraction of the samples whose quantity exceeds the threshold, and its uncertainty is given by the
-interval of Clopper & Pearson (1934), which is also valid if none or all of the samples exceed. The error of the model
-is in the prediction (``propagate(..., noise="model")``, `predict_new_event`) or in ``ratios=``. See
-``docs/theory/prediction.rst``. Fragility curves are in `fe_likelihoods.prediction.fragility`.
+The posterior probability of an exceedance is estimated by averaging, over the samples, each sample's probability to
+exceed the threshold: the robust reliability of Papadimitriou, Beck & Katafygiotis (2001). Without a model error this is
+the fraction of the samples whose quantity exceeds the threshold, and its uncertainty is given by the interval of
+Clopper & Pearson (1934), which is also valid if none or all of the samples exceed. The model error is in the prediction
+(``propagate(..., noise="model")``, `predict_new_event`) or in ``ratios=``. See ``docs/theory/prediction.rst``.
+Fragility curves are in `fe_likelihoods.prediction.fragility`.
 
 References
 ----------
@@ -63,20 +63,19 @@ class Exceedance(NamedTuple):
         Monte Carlo error. Without ratios it is sqrt(p (1 - p) / effective sample size), which is zero if none or all of
         the samples exceed; use the interval in these cases.
     lower, upper : ndarray
-        Interval of the probability. With ratios, or for a new event, it contains what is unknown of the ratios and of
-        the population of the events, and always the probability itself: small probabilities differ between populations
-        by powers of ten, and their mean can be above nearly all of them. Otherwise it is the Clopper-Pearson
-        interval for the effective sample size, which contains the Monte Carlo error only.
+        Interval of the probability. With ratios, or for a new event, it contains the uncertainty of the ratios and the
+        event population, and always the probability itself: small probabilities differ between populations by powers of
+        ten, and their mean can be above nearly all of them. Otherwise it is the Clopper-Pearson interval for the
+        effective sample size, which contains the Monte Carlo error only.
     effective_sample_size : float
         Effective number of independent samples.
     uncertainty : str
         What the probability contains.
     upper_by_events : ndarray or None
-        With `EventRatios`, the upper end of the Clopper-Pearson interval of the share of the events whose ratio
-        exceeds, mean over the samples: what the events tell without the normal form of the logarithms of their ratios.
-        Where it is far above `upper`, no event was near the threshold, and the probability is that of the assumed tail.
-        None without ratios, and with `LevelRatios`: ratios at other levels are no trials of the level that is
-        predicted.
+        With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
+        averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
+        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios,
+        and with `LevelRatios`: ratios at other levels are no trials at the predicted level.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     """
@@ -125,19 +124,18 @@ def exceedance(
         If the quantity is a number: one threshold or an array of any shape. If it is an array: one threshold, or one
         for each entry, shape (...). Positive if there are ratios.
     unit : str, optional
-        Unit of the threshold. It must have the dimension of the channel of the prediction. Default: SI.
+        Unit of the threshold, with the dimension of the predicted channel. Default: SI.
     ratios : EventRatios or LevelRatios, optional
-        Ratios of measured to fitted values of the quantity in several events: the error of the model, for a prediction
-        without noise. The prediction of `predict_new_event` has its own.
+        Ratios of measured to fitted values of the quantity in several events: the model error, for a prediction without
+        noise. A prediction by `predict_new_event` has its ratios already.
     noise : bool, optional
-        False states that the error of the model is left out on purpose. Default: a prediction without it gives a
-        warning.
+        False states that the model error is left out on purpose. Default: a prediction without it gives a warning.
     effective_sample_size : float, optional
-        Effective number of independent samples. Default: that of the prediction, or the number of values.
+        Effective number of independent samples. Default: as in the prediction, or the number of values.
     level : float
         Probability of the interval, between 0 and 1.
     seed : int
-        Seed of the draws for the interval, where there are ratios or a population of events.
+        Seed of the draws for the interval, where there are ratios or an event population.
 
     Returns
     -------
@@ -154,7 +152,7 @@ def exceedance(
     Warns
     -----
     UserWarning
-        If a prediction contains no error of the model: its probability is then too close to 0 or to 1.
+        If a prediction contains no model error: its probability is then too close to 0 or to 1.
 
     Examples
     --------
@@ -239,7 +237,7 @@ def exceedance_probability(
     seed: int,
     below: bool = False,
 ) -> Exceedance:
-    """Probability of an exceedance with ratios, or in a population of events, from the quantiles of its draws.
+    """Probability of an exceedance with ratios, or in an event population, from the quantiles of its draws.
 
     Parameters
     ----------
@@ -272,7 +270,7 @@ def exceedance_probability(
 def _upper_by_events(
     values: np.ndarray, limits: np.ndarray, ratios: EventRatios, level: float, below: bool
 ) -> np.ndarray:
-    """Upper end of the interval of the share of the events that exceed, of as many trials as there are events."""
+    """Upper end of the binomial interval for the share of events that exceed; each event is one trial."""
     exceeded = [(values * each < limits if below else values * each > limits).mean(axis=0) for each in ratios.values]
     return binomial_interval(np.mean(exceeded, axis=0), len(ratios.values), level)[1]
 
@@ -280,17 +278,17 @@ def _upper_by_events(
 def interval_of_draws(
     draws: np.ndarray, share: np.ndarray, effective: ArrayLike, spread: EventSpread, level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interval of a probability from its draws, which contains the probability itself.
+    """Interval of a probability from its draws, extended to contain the probability itself.
 
     Probabilities far in a tail differ between populations by many powers of ten, so that their mean, which is the
-    probability of a new event, can be above nearly all of them. The interval is then extended to it. Without ratios the
-    probabilities of the draws are shares of samples, which may all be zero or one: the interval also contains that of
-    Clopper & Pearson.
+    probability of a new event, can be above nearly all of them. The interval is then extended to it. Without ratios,
+    the drawn probabilities are shares of samples, which may all be zero or one: the interval then also contains the
+    Clopper-Pearson interval.
 
     Parameters
     ----------
     draws : (n_draws, ...) ndarray
-        Probability given each draw of what is unknown of the events; NaN is left out.
+        Probability given each draw of the event population; NaN is left out.
     share : (...) ndarray
         The probability.
     effective : float or (...) ndarray
@@ -323,7 +321,7 @@ def contents(has_noise: bool, spread: EventSpread) -> str:
 
 
 def warn_of_missing_error(caller: str, how: str, stacklevel: int = 3) -> None:
-    """Warn that a probability leaves the error of the model out; `how` says how else to have it than by ratios."""
+    """Warn that a probability leaves the model error out; `how` says how else to have it than by ratios."""
     warnings.warn(
         f"{caller}: the probabilities leave the error of the model out, so that they are too close to 0 or to 1. Give "
         f"ratios=EventRatios(...) of measured to fitted values in several events, or {how}; noise=False states that "

@@ -60,7 +60,7 @@ class HistoryScores(NamedTuple):
     coverage : ndarray, shape (n_channels,)
         Share of the measured samples in the band.
     coverage_strong : ndarray, shape (n_channels,)
-        The same in the strong part: between 5 and 95 % of the sum of squares of the measured history.
+        The same in the strong part, between 5 and 95 % of the measured history's sum of squares.
     coverage_by_level : ndarray, shape (n_channels, 3)
         The same where the envelope of the predicted mean is below 10 %, between 10 and 50 %, and above 50 % of its
         largest value; NaN without such samples.
@@ -74,8 +74,8 @@ class HistoryScores(NamedTuple):
         Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
         errors (`fe_likelihoods.effective_samples`): for the standard error of a coverage.
     coverage_error : ndarray, shape (n_channels, 3)
-        Standard errors of `coverage_by_level`, if the band has its level: those of a binomial share of as many
-        independent samples as the part is worth. NaN without such samples.
+        Standard errors of `coverage_by_level` for a band that has its nominal level: binomial, with the number of
+        independent samples that the part is worth. NaN without such samples.
     """
 
     channels: tuple[Channel, ...]
@@ -122,7 +122,7 @@ class QuantityScores(NamedTuple):
     Attributes
     ----------
     names : tuple of str
-        Names of the quantities: of their channels, or numbers.
+        Names of the quantities: their channels' names, or numbers.
     units : tuple of str
         Display units, "SI" for a function of the whole response.
     level : float
@@ -165,7 +165,7 @@ class QuantityScores(NamedTuple):
     def within(self) -> np.ndarray:
         """Whether each measured value is in its interval, from its `pit` as `fe_likelihoods.share_within`.
 
-        Fewer than ten samples cannot show that a value is outside of a 90 % interval.
+        Fewer than ten samples cannot show that a value is outside a 90 % interval.
         """
         return np.abs(self.pit - 0.5) <= 0.5 * self.level
 
@@ -327,12 +327,12 @@ def envelope(histories: np.ndarray) -> np.ndarray:
 
 
 def strong_part(measured: ArrayLike, start: float = 0.05, stop: float = 0.95) -> np.ndarray:
-    """Samples of the strong part of histories: between two shares of their sums of squares.
+    """Mask of the strong part of histories, between two shares of the sum of squares.
 
     Parameters
     ----------
     measured : (..., n_samples) array_like
-        Histories, NaN where a sample is missing. For an acceleration, the samples between 5 and 95 % are those of the
+        Histories, NaN where a sample is missing. For an acceleration, the samples between 5 and 95 % make up the
         significant duration (M. D. Trifunac, A. G. Brady, 1975, A study on the duration of strong earthquake ground
         motion, Bulletin of the Seismological Society of America 65, 581-626).
     start, stop : float

@@ -8,7 +8,7 @@ of measurements in a band (coverage) is not a score: a band that is ten times to
 CRPS                   Integral of the squared difference between the predicted distribution function and the step at
                        the measured value, in the unit of the quantity; the absolute error if the prediction is a number
 log score              Minus the logarithm of the predicted density at the measured value
-interval score         Width of an interval plus a penalty for every measured value outside of it
+interval score         Width of an interval plus a penalty for every measured value outside it
 PIT                    Probability integral transform: the predicted probability of a value below the measured one;
                        uniform between 0 and 1 if the predictions are calibrated
 =====================  ===============================================================================================
@@ -122,8 +122,8 @@ def crps_samples(values: ArrayLike, observed: ArrayLike, effective_sample_size: 
     -------
     ndarray, shape (...)
         :math:`\frac1n \sum_i |x_i - y| - \frac{1}{2 n^2 (1 - 1 / N)} \sum_{i, j} |x_i - x_j|` (Ferro 2014 for N = n),
-        in the unit of the values: an unbiased estimate of the score of the distribution that the samples are from. NaN
-        where a sample is NaN.
+        in the unit of the values: an unbiased estimate of the score for the distribution that was sampled. NaN where a
+        sample is NaN.
 
     Raises
     ------

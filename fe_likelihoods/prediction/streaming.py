@@ -1,9 +1,9 @@
 """Mean, variance and quantiles of results that arrive in batches.
 
-Mean and variance need one pass. Each batch has its own, and two of them are combined by the update of Chan, Golub &
-LeVeque (1983), which avoids the cancellation of the mean of squares minus the square of the mean. Quantiles need the
-results themselves, of which as many are retained as fit into a limit of memory. A result may stand for several samples,
-because resampling makes copies, so that every result has a count.
+Mean and variance need one pass. They are computed per batch and combined by the update of Chan, Golub & LeVeque (1983),
+which avoids the cancellation in "mean square minus squared mean". Quantiles need the results themselves, of which as
+many are retained as fit into a limit of memory. A result may stand for several samples, because resampling makes
+copies, so that every result has a count.
 
 See ``docs/theory/prediction.rst``.
 
@@ -24,7 +24,7 @@ _CHUNK = 2**18  # values that are sorted at once
 
 
 class RunningMoments:
-    """Running mean and variance of arrays of one shape.
+    """Running mean and variance of equally shaped arrays.
 
     Attributes
     ----------
@@ -65,12 +65,12 @@ class RunningMoments:
 
 
 class RetainedResults:
-    """Results retained for quantiles: all of them if they fit into the limit, else those of a random subsample.
+    """Results retained for quantiles: all of them if they fit into the limit, else a random subsample.
 
     Parameters
     ----------
     result_of_sample : ndarray of int, shape (n,)
-        Index of the result of each sample. Copies of a sample share one result.
+        Index of each sample's result. Copies of a sample share one result.
     shape : tuple of int
         Shape of a result.
     dtype : type
@@ -161,7 +161,7 @@ class RetainedResults:
 def quantiles_with_errors(
     values: np.ndarray, counts: np.ndarray, probabilities: Sequence[float], effective: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute quantiles of the columns of an array, and their standard errors.
+    r"""Compute quantiles of an array's columns, and their standard errors.
 
     Parameters
     ----------

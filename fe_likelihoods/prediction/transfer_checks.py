@@ -1,9 +1,8 @@
-"""Whether a prediction goes beyond its calibration: other amplitudes than those measured, or a noise that is wrong.
+"""Whether a prediction goes beyond its calibration: amplitudes that were not measured, or a noise that is wrong.
 
-Parameters of structures depend on the amplitude of the response, and noise in SI units does not scale with it. A
-posterior under white noise is too narrow where the residuals are correlated, and a noise in shares of the simulated
-response may be fitted with a response that is too large. White errors make peaks too large. A prediction warns of
-these.
+Structural parameters depend on the response amplitude, and noise in SI units does not scale with it. A posterior under
+white noise is too narrow where the residuals are correlated, and with a noise in shares of the simulated response the
+fitted response may be too large. White errors make peaks too large. A prediction warns of these.
 """
 
 import logging
@@ -43,14 +42,14 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-_LARGEST_LEVEL_RATIO = 3.0  # of predicted and calibrated response, beyond which noise in SI units does not transfer
+_LARGEST_LEVEL_RATIO = 3.0  # predicted to calibrated response, beyond which noise in SI units does not transfer
 _LARGEST_PEAK_RATIO = 2.0  # of a predicted peak to the largest calibrated one, or of the smallest one to it
 _UNLIKELY = 0.01  # probability of a correlation under white noise, for all channels together
 _WEAK = 0.2  # lag-one correlation that hardly changes intervals, as in `residual_checks`
 _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and found
-_LARGEST_ADDED_PEAK = 1.1  # median of the peaks with white errors, as a multiple of that of the response
+_LARGEST_ADDED_PEAK = 1.1  # median peak with white errors, as a multiple of the median response peak
 _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the response is too large
-_WORSE = 1.1  # ratio of the RRMSE of the response to that of its best multiple, beyond which this is said
+_WORSE = 1.1  # RRMSE of the response divided by the RRMSE of its best multiple, beyond which this is said
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
 # what the residuals of likelihoods say, and the likelihoods of which a warning has said it
@@ -59,7 +58,7 @@ _WARNED: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 class Peaks:
-    """Peaks of the channels of simulated responses, collected while they are simulated."""
+    """Peaks of each channel, collected while responses are simulated."""
 
     def __init__(self) -> None:
         self._peaks: list[np.ndarray] = []
@@ -72,14 +71,14 @@ class Peaks:
             self._peaks.append(np.repeat(peaks, [len(members[j]) for j in usable], axis=0))
 
     def median(self) -> np.ndarray | None:
-        """Median over the samples of the peak of each channel [SI]; None without a response."""
+        """Median peak of each channel over the samples [SI]; None without a response."""
         return np.median(np.concatenate(self._peaks), axis=0) if self._peaks else None
 
 
 def calibration_of(posterior_or_model: Any) -> Calibrated:
-    """What parameters were calibrated with: of each event, the measured history of each channel [SI].
+    """Calibration data: for each event, the measured history of each channel [SI].
 
-    Takes a posterior, a likelihood, a sequence of `Measurements`, or a bare model, with which nothing was calibrated.
+    Takes a posterior, a likelihood, a sequence of `Measurements`, or a bare model, which has none.
     """
     if isinstance(posterior_or_model, Sequence):
         return [dict(zip(_names(each), each.values, strict=True)) for each in posterior_or_model]
@@ -100,9 +99,9 @@ def _names(measured: Measurements) -> list[str]:
 
 
 def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated, alone: bool) -> str:
-    """What to say where the median of the peak of a channel is beyond the peaks of the calibration by a factor of two.
+    """What to say where a channel's median peak is beyond its calibration peaks by a factor of two.
 
-    An empty text otherwise. `alone` is whether the parameters are those of one likelihood, not of a population.
+    An empty text otherwise. `alone` is whether the parameters belong to one likelihood, not to a population.
     """
     predicted, far = peaks.median(), []
     if predicted is None:
@@ -162,9 +161,9 @@ def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: Pre
 
 
 def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, source: PredictionSource) -> str:
-    """What to say where peaks with white errors of the model are much larger than those of the response.
+    """What to say where peaks with white model errors are much larger than the response peaks.
 
-    An empty text otherwise, and for a noise with a spectrum, or in SI units, which may be that of the sensors.
+    An empty text otherwise, and for a noise with a spectrum, or in SI units, which may be sensor noise.
     """
     if not follows_response(source.noise) or hasattr(source.noise, "response_errors"):
         return ""
@@ -198,14 +197,14 @@ def _measured_peak(name: str, measurements: Measurements) -> float:
 
 
 def _of_channels(predictions: Iterable[Prediction]) -> list[ChannelQuantity]:
-    """The numbers of channels that are predicted."""
+    """The predicted quantities that are numbers of channels."""
     wanted = [each.quantity for each in predictions]
     several = [one for each in wanted for one in (each if isinstance(each, list | tuple) else [each])]
     return [one for one in several if isinstance(one, ChannelQuantity)]
 
 
 def _of_names(peaks: Peaks, channels: Sequence[Channel], names: Sequence[str]) -> np.ndarray:
-    """Medians of the peaks of these channels [SI]."""
+    """Median peaks of these channels [SI]."""
     known = [channel.name for channel in channels]
     return peaks.median()[[known.index(name) for name in names]]
 
@@ -233,8 +232,8 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
 def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> tuple[str, ...]:
     """What to say if the residuals of a likelihood contradict the noise with which it was sampled.
 
-    Samples that do not fit, such as draws of the prior, are not judged. What the last judged samples of a likelihood
-    have shown is kept for predictions under other excitations, which then need no simulation for it.
+    Samples that do not fit, such as draws of the prior, are not judged. The latest result for a likelihood is kept, so
+    that predictions under other excitations need no simulation for it.
 
     Parameters
     ----------
@@ -243,8 +242,8 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     point : (ndim,) ndarray
         A sample of all parameters.
     response : (n_channels, n_steps) ndarray, or None
-        Its response to the excitation of the calibration [SI]. None: what is kept is returned. Where nothing is kept,
-        the response is taken from those that the likelihood has stored, or simulated.
+        Its response to the calibration excitation [SI]. None: the kept result is returned, or, if there is none, the
+        response is looked up among the likelihood's stored responses, or simulated.
 
     Returns
     -------
@@ -290,8 +289,8 @@ def is_first_warning(likelihood: Any) -> bool:
 def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, simulated: np.ndarray) -> str:
     """What to say where a fraction of the simulated response (n_channels, n_steps) fits much better; empty if not.
 
-    Only of a noise whose likelihood has shares of the simulated response: with others the response that fits best is
-    also the most probable one.
+    Only for a noise in shares of the simulated response: with other noises the response that fits best is also the most
+    probable one.
     """
     if not getattr(getattr(noise, "statistic", None), "of_response", False):
         return ""
@@ -320,7 +319,8 @@ def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, s
 
 
 def _contradiction(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, parameters: np.ndarray) -> str:
-    """How residuals (n_channels, n_steps) contradict a noise with parameters (1, n_noise), in words; empty if not.
+    """How residuals (n_channels, n_steps) contradict a noise with parameters (1, n_noise), in words; empty if they do
+    not.
 
     The residuals are whitened where the noise has shares of the response or a spectrum.
     """
@@ -362,7 +362,7 @@ def _response(likelihood: Any, theta: np.ndarray) -> np.ndarray | None:
     """The response of one simulation, which the likelihood counts; None if it fails."""
     try:
         batch = likelihood.simulate(theta[None])
-    except (ChangedModel, StaleCache, TooManyFailures) as error:  # of the next sampling, not of this prediction
+    except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this prediction
         logger.warning("the residuals of the calibration are not checked: %s", error)
         return None
     return None if batch.reasons[0] else batch.response[0]
