@@ -10,7 +10,7 @@ from statistics import median
 import numpy as np
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.problems import bridge_column
 
 from .rows import Row

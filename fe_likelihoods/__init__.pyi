@@ -2,10 +2,26 @@ from . import problems
 from .adapters import nautilus_prior, serve, to_bilby, to_pints, to_pymc
 from .cache.simulation_cache import SimulationCache
 from .cache.verification import StaleCache
+from .damage.damage import Damage, LimitState, damage, limit_states
+from .damage.measures import DamageMeasures, damage_measures, damage_outputs
+from .damage.park_ang import ParkAng, park_ang_constants
 from .data.make_isolated_bridge import table_motion
 from .emulation.emulator import ResponseEmulator
 from .emulation.guide import ResponseGuide
 from .emulation.modes import Mode, ModeSearch, find_modes
+from .events.agreement import Agreement, compare_tests
+from .events.hierarchical_posterior import HierarchicalPosterior, Varying
+from .events.hierarchy import Hierarchy
+from .events.leave_one_out import leave_one_out
+from .events.ratios import EventRatios, LevelRatios
+from .events.stored_posterior import StoredPosterior
+from .likelihood.block_likelihood import BlockLogLikelihood
+from .likelihood.failures import TooManyFailures
+from .likelihood.joint import JointLikelihood
+from .likelihood.likelihood import FELikelihood
+from .likelihood.parameters import Parameter
+from .likelihood.posterior import Posterior
+from .likelihood.predictive_draws import MeasuredData, MeasuredHistory, PredictiveDraws
 from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel
@@ -32,36 +48,20 @@ from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
 from .prediction.averaging import AveragedPrediction, average_predictions
-from .prediction.damage import Damage, LimitState, damage, limit_states
-from .prediction.damage_measures import DamageMeasures, damage_measures, damage_outputs
-from .prediction.event_ratios import EventRatios, LevelRatios
 from .prediction.fragility import Fragility, fragility, peak_ground_acceleration
 from .prediction.fragility_curve import fit_fragility
 from .prediction.held_out import score_left_out
 from .prediction.new_event import event_level, event_ratio, predict_from_median, predict_new_event
-from .prediction.park_ang import ParkAng, park_ang_constants
 from .prediction.prediction import Prediction
 from .prediction.propagation import fit_measures, propagate
 from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
 from .prediction.reliability import Exceedance, exceedance
 from .prediction.score_tables import HistoryScores, QuantityScores
 from .prediction.scores import crps_normal, crps_samples, interval_score, log_score_normal, share_within
-from .probability.agreement import Agreement, compare_tests
-from .probability.block_likelihood import BlockLogLikelihood
-from .probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from .probability.failures import TooManyFailures
-from .probability.hierarchical_posterior import HierarchicalPosterior, Varying
-from .probability.hierarchy import Hierarchy
-from .probability.joint import JointLikelihood
-from .probability.leave_one_out import leave_one_out
-from .probability.likelihood import FELikelihood
-from .probability.mixture_prior import MixtureDistribution, fit_mixture
-from .probability.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
-from .probability.parameters import Parameter
-from .probability.posterior import Posterior
-from .probability.predictive_draws import MeasuredData, MeasuredHistory, PredictiveDraws
-from .probability.priors import Prior
-from .probability.stored_posterior import StoredPosterior
+from .priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from .priors.mixture_prior import MixtureDistribution, fit_mixture
+from .priors.multivariate import MultivariateDistribution, MultivariateNormal, TruncatedMultivariateNormal
+from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import Alignment, align
 from .signals.channels import Channel, Measurements

@@ -32,12 +32,12 @@ from typing import Any
 import numpy as np
 
 from .cache.simulation_cache import SimulationCache
+from .likelihood.likelihood import FELikelihood
+from .likelihood.posterior import Posterior
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
-from .probability.likelihood import FELikelihood
-from .probability.posterior import Posterior
-from .probability.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
+from .priors.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
 from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
 from .signals.events import Events

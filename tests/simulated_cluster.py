@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from fe_likelihoods.probability import evaluation_queue, running_simulations, simulator
+from fe_likelihoods.likelihood import evaluation_queue, running_simulations, simulator
 from fe_likelihoods.simulation.executors import PoolExecutor
 
 __all__ = ["SimulatedCluster", "SimulatedPool"]

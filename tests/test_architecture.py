@@ -146,7 +146,7 @@ def test_every_adapter_imports_its_client_and_the_posterior_alone():
         assert {top(i) for i in imports(path)} & set().union(*ADAPTED.values()) == expected, name(path)
         # models are served as well as posteriors
         more = {"simulation"} if path.stem == "umbridge" else set()
-        assert not adapts or own(path) <= {"adapters", "probability"} | more, name(path)
+        assert not adapts or own(path) <= {"adapters", "likelihood", "priors"} | more, name(path)
 
 
 def test_file_formats_have_their_places():

@@ -32,7 +32,7 @@ def fresh(code: str) -> str:
     ("code", "allowed"),
     [
         ("import fe_likelihoods, samplers", set()),
-        ("import fe_likelihoods.problems, fe_likelihoods.probability.priors, fe_likelihoods.simulation.model", set()),
+        ("import fe_likelihoods.problems, fe_likelihoods.priors.priors, fe_likelihoods.simulation.model", set()),
         ("from fe_likelihoods import FELikelihood, Record, SimulationCache", set()),
         ("import fe_likelihoods.models.linear_oscillator, fe_likelihoods.models.function", set()),
         ("import fe_likelihoods.models.rc_column", {"numba"}),

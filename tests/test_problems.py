@@ -12,7 +12,7 @@ from scipy import stats
 
 from fe_likelihoods import problems, rrmse
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.probability.distributions import HalfNormal
+from fe_likelihoods.priors.distributions import HalfNormal
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
     BRIDGE_COLUMN_NOISE,

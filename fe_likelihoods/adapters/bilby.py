@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from ..probability.posterior import Posterior
+from ..likelihood.posterior import Posterior
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 
 if TYPE_CHECKING:
     import bilby

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..probability.posterior import Posterior
+from ..likelihood.posterior import Posterior
 
 if TYPE_CHECKING:
     import nautilus

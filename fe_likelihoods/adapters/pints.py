@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..probability.posterior import Posterior
+from ..likelihood.posterior import Posterior
 
 if TYPE_CHECKING:
     import pints

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from ..probability.posterior import Posterior
+from ..likelihood.posterior import Posterior
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 
 if TYPE_CHECKING:
     import pymc
@@ -40,7 +40,7 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     Raises
     ------
     ValueError
-        If a prior is not one of `fe_likelihoods.probability.distributions`, or a parameter is named ``log_likelihood``.
+        If a prior is not one of `fe_likelihoods.priors.distributions`, or a parameter is named ``log_likelihood``.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Responses of a model that are stored in a cache on disk as soon as they are simulated, without measurements.
 
 A prediction that was interrupted finds them when it is made again. Likelihoods store their responses themselves
-(`fe_likelihoods.probability.simulator`), under the same keys.
+(`fe_likelihoods.likelihood.simulator`), under the same keys.
 """
 
 import os

@@ -8,7 +8,7 @@ import numpy as np
 from ..cache.file import CacheFile
 from ..cache.salvage import number_or_unknown, salvage
 from ..cache.simulation_cache import SimulationCache
-from ..probability.likelihood import FELikelihood
+from ..likelihood.likelihood import FELikelihood
 
 __all__ = ["Verified", "describe", "export_cache", "latest_stored", "salvage_cache", "verify_cache"]
 

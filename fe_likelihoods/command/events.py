@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..likelihood.posterior import Posterior
 from ..noise.protocol import follows_response
 from ..prediction.prediction import Prediction
-from ..probability.posterior import Posterior
 from ..reporting.other_events import OtherEvent, describe_event
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..likelihood.likelihood import FELikelihood
+from ..likelihood.parameters import channels_of_deviations
+from ..likelihood.posterior import Posterior
 from ..models.external import UserModel
-from ..probability.distributions import Distribution, HalfNormal, Uniform
-from ..probability.likelihood import FELikelihood
-from ..probability.parameters import channels_of_deviations
-from ..probability.posterior import Posterior
+from ..priors.distributions import Distribution, HalfNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationFailed

@@ -3,7 +3,7 @@
 import math
 import re
 
-from ..probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..units import to_si
 from .schema import split_number
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..likelihood.likelihood import FELikelihood
+from ..likelihood.posterior import Posterior
 from ..prediction.prediction import Prediction
-from ..probability.likelihood import FELikelihood
-from ..probability.posterior import Posterior
 from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements

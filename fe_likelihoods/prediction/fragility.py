@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from ..events.hierarchy import Hierarchy
+from ..events.ratios import EventRatios, LevelRatios
+from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..noise.protocol import follows_response
-from ..probability.hierarchy import Hierarchy
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from ..text_tables import number, text_table
 from ..units import DIMENSIONS
-from .event_ratios import EventRatios, LevelRatios
-from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..probability.leave_one_out import LeftOut
-from ..probability.posterior import Posterior
+from ..events.leave_one_out import LeftOut
+from ..events.ratios import EventRatios
+from ..likelihood.posterior import Posterior
 from ..text_tables import NamedResults, number
 from ..units import from_si
-from .event_ratios import EventRatios
 from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity

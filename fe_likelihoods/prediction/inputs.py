@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.memory import distinct_keys
+from ..likelihood.joint import JointLikelihood
+from ..likelihood.likelihood import FELikelihood
 from ..noise.draws import SampleNoise, sample_noise
 from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
 from ..noise.protocol import noise_title
-from ..probability.inputs import as_points
-from ..probability.joint import JointLikelihood
-from ..probability.likelihood import FELikelihood
+from ..priors.points import as_points
 from ..signals.events import find_events
 from ..simulation.executors import as_executor
 from ..simulation.model import Model

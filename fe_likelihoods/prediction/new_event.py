@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from ..probability.hierarchy import Hierarchy
+from ..events.hierarchy import Hierarchy
+from ..events.ratios import EventRatios, LevelRatios
+from ..events.spread import EventSpread
 from ..signals.records import Record
-from .event_ratios import EventRatios, LevelRatios
-from .event_spread import EventSpread
 from .inputs import part_of, read_source
 from .prediction import Prediction
 from .propagation import propagate

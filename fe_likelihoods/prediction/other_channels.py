@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..likelihood.inputs import check_model
 from ..noise.protocol import noise_channels, noise_title, noise_under
-from ..probability.inputs import as_points, check_model
+from ..priors.points import as_points
 from ..simulation.model import Model
 from .inputs import PredictionSource, split_samples
 

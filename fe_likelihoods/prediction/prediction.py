@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..events.spread import EventSpread
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_shifted, compare_with
 from ..signals.error_measures import rrmse
 from ..text_tables import number, text_table
 from ..units import find_unit
-from .event_spread import EventSpread
 from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
 

@@ -33,7 +33,7 @@ from tqdm import tqdm
 from ..cache.simulation_cache import SimulationCache
 from ..cache.stored_responses import StoredResponses
 from ..noise.protocol import noise_time_shifts, noise_under, remark_on_gaps
-from ..probability.inputs import as_points
+from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from ..events.ratios import EventRatios, LevelRatios
+from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
 from ..units import DIMENSIONS, find_unit, to_si
-from .event_ratios import EventRatios, LevelRatios
-from .event_spread import EventSpread, exceedance_draws, exceedance_of_samples
 from .prediction import Prediction
 from .propagation import check_effective_sample_size
 

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from ..cache.verification import StaleCache
+from ..likelihood.failures import TooManyFailures
+from ..likelihood.joint import JointLikelihood
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import sampled_noise
 from ..noise.protocol import follows_response
 from ..noise.residuals import effective_samples, innovations, residual_checks
-from ..probability.failures import TooManyFailures
-from ..probability.inputs import as_points
-from ..probability.joint import JointLikelihood
+from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel

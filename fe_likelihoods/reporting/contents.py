@@ -7,9 +7,9 @@ import numpy as np
 from samplers import Verdict
 from samplers.output import stored_result
 
+from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
-from ..probability.likelihood import FELikelihood
 from .advice import SAME_AS_PRIOR, residual_sentence
 from .fits import Fits
 from .run import FinishedRun

@@ -12,8 +12,8 @@ from scipy.stats import ks_2samp
 
 from samplers.judgement.failures import NearFailures, failures_near
 
-from ..probability.failures import reason_without_numbers
-from ..probability.likelihood import FELikelihood
+from ..likelihood.failures import reason_without_numbers
+from ..likelihood.likelihood import FELikelihood
 from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]

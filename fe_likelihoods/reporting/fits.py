@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..likelihood.likelihood import FELikelihood
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, innovations, residual_checks
-from ..probability.likelihood import FELikelihood
 from ..signals.channels import Channel, Measurements
 from ..signals.events import find_events
 from .run import FinishedRun

@@ -8,7 +8,7 @@ from typing import Any
 
 from samplers.smc import FEWEST_TO_RECYCLE
 
-from ..probability.joint import JointLikelihood
+from ..likelihood.joint import JointLikelihood
 from .run import FinishedRun
 
 __all__ = ["fingerprints", "how_to_repeat", "sampler_settings", "versions"]

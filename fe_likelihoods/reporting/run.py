@@ -13,10 +13,10 @@ from emcee import EnsembleSampler
 from samplers import Verdict
 from samplers.estimates.importance import EvidenceCheck
 
-from ..probability.joint import JointLikelihood
-from ..probability.likelihood import FELikelihood
-from ..probability.parameters import Parameter
-from ..probability.priors import Prior
+from ..likelihood.joint import JointLikelihood
+from ..likelihood.likelihood import FELikelihood
+from ..likelihood.parameters import Parameter
+from ..priors.priors import Prior
 
 __all__ = ["FinishedRun", "read_run"]
 

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from ..probability.priors import Prior
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from ..priors.priors import Prior
 from .run import FinishedRun
 
 __all__ = ["ParameterRow", "describe_prior", "parameter_rows"]

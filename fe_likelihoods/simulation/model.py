@@ -142,7 +142,7 @@ class Model(Protocol):
 
     Tables and figures use ``nominal``, a mapping of names to the nominal values [SI] of which the parameters are
     multiples, ``nominal_units`` with their units, and ``parameter_units`` with the units of other parameters, in words
-    (`fe_likelihoods.probability.parameters.describe_parameters`).
+    (`fe_likelihoods.likelihood.parameters.describe_parameters`).
     """
 
     @property

@@ -18,11 +18,11 @@ import pytest
 from fe_likelihoods.cache import rows as cache_rows
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.command.caches import latest_stored
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
@@ -366,7 +366,7 @@ def test_invalid_bounds(path, name, value):
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
     for model in (Line(), Batched()):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
         np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
@@ -375,7 +375,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -410,7 +410,7 @@ class Pool:
     ids=str,
 )
 def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
     pool = Pool(**attributes)
     likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
     assert pool.sizes == sizes

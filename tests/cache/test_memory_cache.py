@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.memory import MemoryCache
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.distributions import Distribution, HalfNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import Distribution, HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed

@@ -9,10 +9,10 @@ import time
 
 import numpy as np
 
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from samplers import SMCSampler

@@ -21,8 +21,8 @@ import pytest
 from fe_likelihoods.cache import file as cache_file
 from fe_likelihoods.cache.file import APPLICATION_ID, SCHEMA_VERSION, CacheFile
 from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 

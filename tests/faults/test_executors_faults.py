@@ -13,8 +13,8 @@ import emcee
 import numpy as np
 import pytest
 
+from fe_likelihoods.likelihood.failures import TooManyFailures
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.probability.failures import TooManyFailures
 from fe_likelihoods.simulation import dask_executor, dask_workers, executors
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.probability.likelihood import FELikelihood
+from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.signals.channels import Measurements
 from tests.faults import cached_run, guided_run
 from tests.faults import treacherous as bad

@@ -25,7 +25,7 @@ from fe_likelihoods import (
     SimulationCache,
     SimulationFailed,
 )
-from fe_likelihoods.probability.failures import FailureLog
+from fe_likelihoods.likelihood.failures import FailureLog
 from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
 from samplers import SMCSampler

@@ -227,11 +227,11 @@ def deadly(theta: np.ndarray) -> np.ndarray:
 
 def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
-    from fe_likelihoods.probability.distributions import HalfNormal, Uniform
-    from fe_likelihoods.probability.likelihood import (
+    from fe_likelihoods.likelihood.likelihood import (
         FELikelihood,
     )  # not needed by workers, which start faster without it
-    from fe_likelihoods.probability.posterior import Posterior
+    from fe_likelihoods.likelihood.posterior import Posterior
+    from fe_likelihoods.priors.distributions import HalfNormal, Uniform
 
     noise = np.random.default_rng(3).normal(size=(1, N_STEPS))
     measurements = Measurements(CHANNELS, DT, line(np.array([0.4, 0.7])) + 0.3 * noise)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
@@ -10,7 +11,6 @@ from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
-from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.durations import growing_durations

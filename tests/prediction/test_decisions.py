@@ -8,22 +8,22 @@ import pytest
 from scipy import special, stats
 from scipy.fft import dct
 
+from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
+from fe_likelihoods.events.hierarchy import Hierarchy
+from fe_likelihoods.events.ratios import EventRatios, LevelRatios
+from fe_likelihoods.events.stored_posterior import StoredPosterior
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.noise.gaussian import GaussianNoise
-from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
 from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.model_error import model_error
 from fe_likelihoods.prediction.new_event import event_level, event_ratio, predict_new_event
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import peak, rms
 from fe_likelihoods.prediction.reliability import exceedance
-from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
-from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.probability.hierarchy import Hierarchy
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import Prior
-from fe_likelihoods.probability.stored_posterior import StoredPosterior
+from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
+from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from fe_likelihoods.prediction.event_ratios import EventRatios, LevelRatios
+from fe_likelihoods.events.ratios import EventRatios, LevelRatios
 from fe_likelihoods.prediction.reliability import exceedance
 from tests.prediction.twins import ratio_twin
 

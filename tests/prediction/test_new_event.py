@@ -5,16 +5,16 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import GaussianNoise
+from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
+from fe_likelihoods.events.hierarchy import Hierarchy
+from fe_likelihoods.events.ratios import EventRatios
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.prediction.event_ratios import EventRatios
 from fe_likelihoods.prediction.new_event import event_ratio, predict_new_event
 from fe_likelihoods.prediction.quantities import peak, rms
-from fe_likelihoods.probability.distributions import HalfNormal, LogNormal
-from fe_likelihoods.probability.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.probability.hierarchy import Hierarchy
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import Prior
+from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
+from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 
 TOP = Channel("top", "displacement", "mm")
@@ -46,7 +46,7 @@ def hierarchy(rng):
     for k in range(6):
         gain = np.exp(np.log(MEDIAN) + SPREAD * rng.standard_normal() + 0.05 * rng.standard_normal(400))
         tests[f"EQ{k}"] = {"gain": gain, "share_top": 0.2 * np.exp(0.05 * rng.standard_normal(400))}
-    from fe_likelihoods.probability.stored_posterior import StoredPosterior
+    from fe_likelihoods.events.stored_posterior import StoredPosterior
 
     tests = {name: StoredPosterior(values, prior) for name, values in tests.items()}
     varying = {"gain": Varying(LogNormal(MEDIAN, 0.5), HalfNormal(0.3))}

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.prediction.averaging import average_predictions
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
 from fe_likelihoods.prediction.streaming import RunningMoments
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import Prior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
+from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed

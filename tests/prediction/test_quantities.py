@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import (
@@ -14,9 +16,7 @@ from fe_likelihoods.prediction.quantities import (
     rms,
 )
 from fe_likelihoods.prediction.reliability import exceedance
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.units import G0
 

@@ -8,6 +8,8 @@ from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import integrate, stats
 
 from fe_likelihoods import GaussianNoise
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import propagate
@@ -22,9 +24,7 @@ from fe_likelihoods.prediction.scores import (
     pit_samples,
     share_within,
 )
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
 

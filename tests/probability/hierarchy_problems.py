@@ -26,7 +26,7 @@ from fe_likelihoods import (
     Uniform,
     Varying,
 )
-from fe_likelihoods.probability.hierarchy_checks import HierarchyChecks
+from fe_likelihoods.events.hierarchy_checks import HierarchyChecks
 
 __all__ = ["RIGHT", "WRONG", "Problem", "Result", "problem", "solve"]
 

@@ -14,7 +14,7 @@ from fe_likelihoods import (
     Uniform,
     compare_tests,
 )
-from fe_likelihoods.probability import agreement
+from fe_likelihoods.events import agreement
 
 ROOT = np.array([[0.2, 0.0], [0.1, 0.3]])  # of the covariance of the errors of the first test
 SETS = 200

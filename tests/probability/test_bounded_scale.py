@@ -14,7 +14,7 @@ from fe_likelihoods import (
     Uniform,
     Varying,
 )
-from fe_likelihoods.probability.scales import Scales, scales_of
+from fe_likelihoods.events.scales import Scales, scales_of
 
 SHARE = Varying(Uniform(0.0, 1.0), HalfNormal(1.0), "logit")
 ERROR = 0.5  # of measured logits

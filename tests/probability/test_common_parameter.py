@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import HalfNormal, HierarchicalPosterior, Prior, StoredPosterior, TruncatedNormal, Uniform, Varying
-from fe_likelihoods.probability.hierarchy_checks import check_hierarchy
+from fe_likelihoods.events.hierarchy_checks import check_hierarchy
 
 WIDE = TruncatedNormal(0.0, 3.0, -np.inf, np.inf)
 LINEAR = Varying(TruncatedNormal(0.0, 1.0, -np.inf, np.inf), HalfNormal(0.5), "linear")

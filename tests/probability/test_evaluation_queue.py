@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.likelihood.failures import TooManyFailures
+from fe_likelihoods.likelihood.joint import JointLikelihood
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.distributions import HalfNormal, Uniform
-from fe_likelihoods.probability.failures import TooManyFailures
-from fe_likelihoods.probability.joint import JointLikelihood
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, Uniform
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.executors import LocalPool

@@ -23,10 +23,10 @@ from fe_likelihoods import (
     Varying,
     propagate,
 )
-from fe_likelihoods.probability.hierarchical_posterior import _correlation_factor
-from fe_likelihoods.probability.pareto_smoothing import pareto_shape
-from fe_likelihoods.probability.scales import scales_of
-from fe_likelihoods.probability.stored_posterior import describe
+from fe_likelihoods.events.hierarchical_posterior import _correlation_factor
+from fe_likelihoods.events.pareto_smoothing import pareto_shape
+from fe_likelihoods.events.scales import scales_of
+from fe_likelihoods.events.stored_posterior import describe
 from tests.probability.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests

@@ -18,10 +18,10 @@ from fe_likelihoods import (
     Varying,
     leave_one_out,
 )
-from fe_likelihoods.probability.hierarchy_checks import check_hierarchy
-from fe_likelihoods.probability.pareto_smoothing import smoothed_weights
+from fe_likelihoods.events.hierarchy_checks import check_hierarchy
+from fe_likelihoods.events.pareto_smoothing import smoothed_weights
 
-module = importlib.import_module("fe_likelihoods.probability.leave_one_out")
+module = importlib.import_module("fe_likelihoods.events.leave_one_out")
 ERROR, WIDE = 0.2, 2.0  # standard deviations of a measurement and of the prior of a test
 LINEAR = Varying(TruncatedNormal(0.0, 2.0, -np.inf, np.inf), HalfNormal(1.0), "linear")
 GRID = np.stack([each.ravel() for each in np.meshgrid(np.linspace(-1, 3, 120), np.linspace(0.01, 2.4, 120))], axis=1)

@@ -9,12 +9,12 @@ import pytest
 from scipy import integrate, special, stats
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
-from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record

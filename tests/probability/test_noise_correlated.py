@@ -10,14 +10,14 @@ from scipy import linalg, stats
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.draws import SampleNoise
 from fe_likelihoods.noise.residuals import effective_samples, lag_one_sums
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
 from fe_likelihoods.prediction.scores import interval_score
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record

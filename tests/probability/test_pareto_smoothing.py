@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.probability.pareto_smoothing import smoothed_weights
+from fe_likelihoods.events.pareto_smoothing import smoothed_weights
 
 
 def test_smoothed_weights_and_shape_are_those_of_arviz(rng):

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from fe_likelihoods.likelihood.failures import FailureLog, reason_without_numbers
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.gaussian import GaussianNoise
-from fe_likelihoods.probability.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.failures import FailureLog, reason_without_numbers
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
-from fe_likelihoods.probability.priors import Prior
+from fe_likelihoods.priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import MisfitBatch, SimulationBatch, SimulationFailed, misfit_batch, simulate_batch

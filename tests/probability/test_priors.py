@@ -9,8 +9,8 @@ import pytest
 from scipy import integrate, stats
 from scipy.special import log_ndtr, ndtr
 
-from fe_likelihoods.probability.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.probability.priors import Prior
+from fe_likelihoods.priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.priors.priors import Prior
 
 
 def truncated(mean, sd, lower=0.0, upper=math.inf):

@@ -5,16 +5,16 @@ import warnings
 import numpy as np
 import pytest
 
+from fe_likelihoods.likelihood.block_likelihood import block_log_likelihood
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.gaussian import GaussianNoise
 from fe_likelihoods.noise.levels import local_level
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import rms
-from fe_likelihoods.probability.block_likelihood import block_log_likelihood
-from fe_likelihoods.probability.distributions import HalfNormal, TruncatedNormal
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
+from fe_likelihoods.likelihood.failures import TooManyFailures
+from fe_likelihoods.likelihood.likelihood import FELikelihood
+from fe_likelihoods.likelihood.simulator import Simulator
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
@@ -15,9 +18,6 @@ from fe_likelihoods.models.linear_structure_parts import ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
-from fe_likelihoods.probability.failures import TooManyFailures
-from fe_likelihoods.probability.likelihood import FELikelihood
-from fe_likelihoods.probability.simulator import Simulator
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
@@ -305,7 +305,7 @@ def test_a_damaged_response_is_simulated_again(path, thetas):
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
 
     class Interrupted(Line):
         def simulate(self, theta):
@@ -325,7 +325,7 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkey
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
     expected = likelihood_of(Line()).simulate(thetas)
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
     batch = likelihood_of(Line(), cache=path).simulate(thetas)
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
@@ -344,7 +344,7 @@ def test_too_many_failures(thetas):
 @pytest.mark.parametrize("source", ["disk", "disk, responses", "recalled"])
 def test_known_failures_are_compared_with_all_known_simulations(source, path, thetas, monkeypatch):
     """Failures of an earlier run must not stop a run that has simulated little itself."""
-    monkeypatch.setattr("fe_likelihoods.probability.simulator._SECONDS_PER_CHUNK", 0.0)
+    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
     thetas = np.concatenate([thetas, thetas + [10.0, 0.4], thetas + [20.0, 0.4]])
     new = np.column_stack([np.arange(40.0), np.full(40, 0.5)])
     first = likelihood_of(Line(), cache=None if source == "recalled" else path)

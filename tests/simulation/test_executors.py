@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import problems
+from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.probability.likelihood import FELikelihood
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import dask_executor, sent_functions
 from fe_likelihoods.simulation.by_value import Pickled

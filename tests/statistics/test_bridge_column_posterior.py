@@ -14,8 +14,8 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import problems, rrmse
-from fe_likelihoods.probability.distributions import TruncatedNormal
-from fe_likelihoods.probability.posterior import Posterior
+from fe_likelihoods.likelihood.posterior import Posterior
+from fe_likelihoods.priors.distributions import TruncatedNormal
 from fe_likelihoods.signals.readers import read_csv
 from fe_likelihoods.signals.records import Record
 from samplers import SMCSampler

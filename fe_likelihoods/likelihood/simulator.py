@@ -1,6 +1,6 @@
 """Simulations of a model and their statistics against measurements: each is run once, counted, cached and verified.
 
-A request first takes what is known (`fe_likelihoods.probability.known_simulations`). The other simulations are run in a
+A request first takes what is known (`fe_likelihoods.likelihood.known_simulations`). The other simulations are run in a
 pool to which single items can be submitted, where each is cached when it arrives and nothing waits for a batch.
 Otherwise they are run in parts, each of which is cached when it has ended: in this process, on threads by compiled
 models, or by the ``map`` of a pool. Both ways are one for those who request simulations: `start`, `wait`, `leave`.
@@ -22,6 +22,7 @@ import numpy as np
 from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import FinishedRows, MemoryCache, ResponseMemory, RowBuffer, distinct_keys
 from ..cache.simulation_cache import SimulationCache
+from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
@@ -39,7 +40,7 @@ from ..simulation.opened import Observed, unpack
 from ..simulation.residual_statistics import Statistic, statistic_width
 from .checked_model import CheckedModel, opened_cache
 from .failures import FailureLog
-from .inputs import as_rows, check_statistic, name_of_statistic
+from .inputs import check_statistic, name_of_statistic
 from .known_simulations import KnownSimulations, Requested, most_responses
 from .running_simulations import RunningRequests, RunningSimulation, Simulated, take_all
 

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..priors.distributions import TruncatedNormal
+from ..priors.mixture_prior import MixtureDistribution, fit_mixture
+from ..priors.points import as_points
+from ..priors.priors import Prior
 from ..signals.channels import Measurements
 from ..text_tables import number, text_table
-from .distributions import TruncatedNormal
-from .inputs import as_points
-from .mixture_prior import MixtureDistribution, fit_mixture
-from .priors import Prior
 from .scales import Scales
 
 __all__ = [

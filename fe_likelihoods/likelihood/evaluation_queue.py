@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from ..cache.memory import distinct_keys
+from ..priors.points import as_points
+from ..priors.priors import Prior
 from ..simulation.model import has_batch_method
-from .inputs import as_points
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
-from .priors import Prior
 from .running_simulations import RunningSimulation, take_all
 from .simulator import Simulator
 

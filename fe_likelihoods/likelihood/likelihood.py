@@ -3,7 +3,7 @@
 The steps are: structural parameters to the response of the model, response to the sums of squared residuals J per
 channel, J and the parameters of the noise to the log-likelihood. (A noise may need more numbers than J, its statistic
 of the residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches the simulations
-(`fe_likelihoods.probability.simulator`). The equations are on the page ``docs/theory/likelihood.rst``.
+(`fe_likelihoods.likelihood.simulator`). The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -21,15 +21,16 @@ from ..noise.marginal import MarginalNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
 from ..noise.sample_counts import count_samples
 from ..noise.time_shifts import with_time_shifts
+from ..priors.distributions import Distribution, RandomState, uniform_numbers
+from ..priors.multivariate import as_distribution
+from ..priors.points import as_points, complete_repr
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
 from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
 from .data_identity import combined_digest, data_digests
-from .distributions import Distribution, RandomState, uniform_numbers
-from .inputs import as_points, check_model, check_noise, complete_repr, match_measurements
-from .multivariate import as_distribution
+from .inputs import check_model, check_noise, match_measurements
 from .parameters import Parameter, describe_parameters
 from .simulator import Simulator, reported
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from .event_ratios import EventRatios, LevelRatios, RatioPopulations, standardised
+from .ratios import EventRatios, LevelRatios, RatioPopulations, standardised
 
 __all__ = ["EventSpread", "exceedance_draws", "exceedance_of_samples"]
 

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..noise.protocol import noise_title
+from ..priors.distributions import Distribution, RandomState
+from ..priors.points import as_points, complete_repr
+from ..priors.priors import Prior
 from .block_likelihood import BlockLogLikelihood
-from .distributions import Distribution, RandomState
 from .evaluation_queue import EvaluationQueue
-from .inputs import as_points, complete_repr
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
 from .parameters import Parameter
 from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, predictive_draws
-from .priors import Prior
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
@@ -304,7 +304,7 @@ class Posterior:
             Samples of the posterior.
         block : float, optional
             Length of a block [s], by default from the correlation of the residuals
-            (`fe_likelihoods.probability.block_likelihood.choose_blocks`).
+            (`fe_likelihoods.likelihood.block_likelihood.choose_blocks`).
         seed : int
             Seed of the noise.
 

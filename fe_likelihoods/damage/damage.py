@@ -27,14 +27,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..events.ratios import EventRatios, LevelRatios
+from ..events.spread import EventSpread
+from ..prediction.prediction import Prediction
+from ..prediction.propagation import check_effective_sample_size
+from ..prediction.reliability import Exceedance, exceedance, exceedance_probability, warn_of_missing_error
 from ..text_tables import number
 from ..units import DIMENSIONS, find_unit, from_si
-from .damage_measures import SIDES, STRAIN_MEASURES, DamageMeasures
-from .event_ratios import EventRatios, LevelRatios
-from .event_spread import EventSpread
-from .prediction import Prediction
-from .propagation import check_effective_sample_size
-from .reliability import Exceedance, exceedance, exceedance_probability, warn_of_missing_error
+from .measures import SIDES, STRAIN_MEASURES, DamageMeasures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

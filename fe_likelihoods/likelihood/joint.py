@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..noise.marginal import sampled_noise
+from ..priors.distributions import Distribution, RandomState
+from ..priors.points import as_points
 from .data_identity import combined_digest
-from .distributions import Distribution, RandomState
-from .inputs import as_points
 from .likelihood import FELikelihood
 from .parameters import Parameter, channels_of_deviations
 from .simulator import COUNTS, reported

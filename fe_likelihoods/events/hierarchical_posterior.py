@@ -29,11 +29,11 @@ from typing import Any
 
 import numpy as np
 
-from .distributions import Distribution, RandomState
-from .inputs import as_points, complete_repr
-from .multivariate import as_distribution
+from ..priors.distributions import Distribution, RandomState
+from ..priors.multivariate import as_distribution
+from ..priors.points import as_points, complete_repr
+from ..priors.priors import Prior
 from .population_marginal import population_marginal
-from .priors import Prior
 from .scales import SCALES, scales_of
 from .stored_posterior import StoredPosterior, describe
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from ..priors.distributions import RandomState
+from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
-from .distributions import RandomState
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_checks import check_hierarchy
-from .inputs import as_points, complete_repr
 from .population_marginal import draw_parameters, sample_weights
 
 __all__ = ["Hierarchy"]

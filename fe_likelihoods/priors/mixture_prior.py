@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .distributions import RandomState
-from .inputs import as_points
 from .multivariate import MultivariateDistribution, as_generator
+from .points import as_points
 
 if TYPE_CHECKING:
     from .priors import Prior

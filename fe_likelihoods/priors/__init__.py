@@ -1,0 +1,1 @@
+"""Prior distributions of parameters: of one, of several together, and of all."""

@@ -1,1 +1,0 @@
-"""Priors, noise models, the likelihood and the posterior."""
