@@ -22,16 +22,16 @@ from .records import Record
 
 __all__ = ["Alignment", "align"]
 
-_FEWEST = 0.5  # share of the energy, and of the samples, of the shorter of channel and reference that must overlap
-_CANDIDATES = 8  # highest peaks on the grid of lags that are refined
+_FEWEST = 0.5  # the shorter of channel and reference must overlap with this share of its energy and of its samples
+_CANDIDATES = 8  # number of the highest peaks on the grid of lags that are refined
 _WINDOW = 5.0  # length of the sums over lags of autocorrelations, in correlation times
-_DRIFT = 4.0  # standard errors of the drift beyond which it is stated
+_DRIFT = 4.0  # a drift beyond this many standard errors is stated
 _LARGEST_DRIFT = 0.01
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 
 
 class Alignment(NamedTuple):
-    """A lag, and how sure it is.
+    """A lag and its uncertainty.
 
     Attributes
     ----------
@@ -42,12 +42,12 @@ class Alignment(NamedTuple):
     correlation : dict of str to float
         Correlation of each channel with the shifted reference [-]; negative for a sensor with the opposite sign.
     probability : float
-        Probability of the highest peak against the second highest one, a different lag.
+        Probability of the highest peak, compared with the second highest peak at a different lag.
     second_lag : float or None
         Lag of the second highest peak [s]; None if there is none.
     drift : float
-        Change of the lag per time [-], from the lags of the first and the second half of the energy of the reference:
-        0.002 if the clock of the measurements gains 2 ms per second.
+        Change of the lag per time [-], from the lags of the reference's first and second half (by energy): 0.002 if the
+        clock of the measurements gains 2 ms per second.
     drift_error : float
         Standard error of the drift [-]; inf if the halves are too short.
     """
@@ -62,7 +62,7 @@ class Alignment(NamedTuple):
 
     @property
     def statement(self) -> str:
-        """How sure the lag is, in words."""
+        """Uncertainty of the lag, in words."""
         text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, correlation " + ", ".join(
             f"{name} {value:.3f}" for name, value in self.correlation.items()
         )
@@ -90,9 +90,9 @@ class _Pair(NamedTuple):
     name : str
         Name of the channel.
     start, step : float
-        Time of its first sample and its step [s].
+        Time of the channel's first sample, and its step [s].
     places : (n,) int
-        Places of the samples that are there.
+        Indices of the samples that are not missing.
     values : (n,) float
         These samples, without their mean.
     dt : float
@@ -120,7 +120,7 @@ class _Pair(NamedTuple):
 
     @property
     def finer(self) -> int:
-        """Number of lags per step of the channel, so that they are not farther apart than the reference's samples."""
+        """Number of lags per channel step, so that lags are not farther apart than the reference samples."""
         return max(1, math.ceil(self.step / self.dt - 1e-9))
 
 
@@ -139,25 +139,25 @@ def align(
     measurements : Measurements
         The measurements. Missing samples are left out.
     channels : sequence of str, optional
-        The channels to use. Default: those that the response has as well; for a record, the only acceleration.
+        The channels to use. Default: the channels that the response also has; for a record, the only acceleration.
     max_lag : float, optional
-        Largest lag in both directions [s]. Default: half of the shorter duration. At a lag, half of the
-        shorter one of channel and reference must overlap with the other.
+        Largest lag in both directions [s]. Default: half of the shorter duration. At each lag, half of the shorter of
+        channel and reference must overlap with the other.
 
     Returns
     -------
     Alignment
-        The lag, its error, and the statement of how sure it is.
+        The lag, its error, and a statement of its uncertainty.
 
     Raises
     ------
     ValueError
         If channels do not exist or do not fit, a channel or the reference is constant, the largest lag is beyond the
-        record, or the correlation is largest at the end of the range of lags.
+        record, or the correlation is largest at an end of the lag range.
 
     Notes
     -----
-    The standard error is that of least squares with correlated errors: the information of a channel is a^2 sum r'^2 /
+    The standard error follows from least squares with correlated errors: the information of a channel is a^2 sum r'^2 /
     (s^2 k), with the variance s^2 of the errors and k = 1 + 2 sum_j q_j p_j for the autocorrelations q of the errors
     and p of the derivative r' of the reference.
     """
@@ -273,7 +273,7 @@ def _coefficient(own: NDArray[np.float64], shifted: NDArray[np.float64]) -> floa
 def _on_lags(pair: _Pair, lags: NDArray[np.float64]) -> NDArray[np.float64]:
     """Correlations (n_lags,), interpolated between the lags of the grid; zero with too little overlap.
 
-    The step of the grid is that of the channel, divided so that it is not longer than that of the reference.
+    The grid has the step of the channel, divided so that it is not longer than the step of the reference.
     """
     step, places = pair.step / pair.finer, pair.finer * pair.places
     steps = int(pair.end / step + 1e-9) + 1
@@ -307,7 +307,7 @@ def _on_lags(pair: _Pair, lags: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _advantage(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, other: float) -> float:
-    """Score of a lag minus that of another one, over the samples that both compare."""
+    """Difference between the scores of two lags, over the samples that both compare."""
     total = 0.0
     for pair, n in zip(pairs, effective, strict=True):
         common = _shifted(pair, lag)[0] & _shifted(pair, other)[0]
@@ -331,7 +331,7 @@ def _refine(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, 
 
 
 def _drift(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, step: float) -> tuple[float, float]:
-    """Change of the lag per time and its standard error, from the lags of two halves of the energy of the reference."""
+    """Change of the lag per time and its standard error, from the lags of the reference's two halves (by energy)."""
     halves = [[_half(pair, lag, later) for pair in pairs] for later in (False, True)]
     if any(half.values.size < 20 for parts in halves for half in parts):
         return 0.0, math.inf
@@ -357,7 +357,7 @@ def _drift(pairs: Sequence[_Pair], effective: NDArray[np.float64], lag: float, s
         motions = [(part.times[inside], motion) for part in parts for inside, motion in [_shifted(part, lag)]]
         centres.append(np.mean([np.average(times, weights=motion**2) for times, motion in motions]))
     apart = float(centres[1] - centres[0])
-    # where there is no noise, the interpolation of the reference limits what can be told apart
+    # without noise, the interpolation of the reference limits which lags can be distinguished
     error = math.sqrt(sum(variances) + (0.02 * step) ** 2)
     return (lags[1] - lags[0]) / apart, error / apart
 
@@ -373,7 +373,7 @@ def _half(pair: _Pair, lag: float, later: bool) -> _Pair:
 
 
 def _errors(pair: _Pair, lag: float) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Errors of the shifted reference that fits best, the shifted reference times its factor, and that factor."""
+    """Errors of the best-fitting shifted reference, the shifted reference times its factor, and this factor."""
     inside, shifted = _shifted(pair, lag)
     own, shifted = pair.values[inside] - pair.values[inside].mean(), shifted - shifted.mean()
     factor = float(own @ shifted / (shifted @ shifted))
@@ -407,7 +407,7 @@ def _autocorrelation(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _sum_to_window(terms: NDArray[np.float64]) -> float:
-    """Sum of the terms at lags of one and more, up to five correlation times, because later ones are mostly noise."""
+    """Sum of the terms at lags of one and more, up to five correlation times, because later terms are mostly noise."""
     times = 1.0 + 2.0 * np.cumsum(np.abs(terms[1:]))
     wide = np.flatnonzero(np.arange(1, terms.size) >= _WINDOW * times)
     last = int(wide[0]) + 1 if wide.size else terms.size - 1

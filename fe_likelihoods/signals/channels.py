@@ -83,8 +83,8 @@ class Measurements:
         Time step [s], or one per channel.
     values : (n_channels, n_steps) array_like, or sequence of n_channels arrays
         Samples in SI units, one row per channel, stored as a read-only copy. NaN marks a missing sample: a gap, or
-        times at which a channel was not measured. So does a masked element of a `numpy.ma` array. Rows of different
-        lengths are filled with NaN at their ends.
+        times at which a channel was not measured. Masked elements of a `numpy.ma` array are also missing. Rows of
+        different lengths are filled with NaN at their ends.
     description : str, optional
         What was measured, where and when.
     start : float or sequence of float, optional
@@ -154,7 +154,7 @@ class Measurements:
 
     @property
     def n_steps(self) -> int:
-        """Number of samples of each channel."""
+        """Number of samples per channel."""
         return self.values.shape[1]
 
     @property
@@ -179,7 +179,7 @@ class Measurements:
 
     @property
     def root_mean_squares(self) -> NDArray[np.float64]:
-        """Root mean square of the samples of each channel, shape (n_channels,) [SI unit of the channel]."""
+        """Root mean square of each channel, shape (n_channels,) [SI unit of the channel]."""
         return np.sqrt(np.nanmean(np.square(self.values), axis=1))
 
     @property
@@ -193,7 +193,7 @@ class Measurements:
         return self.times(self.channels[0].name)
 
     def times(self, name: str) -> NDArray[np.float64]:
-        """Return the times of the samples of one channel, shape (n_steps,) [s], those of missing samples included."""
+        """Return the sample times of one channel, shape (n_steps,) [s], including the times of missing samples."""
         row = self._row(name)
         times = np.arange(self.n_steps) * self.steps[row]
         return times + self.starts[row] if self.starts[row] else times
@@ -245,8 +245,8 @@ class Measurements:
         Returns
         -------
         Measurements
-            The samples. Channels that begin at zero begin at zero again, as the record that is trimmed to the same
-            times; for others, `start` is the new zero.
+            The samples. Channels that begin at zero begin at zero again, like a record that is trimmed to the same
+            times; for other channels, `start` is the new zero.
 
         Raises
         ------
@@ -296,13 +296,13 @@ class Measurements:
 
         Notes
         -----
-        This is the right way to thin measurements for a likelihood with white noise: the remaining samples keep their
-        noise, which is still independent from sample to sample, and they are compared with the response of the model
-        at the same instants. A filter would correlate the noise.
+        This is the right way to thin measurements for a likelihood with white noise: the noise of the remaining samples
+        is still independent from sample to sample, and they are compared with the model response at the same instants.
+        A filter would correlate the noise.
 
         The remaining samples are not a band-limited signal, because motion above the new Nyquist frequency appears at
-        lower frequencies (aliasing). Do not differentiate or integrate them or compute spectra of them, and resample
-        an excitation with `Record.resample` instead.
+        lower frequencies (aliasing). Do not differentiate or integrate them, or compute their spectra, and resample an
+        excitation with `Record.resample` instead.
         """
         if not isinstance(factor, (int, np.integer)) or not 1 <= factor <= self.n_steps:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
@@ -366,7 +366,7 @@ class Measurements:
         return html_object(f"Measurements of {self.n_channels} channels", [self.description], html_table(header, rows))
 
     def rrmse_of(self, response: "Measurements") -> dict[str, float]:
-        """Return the RRMSE of each channel that both have [-]; none if the times differ or the channel is zero."""
+        """Return the RRMSE of each common channel [-], except channels that are zero or whose times differ."""
         simulated = {channel.name for channel in response.channels}
         common = [channel.name for channel in self.channels if channel.name in simulated]
         return {
@@ -457,7 +457,7 @@ def _check_start(start: Any) -> float:
 
 
 def plot_response(response: Measurements, measurements: Measurements | None = None, **options) -> "Figure":
-    """Plot the response of a model, beside measurements if there are any.
+    """Plot the response of a model, with measurements if there are any.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
     Raises
     ------
     ValueError
-        If some times have a date and others have none, or 1 o'clock follows 12 o'clock, as on a clock of 12 hours.
+        If some times have a date and others have none, or 1 o'clock follows 12 o'clock, as on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
     dates = {time.day is None for time in known}

@@ -1,13 +1,13 @@
-"""Comparison of the response of a model with measurements that have gaps, or times of their own.
+"""Comparison of a model response with measurements that have gaps, or other sample times than the response.
 
-Measurements with all samples of the model's response need none of this: their residuals are a difference of arrays.
-Here a channel is compared where it was measured. Samples that are missing have residuals of NaN, so that a statistic of
-the residuals sees which samples are there.
+Measurements with all samples of the model response need none of this: their residuals are a difference of arrays. Here
+each channel is compared at the times at which it was measured. Missing samples have residuals of NaN, so that
+statistics of the residuals can leave them out.
 
-The response is evaluated at the times of the samples by interpolation (`fe_likelihoods.signals.interpolation`), without
-a filter, also where a channel has longer steps than the response. A sample is the value of the quantity at one instant,
-and the value of the response at the same instant is what it is compared with. A filter of the response would remove
-motion that the sensor has measured; the noise of thinned white samples stays white.
+The response is interpolated at the sample times (`fe_likelihoods.signals.interpolation`), without a filter, even for
+channels sampled more coarsely than the response. A sample is the value of the quantity at one instant, and it is
+compared with the response at the same instant. A filter of the response would remove motion that the sensor has
+measured; the noise of thinned white samples stays white.
 """
 
 import math
@@ -30,14 +30,15 @@ _LATEST = 1e-6  # in steps: how far a sample may be after the end of the respons
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measurements that have gaps, or times of their own, prepared for a response.
+    """Measurements that have gaps, or other sample times than a response, prepared for this response.
 
     Attributes
     ----------
     values : ndarray, shape (n_channels, n_samples)
         Samples [SI], NaN where there is none.
     places : tuple of Interpolation or None, one per channel
-        How the response is evaluated at the times of each channel; None where its times are those of the response.
+        How the response is evaluated at the sample times of each channel; None if the channel and the response have the
+        same times.
     lags : Lags or None
         Lags at which the residuals are also formed, for unknown time shifts.
     """
@@ -53,7 +54,7 @@ class Comparison:
 
     @property
     def description(self) -> str:
-        """What residuals depend on besides response and measurements: interpolation and lags, for fingerprints."""
+        """Interpolation and lags of the residuals, for fingerprints."""
         text = " interpolated by six points" if self.interpolated else ""
         if self.lags is not None:
             shifted = [k for k, place in enumerate(self.lags.places) if place is not None]
@@ -66,7 +67,7 @@ class Comparison:
         return np.isnan(self.values)
 
     def at_samples(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the response (n_channels, n_steps) at the times of the samples, shape (n_channels, n_samples)."""
+        """Return the response (n_channels, n_steps) at the sample times, shape (n_channels, n_samples)."""
         if all(place is None for place in self.places):
             return response
         n_samples = self.values.shape[1]
@@ -112,9 +113,8 @@ class Lags(NamedTuple):
     count : int
         The lags are -count ... count steps of the response.
     places : tuple of Interpolation or None, one per channel
-        How the response is evaluated at (sample, lag), all samples of one lag after the other; None for channels
-        without a shift.
-    samples : tuple of ndarray of int or None, one per channel
+        How the response is evaluated at (sample, lag), lag by lag; None for channels without a shift.
+    samples : tuple of (integer ndarray or None), one per channel
         The samples of each channel that are compared.
     """
 
@@ -123,7 +123,7 @@ class Lags(NamedTuple):
     samples: tuple[NDArray[np.intp] | None, ...]
 
     def sums(self, response: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return sums of products of residuals at neighbouring lags, shape ((2 count + 1) * POINTS, n_channels).
+        """Return sums over products of residuals at neighbouring lags, shape ((2 count + 1) * POINTS, n_channels).
 
         The number of row ``POINTS * k + j`` is the sum over the samples of e_k e_(k + j), where e_k is the residual at
         lag k; zero for channels without a shift, and where k + j is no lag.
@@ -143,7 +143,7 @@ class Lags(NamedTuple):
 def compare_with(
     measurements: Measurements, dt: float, n_steps: int, time_shifts: Mapping[str, float] | None = None
 ) -> NDArray[np.float64] | Comparison:
-    """Return what a response is compared with.
+    """Return the measured values, or the `Comparison`, that a response is compared with.
 
     Parameters
     ----------
@@ -152,25 +152,25 @@ def compare_with(
     dt : float
         Time step of the response [s].
     n_steps : int
-        Number of samples of the response.
+        Number of response samples.
     time_shifts : mapping of str to float, optional
-        Largest unknown time shift of channels [s], by their names. Samples within this time of an end of the response,
-        and three further steps, are then left out of their channel.
+        Largest unknown time shift of channels [s], by their names. Samples of such a channel are left out within this
+        time, plus three steps, from either end of the response.
 
     Returns
     -------
     ndarray, shape (n_channels, n_steps), or Comparison
-        The measured values if each sample of the response has one, else the comparison.
+        The measured values if every response sample has one, else the comparison.
 
     Raises
     ------
     ValueError
-        If the measurements do not end with the response, a sample is before the first one of the response, or a time
-        shift leaves no sample.
+        If the measurements do not end with the response, a sample is before the first response sample, or a time shift
+        leaves no sample.
 
     Notes
     -----
-    With the step of the response, the measurements must have all its samples, of which some may be missing (NaN). With
+    With the step of the response, the measurements must have as many samples, some of which may be missing (NaN). With
     other steps or starts, they must end within one step before the end of the response, so that a wrong step is
     noticed.
     """

@@ -1,7 +1,7 @@
 """Data sets in HDF5: an excitation, the response measured under it, and how both were made.
 
 A data set is one file with a `Record`, `Measurements` and free attributes, such as the true parameters of synthetic
-data. It carries a checksum over all of them, because a posterior from damaged data gives no sign of the damage.
+data. It carries a checksum of all contents, because a posterior gives no sign of damaged data.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
-"""Durations of the first parts of a record, by their share of the Arias intensity.
+"""Durations after which a record has reached given shares of its Arias intensity.
 
 A search for parameters is more robust if it starts with a short first part of the record and continues with longer
-ones: the misfit of a long record has many local minima, because cycles of the response that are out of phase by a whole
-period nearly fit. The first part must contain enough of the strong motion to identify the parameters.
+parts: the misfit of a long record has many local minima, because response cycles that are out of phase by a whole
+period nearly fit. The first part must contain enough strong motion to identify the parameters.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,13 @@ def growing_durations(
     Parameters
     ----------
     acceleration : (n_steps,) or (n_channels, n_steps) float
-        Accelerations of a record, or measured responses where there is no record. Of several channels, each counts
-        alike.
+        Accelerations of a record, or measured responses if there is no record. Several channels have equal weight.
     dt : float
         Time step [s].
     shares : sequence of float
-        Increasing shares of the integral of the squared acceleration, between 0 and 1.
+        Increasing shares of the integrated squared acceleration, between 0 and 1.
     ratio : float
-        Least ratio of a duration to the one before, at least 1. Durations that are too close to the next longer one are
+        Smallest ratio of successive durations, at least 1. Durations that are too close to the next longer duration are
         left out.
 
     Returns

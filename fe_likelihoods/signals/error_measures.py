@@ -22,8 +22,7 @@ def rrmse(
     predicted : (..., n_steps) array_like
         Predicted values :math:`\hat y`.
     measured : (..., n_steps) array_like
-        Measured values :math:`y` in the same unit, of the same shape. The sums are over the samples that are there:
-        those that are NaN are left out.
+        Measured values :math:`y` in the same unit, of the same shape. Samples that are NaN are left out of the sums.
     names : sequence of str, optional
         Names of the histories, for the message of an error.
 
@@ -35,7 +34,7 @@ def rrmse(
     Raises
     ------
     ValueError
-        If the shapes differ, or a measured history has no sample or is zero at all of them.
+        If the shapes differ, or a measured history has no sample or only zeros.
 
     Examples
     --------
@@ -53,12 +52,12 @@ def rrmse(
 
 
 def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:
-    """Sum of squares of each measured history, the denominator of relative errors.
+    """Sum of squares per measured history, the denominator of relative errors.
 
     Parameters
     ----------
     measured : (..., n_steps) array_like
-        Measured values; those that are NaN are left out.
+        Measured values; NaN is left out.
     names : sequence of str, optional
         Names of the histories, for the message of an error.
 
@@ -70,7 +69,7 @@ def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> N
     Raises
     ------
     ValueError
-        If a history has no sample or is zero at all of them, so that no error relative to it exists.
+        If a history has no sample or only zeros, so that no relative error exists.
     """
     squares = np.square(np.asarray(measured, dtype=float))
     sums = (np.nan_to_num(squares, nan=0.0) if np.isnan(squares).any() else squares).sum(axis=-1)

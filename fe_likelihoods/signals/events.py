@@ -1,7 +1,7 @@
 """Several records on one structure, one after the other: `Events` is one loading and knows the times of its events.
 
 The state of the structure is carried from event to event, because a model simulates the joined record as one. Cracks,
-yielded bars and residual displacements of one event are the initial state of the next one.
+yielded bars and residual displacements after one event are the initial state of the next event.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ class Events(Record):
     Parameters
     ----------
     records : sequence of Record
-        The events in their order in time, with the same time step. Events among them are taken apart, and keep the
-        pauses between them.
+        The events in chronological order, with the same time step. `Events` in the sequence are split into their
+        records, and keep their pauses.
     rest : float or sequence of float
         Length of the pauses [s], zero or more, rounded to whole time steps; a sequence has one for each pause. The
         pause should be long enough for the free vibration to decay, as it was in the test.
     names : sequence of str, optional
-        Names of the events, which must differ. Default: the names of the records; a name that comes again has a number
-        ("EQ1", "EQ1_2").
+        Names of the events, which must differ. Default: the names of the records; a repeated name gets a number ("EQ1",
+        "EQ1_2").
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Events(Record):
 
     @property
     def in_events(self) -> NDArray[np.bool_]:
-        """Whether a sample of the joined record is in an event, not in a pause, shape (n_steps,)."""
+        """Whether each sample of the joined record is in an event, not in a pause, shape (n_steps,)."""
         inside = np.zeros(self.n_steps, dtype=bool)
         for window in self.windows:
             inside[window.samples] = True
@@ -150,7 +150,7 @@ class Events(Record):
         return self.windows[self.names.index(name)]
 
     def split(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Split histories at the samples of the joined record into those of the events, without the pauses.
+        """Split histories over the joined record into one history per event, without the pauses.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Events(Record):
         Raises
         ------
         ValueError
-            If the number of samples differs from that of the joined record.
+            If the histories and the joined record have different numbers of samples.
         """
         values = np.asarray(values)
         if values.shape[-1:] != (self.n_steps,):
@@ -234,7 +234,7 @@ class Events(Record):
         return Measurements(tuple(channels.values()), dt, values, "; ".join(described))
 
     def resample(self, dt: float) -> Events:
-        """Return the events with another time step, each resampled by itself as by `Record.resample`."""
+        """Return the events with another time step, each resampled separately by `Record.resample`."""
         return Events([record.resample(dt) for record in self.records], self.rests, self.names)
 
     def scale(self, factor: float) -> Events:
@@ -268,7 +268,7 @@ def _pauses(rest: float | Sequence[float], n: int) -> list[float]:
 
 
 def _flatten(given: list[Record], pauses: list[float]) -> tuple[list[Record], list[float]]:
-    """Replace `Events` among the records by their parts; return the parts and the pauses between them."""
+    """Replace `Events` among the records by their records; return all records and the pauses between them."""
     parts, between = [], []
     for record, pause in zip(given, [*pauses, None], strict=True):
         inner = isinstance(record, Events)
@@ -279,7 +279,7 @@ def _flatten(given: list[Record], pauses: list[float]) -> tuple[list[Record], li
 
 
 def _unique(given: list[Record]) -> list[str]:
-    """Names of the events, with a number where a name comes again."""
+    """Names of the events, with a number for repeated names."""
     names: list[str] = []
     for wanted in [name for each in given for name in (each.names if isinstance(each, Events) else [each.name])]:
         count, name = 1, wanted
@@ -299,8 +299,8 @@ def _checked_names(names: Sequence[str], n: int) -> list[str]:
 
 
 def find_events(model: Any) -> Events | None:
-    """The events that are the excitation of a model, None if it is another one."""
-    for name in ("record", "loading", "supports"):  # of the models of this package; optional in others
+    """The events that are the excitation of a model; None if the excitation is a plain record."""
+    for name in ("record", "loading", "supports"):  # models of this package have it; optional in others
         excitation = getattr(model, name, None)
         for each in excitation if isinstance(excitation, tuple | list) else (excitation,):
             if isinstance(each, Events):
@@ -309,7 +309,7 @@ def find_events(model: Any) -> Events | None:
 
 
 def events_of(model: Any) -> Events:
-    """The events that are the excitation of a model; raise ValueError if it is another one."""
+    """The events that are the excitation of a model; raise ValueError if the excitation is not `Events`."""
     events = find_events(model)
     if events is None:
         raise ValueError(
@@ -327,5 +327,5 @@ def events_of(model: Any) -> Events:
 
 
 def join_measurements(model: Any, measurements: Measurements | Mapping[str, Measurements]) -> Measurements:
-    """Measurements over the excitation of a model; those of single events, given by name, are joined."""
+    """Measurements over the excitation of a model; measurements of single events, given by name, are joined."""
     return events_of(model).join(measurements) if isinstance(measurements, Mapping) else measurements

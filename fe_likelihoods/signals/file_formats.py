@@ -11,7 +11,7 @@ CSMIP V2
     acceleration, velocity and displacement. Each block starts with a line such as
     ``3000 POINTS OF ACCEL DATA EQUALLY SPACED AT  .020 SEC.  (UNITS: CM/SEC/SEC)``, each channel ends with ``/&``.
 COSMOS V2 (format 1.20)
-    Headers that state their own length and Fortran format, then
+    Headers that state their length and Fortran format, then
     ``42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)``.
 
 Both V2 formats are Fortran columns without separators. They are split by width, never at blanks.
@@ -35,7 +35,7 @@ from .text_files import NUMBER, Series, check_count, is_number, parse_count, par
 
 __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
-# Expressions are searched from one place of a line, and no two parts of one match the same text: their time is linear.
+# Expressions are searched from one place in a line, and their parts never match the same text: their time is linear.
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
 _AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
@@ -55,7 +55,7 @@ _CSMIP_REALS, _CSMIP_DT = (
 )  # length of the real header; position in it, from 1, of the step of the corrected data
 _COSMOS_DT = 34
 _WIDEST = 1000
-# Limits of a zip archive with all that it contains: bytes, files, archives within archives. Stations have a few MiB.
+# Limits of a zip archive and its contents: bytes, files, nested archives. Stations have a few MiB.
 _LARGEST_CONTENT, _MOST_FILES, _DEEPEST = 64 * 2**20, 2000, 3
 _MOST_LINES = 4_000_000
 _ZIP_DAMAGE = (
@@ -123,7 +123,7 @@ def parse_at2(text: str, file: str) -> Series:
 
 
 def _at2_header(line: str) -> tuple[str, str, str] | None:
-    """Number of samples, step and its unit as the line of an AT2 header states them; None for another line."""
+    """Number of samples, step and unit of the step, as stated in a line of an AT2 header; None for other lines."""
     if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line, count.end())):
         return count[1], step[1], step[2]
     old = _AT2_OLD.match(line)
@@ -187,7 +187,7 @@ def parse_v2(channel: V2Channel) -> Series:
 
 
 class _Allowance:
-    """What may still be read of an archive; one object for all archives within it."""
+    """How much may still be read from an archive; one object for all nested archives."""
 
     def __init__(self, name: str):
         self._name, self._bytes, self._files = name, _LARGEST_CONTENT, _MOST_FILES
@@ -225,7 +225,7 @@ def _unzip(content: bytes, name: str, allowance: _Allowance | None = None, depth
 
 
 def _split_v2(text: str, file: str) -> list[V2Channel]:
-    """Return the channels of a V2 file. Channels of velocity and displacement (in COSMOS files) are left out."""
+    """Return the channels of a V2 file, without channels of velocity and displacement (in COSMOS files)."""
     channels = []
     if text.count("\n") > _MOST_LINES:
         raise ValueError(f"{file}: expected at most {_MOST_LINES} lines, got {text.count(chr(10))}")
@@ -271,7 +271,7 @@ def _header_number(channel: V2Channel, start: int, form: tuple[int, int], place:
 
 
 def _fixed_width(channel: V2Channel, start: int, count: int, form: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the `count` numbers of a block of Fortran columns."""
+    """Return the `count` numbers in a block of Fortran columns."""
     per_line, width = form
     values: list[float] = []
     for offset in range(start, start - (-count // per_line)):

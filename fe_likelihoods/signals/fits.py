@@ -1,4 +1,4 @@
-"""How well do responses fit measurements: the figure of a model before and after its update, with its errors."""
+"""Figure of how well responses fit measurements, such as a model before and after its update, with the errors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,23 +23,23 @@ def plot_fit(
     time_label: str = "time [s]",
     title: str | None = None,
 ) -> "Figure":
-    """Plot measurements beside the response of a model, such as before and after an update.
+    """Plot measurements with the response of a model, such as before and after an update.
 
-    Each channel has a row: the whole history beside each response, with the relative root mean square error (RRMSE) in
-    the title, and all responses in the strongest five seconds.
+    Each channel has a row: one axes per response with the whole history and the relative root mean square error (RRMSE)
+    in the title, then one axes with all responses in the strongest five seconds.
 
     Parameters
     ----------
     measurements : Measurements
         The measured histories.
     responses : mapping of str to (Measurements or ndarray), or one of these
-        Responses by their titles. An array has the shape of ``measurements.values`` [SI], its samples and its channels,
-        as ``measurements.values - posterior.likelihood.residuals(x)`` is for parameters x.
+        Responses by their titles. An array has the shape, samples and channels of ``measurements.values`` [SI], such as
+        ``measurements.values - posterior.likelihood.residuals(x)`` for parameters x.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all.
     window : float, optional
-        Length [s] of the strongest part that is shown again on a longer scale. None, or more than two thirds of the
-        history: no such part.
+        Length [s] of the strongest part, which is shown again on a longer scale. It is not shown for None or more than
+        two thirds of the history.
     time_label : str
         Label of the horizontal axes, for example "step" for a test without time.
     title : str, optional
@@ -48,7 +48,7 @@ def plot_fit(
     Returns
     -------
     matplotlib Figure
-        With axes of shape (n_channels, n_responses + 1); without the last column where no channel has such a part.
+        With axes of shape (n_channels, n_responses + 1), or (n_channels, n_responses) without strongest parts.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def plot_fit(
 
 
 def strongest_window(times: np.ndarray, values: np.ndarray, length: float) -> tuple[float, float]:
-    """Begin and end [s] of the part of a history with the largest sum of squares.
+    """Begin and end [s] of the part with the largest sum of squares.
 
     Parameters
     ----------

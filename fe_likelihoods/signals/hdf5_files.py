@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 __all__ = ["DAMAGE", "read_values"]
 
-# What reading a damaged file raises, besides ValueError
+# Errors that reading a damaged file raises, besides ValueError
 DAMAGE = (OSError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError)
 # deflate compresses zeros to 1/1032 of their size (RFC 1951); data are never smaller
 _LARGEST_RATIO = 1100
@@ -16,7 +16,7 @@ _SMALL = 2**20
 
 
 def read_values(data: Any, path: str | os.PathLike, kind: str = "<f8") -> NDArray:
-    """Return the numbers of a data set; raise ValueError where the file cannot contain as many as it declares.
+    """Return the numbers of a data set; raise ValueError if it declares more numbers than the file can contain.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Values of uniformly sampled histories at other times, by polynomials through the nearest samples.
 
-Between two samples a history is the polynomial of fifth degree through the three samples before and the three after
-(Lagrange's form). At a sample it is that sample, exactly. For a sine with n samples per period, the largest error is
-``0.31 (pi / n)^6`` of its amplitude: 5e-6 for n = 20, 3e-4 for n = 10. Nothing is filtered.
+Between two samples a history follows the fifth-degree polynomial through the three samples before and the three samples
+after (Lagrange's form). At a sample it has exactly the value of the sample. For a sine with n samples per period, the
+largest error is ``0.31 (pi / n)^6`` of its amplitude: 5e-6 for n = 20, 3e-4 for n = 10. Nothing is filtered.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ __all__ = ["POINTS", "Interpolation", "interpolate", "make_interpolation"]
 POINTS = 6
 """Number of samples that determine a value between two of them."""
 
-_SAME_TIME = 1e-6  # in steps: times that are nearer to a sample are those of the sample
+_SAME_TIME = 1e-6  # in steps: times nearer to a sample than this are equal to the time of the sample
 
 
 class Interpolation(NamedTuple):
@@ -26,7 +26,7 @@ class Interpolation(NamedTuple):
     first : ndarray of int, shape (n_times,)
         Index of the first sample of each polynomial.
     weights : ndarray, shape (n_points, n_times), or None
-        Weights of that sample and those after it; None where all times are those of samples, with weights of one.
+        Weights of this sample and the following samples; None if all times are sample times, with weights of one.
     """
 
     first: NDArray[np.intp]
@@ -41,7 +41,7 @@ def make_interpolation(dt: float, n_steps: int, times: NDArray[np.float64]) -> I
     dt : float
         Time step of the history [s]. Its first sample is at time zero.
     n_steps : int
-        Number of samples of the history.
+        Number of samples in the history.
     times : (n_times,) float
         Times within the history [s].
 

@@ -1,7 +1,7 @@
 """Readers of measured responses in CSV files and Excel workbooks: histories, and tests with an imposed displacement.
 
-They convert to SI units, with the units and the time step of the file or of their arguments, and raise ValueError if
-neither states them or if they disagree (`fe_likelihoods.signals.tables`).
+They convert to SI units. Units and time step come from the file or the arguments; ValueError is raised if neither
+states them or if they disagree (`fe_likelihoods.signals.tables`).
 """
 
 from collections.abc import Sequence
@@ -69,16 +69,16 @@ def read_columns(
     description : str, optional
         Description of the measurements.
     time_unit : str, optional
-        Unit of the times, if the name of their column does not end with it.
+        Unit of the times, if the column name does not end with it.
     skip : int, optional
         Number of lines above the table, if they are not found.
     zero : float or str, optional
         Time in the file at which the excitation begins [s]. For clock times, which count from midnight, it may be a
         clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``.
     missing : sequence of float, optional
-        Numbers that stand for missing samples; they are read as NaN. A warning names those that none of the columns
-        has. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them;
-        -999, 99999, -99999, 32767 and -32768 unless a further number has half their size. ``()`` takes all numbers as
+        Numbers that stand for missing samples; they are read as NaN. A warning names the numbers that no column has.
+        If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them; -999,
+        99999, -99999, 32767 and -32768 unless a further number has half their size. ``()`` takes all numbers as
         measured.
 
     Returns
@@ -128,7 +128,7 @@ def read_imposed_test(
     units : str or sequence of str, optional
         Unit of the numbers, as in `read_columns`.
     displacement_unit : str, optional
-        Unit of the displacement, if the name of its column does not end with it.
+        Unit of the displacement, if the column name does not end with it.
     description : str, optional
         Description of the measurements.
     skip : int, optional

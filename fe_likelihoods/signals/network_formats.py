@@ -1,8 +1,8 @@
 """File formats of strong-motion networks: USGS SMC, GeoNet V1A and V2A, K-NET and KiK-net, ESM and ITACA.
 
-The functions return plain numbers with the unit, the step and the title that a file states, as those of
-`fe_likelihoods.signals.file_formats`. The stated number of samples and the stated peak are compared with what was read,
-so that a file of another form is refused instead of read wrongly.
+The functions return plain numbers with the unit, the step and the title that a file states, as in
+`fe_likelihoods.signals.file_formats`. The stated number of samples and the stated peak are compared with the samples,
+so that a file with another layout is refused instead of misread.
 
 USGS SMC
     11 lines of text, 48 integers in columns of 10, 50 reals in columns of 15, comment lines with ``|``, samples in
@@ -13,9 +13,9 @@ GeoNet V1A, V2A
     velocities and displacements, in columns of 8. Format description: W. J. Cousins (2008), "GNS accelerogram data
     files, standard format"; GeoNet, "Strong motion file formats".
 K-NET, KiK-net
-    17 lines of names and values, then counts. The scale factor is that of a count, and the mean is subtracted, as in
-    the stated peak. Format description: National Research Institute for Earth Science and Disaster Resilience, "About
-    K-NET ASCII format".
+    17 lines of names and values, then counts, which are multiplied by the stated scale factor. The mean is subtracted,
+    as in the stated peak. Format description: National Research Institute for Earth Science and Disaster Resilience,
+    "About K-NET ASCII format".
 ESM, ITACA (DYNA 1.x)
     Lines ``NAME: value``, then one sample per line. Format description: ITACA development team, "DYNA 1.0".
 """
@@ -33,7 +33,7 @@ from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, p
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
-_SMC_NULL = 1.6e38  # reals at least this large are not given
+_SMC_NULL = 1.6e38  # larger reals stand for missing values
 _SMC_TYPES = {"1": "UNCORRECTED ACCELEROGRAM", "2": "CORRECTED ACCELEROGRAM"}
 _SMC_TEXT, _SMC_INTEGERS, _SMC_REALS, _SMC_DATA = 11, (48, 8, 10), (50, 5, 15), (8, 10)
 _GEONET_TEXT, _GEONET_INTEGERS, _GEONET_REALS, _GEONET_DATA = 16, (40, 10, 8), (60, 10, 8), (10, 8)
@@ -71,7 +71,7 @@ class GeonetComponent(NamedTuple):
 
 
 def recognise(text: str) -> tuple[str, str | None]:
-    """Return the name of the format of a file, and of the function that reads it.
+    """Return the name of a file's format, and the name of the function that reads it.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def recognise(text: str) -> tuple[str, str | None]:
     Returns
     -------
     name : str
-        Name of the format; empty if it is none of those that are known.
+        Name of the format; empty if it is unknown.
     reader : str or None
         Name of the function; None for a format that is not read.
     """
@@ -91,7 +91,7 @@ def recognise(text: str) -> tuple[str, str | None]:
 
 
 def _is_table(lines: list[str]) -> bool:
-    """Whether two successive lines are numbers between commas, semicolons or tabs, which no format here has."""
+    """Whether two successive lines have numbers between commas, semicolons or tabs, which no format here has."""
     before = False
     for line in lines:
         separator = next((each for each in (";", "\t", ",") if each in line), None)
@@ -278,7 +278,7 @@ def parse_esm(text: str, file: str) -> Series:
 
 
 def _numbers(lines: list[str], start: int, count: int, per_line: int, width: int, file: str) -> list[float]:
-    """Numbers of a header of Fortran columns, from the line with index `start`."""
+    """Numbers in a header with Fortran columns, from the line with index `start`."""
     numbers = []
     for k in range(count):
         row, column = divmod(k, per_line)
@@ -315,7 +315,7 @@ def _whole(number: float, file: str, what: str) -> int:
 
 
 def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
-    """Raise ValueError if the stated peak is not that of the samples."""
+    """Raise ValueError if the stated peak is not the peak of the samples."""
     if not abs(found - stated) <= tolerance:
         raise ValueError(
             f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "

@@ -1,7 +1,7 @@
 """Readers of ground motions: formats of strong-motion networks, CSV, and Excel workbooks.
 
-`read_record` recognises the format of a ground motion. The other readers name the format of a file that they do not
-read.
+`read_record` recognises the format of a ground motion. The other readers, given a file in another format, name this
+format in their error.
 
 Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
 ValueError if neither states them or if they disagree. The formats themselves are in
@@ -174,7 +174,7 @@ def read_record(
     units: str | None = None,
     missing: Sequence[float] | None = None,
 ) -> Record:
-    """Read a ground motion from a file of any format that is read here, which is recognised by its first lines.
+    """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def read_record(
     Raises
     ------
     ValueError
-        As the reader of the format; for a format that is known and not read, with its name.
+        As the reader of the format; for a known format without a reader, the message has its name.
     """
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
@@ -213,7 +213,7 @@ def read_record(
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
-    """Read the corrected acceleration of one channel from a CSMIP or COSMOS V2 file, or from a zip archive of them.
+    """Read the corrected acceleration of one channel from a CSMIP or COSMOS V2 file, or from a zip archive of V2 files.
 
     Archives may contain archives, as downloads of whole stations do. The unit is taken from the file, which must state
     it.
@@ -226,8 +226,8 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
         The channel number of the station (``STA CHN``), or of the recorder if the file has no other. Needed if there
         is more than one channel.
     member : str, optional
-        End of the name of a file in the archive, such as ``"CHAN12.V2"`` or ``"Free Field.zip/CHAN012.V2"``. Needed if
-        the archive contains a channel more than once.
+        End of the file name in the archive, such as ``"CHAN12.V2"`` or ``"Free Field.zip/CHAN012.V2"``. Needed if the
+        archive contains a channel more than once.
 
     Returns
     -------
@@ -269,11 +269,11 @@ def read_csv(
     Cells are separated by commas, semicolons, tabs or blanks. Decimal commas are read where commas do not separate.
     The text is UTF-8 or Latin-1. Text above the table is left out. Workbooks need the package openpyxl.
 
-    The unit is the suffix of the name of the column (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell of a
-    line of units below the header line, the comment ``# units: g``, or `units`. If more than one of them is given, they
-    must agree. Times must be uniform within the rounding of their printed digits. The first sample of the record is at
-    time zero, also where the times of the file begin later (see `read_columns`). The comments ``# dt = 0.02 s`` and ``#
-    npts = 1559`` are checked if present.
+    The unit is the suffix of the column name (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line
+    of units below the header line, the comment ``# units: g``, or `units`. If several are given, they must agree. Times
+    must be uniform within the rounding of the printed digits. The first sample of the record is at time zero, even if
+    the times in the file begin later (see `read_columns`). The comments ``# dt = 0.02 s`` and ``# npts = 1559`` are
+    checked if present.
 
     Parameters
     ----------
@@ -287,14 +287,14 @@ def read_csv(
     column : str, optional
         Name of the column, needed if there is more than one besides the time.
     time_unit : str, optional
-        Unit of the times, if the name of their column does not end with it.
+        Unit of the times, if the column name does not end with it.
     skip : int, optional
         Number of lines above the table, if they are not found.
     missing : sequence of float, optional
-        Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. A warning
-        names those that the column does not have. Others of -9999, -999.25, 1e30 and 9.97e36 are refused unless further
-        numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further number has half their
-        size. ``()`` takes all numbers as measured.
+        Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. A warning names
+        the numbers that the column does not have. If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless
+        further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further number has half
+        their size. ``()`` takes all numbers as measured.
 
     Returns
     -------
@@ -319,7 +319,7 @@ def _read_csv(
     skip: int | None = None,
     missing: Sequence[float] | None = None,
 ) -> Record:
-    """`read_csv`, at the depth of calls that its warnings expect below a public reader."""
+    """`read_csv`, at the call depth below a public reader that its warnings expect."""
     with named_format(path, "read_csv"):
         series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt, missing)
     return _record(series, units, path, Path(path).stem)
@@ -327,7 +327,7 @@ def _read_csv(
 
 @contextlib.contextmanager
 def named_format(path: str | Path, reader: str) -> Iterator[None]:
-    """Name the format of a file that a reader refuses, if it is another one that is known."""
+    """Name the format of a file that a reader refuses, if it is another known format."""
     try:
         yield
     except ValueError as error:
@@ -348,6 +348,6 @@ def _looks_like(name: str, reader: str | None) -> str:
 
 def _record(series: Series, units: str | None, file: str | Path, name: str) -> Record:
     unit = agree_on_unit(series.unit, units, "acceleration", file)
-    # The source has the name of the file without its folder, because it is written into data sets that are shared.
+    # The source has the file name without its folder, because it is written into data sets that are shared.
     source = Path(file).name + (f": {series.title}" if series.title else "")
     return Record(name, series.dt, to_si(series.values, unit, "acceleration"), source)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DisplacementHistory", "Record", "SubdividedHistory"]
 
-_LARGEST_RATIO_TERM = 1000  # of the two steps in `Record.resample`; the length of the filter grows with it
+_LARGEST_RATIO_TERM = 1000  # of the ratio of steps in `Record.resample`; the filter length grows with it
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +104,10 @@ class Record:
 
         A longer step filters first, with a symmetric (zero-phase) finite impulse response whose half-amplitude point
         is the new Nyquist frequency, in the polyphase form of `scipy.signal.resample_poly` (Kaiser window, beta = 5).
-        Motion below 0.84 of the new Nyquist frequency keeps its amplitude within 0.3 %, motion above 1.16 of it keeps
-        less than 0.3 %. Before the first sample and after the last one the record is continued by its mirror image in
-        time and sign about that sample, so that an offset, a drift or a record that was cut does not cause
-        oscillations at its ends.
+        Motion below 0.84 times the new Nyquist frequency keeps its amplitude within 0.3 %, motion above 1.16 times this
+        frequency keeps less than 0.3 %. Before the first sample and after the last sample the record is continued by
+        its mirror image in time and sign about this sample, so that an offset, a drift or a cut does not cause
+        oscillations at the ends.
         """
         new_dt = check_step(dt, self.name)
         exact = self.dt / new_dt
@@ -182,7 +182,7 @@ class Record:
         """Return this record, a pause without ground motion, and another record as one record.
 
         A model simulates the result as one loading, so the state of the structure at the end of this record (cracks,
-        yielding, residual displacements) is its state at the beginning of the other one. To keep the times of the
+        yielding, residual displacements) is its state at the beginning of the other record. To keep the times of the
         events, join the records with `fe_likelihoods.signals.events.Events`.
 
         Parameters

@@ -2,7 +2,7 @@ r"""Elastic response spectrum of a ground motion: the largest response of linear
 
 Each oscillator is solved exactly for a ground acceleration that is linear between its samples
 (`fe_likelihoods.signals.sdof.respond`). The response is evaluated at 40 instants or more per period, so that a peak
-between two of them is underestimated by less than :math:`1 - \cos(\pi / 40) = 0.3\,\%` of the oscillating part. The
+between two instants is underestimated by less than :math:`1 - \cos(\pi / 40) = 0.3\,\%` of the oscillating part. The
 response is followed for one period of free vibration after the end of the motion, because the peak may occur there.
 
 References
@@ -42,7 +42,7 @@ class ResponseSpectrum(NamedTuple):
     pseudo_velocity : ndarray, shape (n_periods,)
         Pseudo-velocity, :math:`\omega` SD [m/s].
     pseudo_acceleration : ndarray, shape (n_periods,)
-        Pseudo-acceleration, :math:`\omega^2` SD [m/s²]. Multiplied by the mass, it is the largest force of the spring.
+        Pseudo-acceleration, :math:`\omega^2` SD [m/s²]. Multiplied by the mass, it is the largest spring force.
     """
 
     periods: NDArray[np.float64]

@@ -18,7 +18,7 @@ __all__ = [
     "sample_window",
 ]
 
-_TIME_TOLERANCE = 1e-9  # in steps: round-off of times that are multiples of the step
+_TIME_TOLERANCE = 1e-9  # in steps: round-off in times that are multiples of the step
 _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
 
 
@@ -81,7 +81,7 @@ def check_step(dt: float, name: str) -> float:
 
 
 def rest_samples(rest: float, dt: float) -> int:
-    """Return the number of zero samples in a pause of `rest` seconds between two records of step `dt` [s].
+    """Return the number of zero samples in a pause of `rest` seconds between two records with the step `dt` [s].
 
     Raises
     ------
@@ -148,7 +148,7 @@ def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float 
 
 
 def array_digest(*arrays: NDArray[np.float64]) -> str:
-    """Return a hex digest (BLAKE2b, 128 bits) of arrays of float64, equal on every machine (little-endian bytes)."""
+    """Return a hex digest (BLAKE2b, 128 bits) of float64 arrays, equal on every machine (little-endian bytes)."""
     state = hashlib.blake2b(digest_size=16)
     for array in arrays:
         state.update(np.ascontiguousarray(array, dtype="<f8").tobytes())

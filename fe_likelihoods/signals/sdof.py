@@ -60,7 +60,7 @@ def hold_integrals(z: complex) -> tuple[complex, complex]:
     if abs(z) >= 1.0:
         constant = (cmath.exp(z) - 1.0) / z
         return constant, (constant - 1.0) / z
-    # Both differences cancel at small z. The series of the second one, 1/2 + z/3! + ..., is exact to round-off.
+    # Both differences cancel at small z. The series of the second difference, 1/2 + z/3! + ..., is exact to round-off.
     series = 1.0 + 0.0j
     for k in range(20, 2, -1):
         series = 1.0 + z / k * series

@@ -1,8 +1,8 @@
-"""Rows of cells of CSV files, as loggers and spreadsheets write them, and of Excel workbooks.
+"""Rows of cells in CSV files, as loggers and spreadsheets write them, and in Excel workbooks.
 
-Cells are separated by semicolons, tabs, commas or blanks; the separator is the one that splits most of the last lines
-into numbers. Decimal commas are read where commas do not separate. Text before the header line is left out. A line with
-numbers and words is never taken for such text unless a header line follows it.
+Cells are separated by semicolons, tabs, commas or blanks, whichever splits most of the last lines into numbers. Decimal
+commas are read if commas do not separate cells. Text before the header line is left out. A line with numbers and words
+counts as such text only if a header line follows it.
 """
 
 import codecs
@@ -39,7 +39,7 @@ class Rows(NamedTuple):
     names : tuple of str
         Cells of the header line. Empty if there is none.
     units : tuple of str
-        Cells of a line of units below the header line. Empty if there is none.
+        Cells in a line of units below the header line. Empty if there is none.
     cells : list of (int, list of str)
         Number of the line and cells, with decimal points. A missing cell is an empty string.
     comments : list of str
@@ -109,7 +109,7 @@ def _split(line: str, separator: str, where: str) -> list[str]:
 
 
 def _find_separator(lines: Sequence[str]) -> str:
-    """The separator that splits most of the lines into several numbers, or into one if none does."""
+    """The separator that splits most lines into several numbers, or into one number if no separator does."""
     best, most = " ", (0, 0)
     for separator in _SEPARATORS:
         widths: Counter[int] = Counter()
@@ -174,7 +174,7 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 def _check_short_header(lines: Sequence[tuple[int, list[str]]], width: int, file: str) -> None:
-    """Raise ValueError if the line above the rows has the names of all their cells but one."""
+    """Raise ValueError if the line above the rows has one name fewer than the rows have cells."""
     number, cells = lines[-1] if lines else (0, [])
     if width > 2 and len(cells) == width - 1 and _is_text(cells) and all(cells):
         raise ValueError(
@@ -236,9 +236,9 @@ def _find_header(
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a line below a header line has units: all cells are, one is a unit of time, or all are in brackets.
+    """Whether a line below a header line has units: all cells are units, one is a unit of time, or all are in brackets.
 
-    Cells that are no known unit are refused where their column is read.
+    Cells that are no known unit are refused when their column is read.
     """
     given = [cell for cell in cells if cell]
     if all(map(_unit_of, given)) or all(cell[0] + cell[-1] in ("()", "[]") for cell in given):
@@ -258,7 +258,7 @@ def _is_text(cells: Sequence[str]) -> bool:
 
 
 def _unit_of(cell: str) -> str:
-    """The unit that a cell consists of, with or without brackets; an empty string if it is none."""
+    """The unit that a cell consists of, with or without brackets; an empty string if the cell is no unit."""
     text = cell.strip("[]() ")
     try:
         find_unit(text)
@@ -287,7 +287,7 @@ def _with_points(rows: list[tuple[int, list[str]]], file: str) -> list[tuple[int
 def _without_empty_columns(
     names: tuple[str, ...], units: tuple[str, ...], rows: list[tuple[int, list[str]]], comments: list[str]
 ) -> Rows:
-    """Rows without the columns that have neither a name nor a number, as after a separator at the end of each line."""
+    """Rows without columns that have neither a name nor a number, such as after a separator at the end of each line."""
     width = len(rows[0][1])
     empty = {k for k in range(width) if (not names or not names[k]) and not any(cells[k] for _, cells in rows)}
     if not empty or len(empty) == width:
@@ -298,7 +298,7 @@ def _without_empty_columns(
 
 
 def _workbook(path: str | Path) -> list[tuple[int, list[str]]]:
-    """Rows of the first sheet of an Excel workbook, without empty ones; formulas have their stored values."""
+    """Non-empty rows in the first sheet of an Excel workbook; formulas have their stored values."""
     try:
         from openpyxl import load_workbook
     except ImportError as error:

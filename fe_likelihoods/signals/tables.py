@@ -1,6 +1,6 @@
 """Tables of numbers in text files and workbooks: columns with names, units and times.
 
-The functions return plain numbers, with the units and the step that the file states. They convert nothing but times.
+The functions return plain numbers, with the units and the step that the file states. Only times are converted.
 """
 
 import math
@@ -34,13 +34,13 @@ __all__ = [
 
 _LONGEST_UNIT = 100
 _SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
-# the same, or the ends of a range, but also plausible as measured numbers: counts, or accelerations in gal
+# also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
 _PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 
 
 class Table(NamedTuple):
-    """Columns of numbers of a text file.
+    """Columns of numbers in a text file.
 
     Attributes
     ----------
@@ -61,11 +61,11 @@ class Table(NamedTuple):
     time_unit : str or None
         Unit of the times as given by the caller.
     clocks : frozenset of int
-        Columns of clock times. Their values are the seconds since the midnight before the first one.
+        Columns of clock times. Their values are the seconds since the midnight before the first clock time.
     dates : frozenset of int
         Columns of dates, which have no values.
     day : int or None
-        Number of the day of the first clock time, None without a date.
+        Day number of the first clock time, None without a date.
     """
 
     file: str
@@ -219,13 +219,13 @@ def table_step(table: Table, dt: float | None = None) -> float:
 
     Notes
     -----
-    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit for
-    its own rounding, half a unit for the rounding of the two ends that define the grid. If that unit is more than half
-    a step, this tolerance would hide a missing sample, and it is not applied. Times that may have been stored in single
-    precision (float32) may differ by 2e-7 of the largest one, if that is less than a quarter of a step. Other times,
-    such as Unix times, must be uniform within 1e-4 of a step and the round-off of double precision. If, within the
-    rounding and within 1e-4 of it, the mean step corresponds to a whole number of samples per second, that number is
-    used.
+    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
+    it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
+    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored in single
+    precision (float32) may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other
+    times, such as Unix times, must be uniform within 1e-4 of a step and the round-off of double precision. If the mean
+    step corresponds to a whole number of samples per second, within the rounding and within a relative 1e-4, this
+    number is used.
     """
     stated = re.search(rf"\bdt\s*=\s*({NUMBER})\s*s\b", table.comments)
     place = _time_column(table)
@@ -242,11 +242,11 @@ def table_step(table: Table, dt: float | None = None) -> float:
 
 
 def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """Return the numbers of a column, with NaN for those equal to a number of `missing`.
+    """Return the numbers of a column, with NaN for numbers that are in `missing`.
 
     ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless `missing`
-    is empty or the number may have been measured: the column has others within 1 % of it, or, for -999 and the limits
-    of integers, others of half its size, as those beside a measured peak are.
+    is empty or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the
+    limits of integers, other numbers of half its size, like the samples next to a measured peak.
     """
     values = table.values[:, place]
     listed = _listed(missing)
@@ -271,7 +271,7 @@ def column_values(table: Table, place: int, missing: Sequence[float] | None = No
 
 
 def warn_if_absent(table: Table, places: Sequence[int], missing: Sequence[float] | None, stacklevel: int) -> None:
-    """Warn where a number of `missing` is in none of the columns: the file may write it in another way."""
+    """Warn if a number in `missing` is in none of the columns: the file may write it in another way."""
     listed = _listed(missing)
     absent = listed[~np.isin(listed, table.values[:, list(places)])]
     if absent.size:
@@ -321,8 +321,8 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
     For a file with clock times, `zero` may be a clock time.
 
-    A printed time is rounded by half a unit of its last digit at most. With ``zero=0``, a start that is a whole number
-    of steps within this rounding is that number of steps. For another `zero` this holds within round-off.
+    A printed time is rounded by at most half a unit of its last digit. With ``zero=0``, a start within this rounding of
+    a whole number of steps is set to this number. For another `zero`, the same holds within round-off.
     """
     place = _time_column(table)
     if isinstance(zero, str):
@@ -369,7 +369,7 @@ def _time_unit(table: Table, place: int) -> str:
 
 
 def _uniform_step(table: Table, place: int) -> tuple[float, float]:
-    """Return the mean step of a column of times [s] and the largest error that their rounding can cause in it."""
+    """Return the mean step of the times in a column [s], and the largest error in it that rounding can cause."""
     unit = _time_unit(table, place)
     times = to_si(table.values[:, place], unit, "time")
     if np.isnan(times).any():
@@ -382,7 +382,7 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
     step = float(times[-1] - times[0]) / increments.size
     rounding = float(to_si(10.0 ** -table.decimals[place], unit)) * (1 + 1e-6)
     largest = float(np.abs(times).max())
-    # no term may reach a step, otherwise it hides lost samples where the times are large, such as Unix times
+    # no term may reach a step, otherwise it hides lost samples if the times are large, such as Unix times
     single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and _fits_single_precision(table, place) else 0.0
     tolerance = (rounding if rounding <= 0.501 * step else 0.0) + single
     tolerance += min(1e-4 * step + 4 * float(np.spacing(largest)), 0.1 * step)
@@ -404,7 +404,7 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
 
 
 def _fits_single_precision(table: Table, place: int) -> bool:
-    """Return whether each printed time is that of a float32, rounded to the printed digits."""
+    """Return whether each printed time is a float32, rounded to the printed digits."""
     printed = table.values[:, place]
     with np.errstate(over="ignore"):
         single = printed.astype(np.float32).astype(np.float64)
@@ -412,7 +412,7 @@ def _fits_single_precision(table: Table, place: int) -> bool:
 
 
 def _check_single_clock(table: Table, place: int) -> None:
-    """Raise ValueError if another column has other times: it is not known which columns of values belong to them."""
+    """Raise ValueError if another column has different times, so that the times of the values are ambiguous."""
     own_unit = _time_unit(table, place)
     times = to_si(table.values[:, place], own_unit, "time")
     for other, name in enumerate(table.names):
@@ -439,5 +439,5 @@ def _check_single_clock(table: Table, place: int) -> None:
 
 def _decimals(field: str) -> int:
     mantissa, _, exponent = field.lower().partition("e")
-    power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger one is that of zero
+    power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
     return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)

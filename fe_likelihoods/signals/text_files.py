@@ -1,4 +1,4 @@
-"""What the readers of text files share: reading, numbers, units and series of samples."""
+"""Shared by the readers of text files: reading, numbers, units and series of samples."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-"""Regular expression of a decimal number, without alternatives for the same digits: its time is linear."""
+"""Regular expression for a decimal number, without alternatives for the same digits: its time is linear."""
 
 LARGEST_FILE = 256 * 2**20
 """Largest size of a text file or an archive [bytes]; long records have some MiB."""
