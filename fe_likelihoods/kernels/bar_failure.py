@@ -1,6 +1,6 @@
 """Failure of reinforcing bars: low-cycle fatigue with fracture, and buckling in compression.
 
-Both multiply the natural stress s of `reinforcing_steel` by a factor and leave its rules as they are::
+Both multiply the natural stress s of `reinforcing_steel` by a factor and do not change its rules::
 
     s_bar = phi_f(D) phi_b(x) s
 
@@ -10,9 +10,9 @@ that started at (x0, s0) is what remains of its strain after elastic unloading::
     D = sum (ep/Cf)^(1/alpha),   ep = |x-x0| - |s-s0|/E0
     phi_f = 1 - (Cf/Cd)^(1/alpha) D - max(0, D-1)/0.04,   not below 0
 
-The bar loses strength gradually and fractures at D = 1; its stress goes to zero before D = 1.04. The half cycles are
-those of rainflow counting, and the law provides them: a nested reversal starts a new half cycle one level deeper; a
-curve that ends where the path reversed before closes a loop, after which the interrupted half cycle continues.
+The bar loses strength gradually and fractures at D = 1; its stress goes to zero before D = 1.04. The branches of the
+law give the half cycles of rainflow counting: a nested reversal starts a new half cycle one level deeper; a curve that
+ends at an earlier reversal closes a loop, after which the interrupted half cycle continues.
 
 **Buckling.** A bar in compression follows the average stress of Dhakal and Maekawa. With the strain z = xr - x from the
 unloaded point xr of the largest tensile strain xs, and L/d the ratio of unsupported length to diameter::
@@ -52,11 +52,11 @@ from .reinforcing_steel import BRANCH, E0, FYP, MAX_TRANSITIONS, SC, XC, YP, bac
 
 __all__ = ["N_FAILURE", "N_STATE", "constants", "stress_history", "stress_tangent", "update"]
 
-# Layout of the constants of the failure of one steel. CF is 0 without fatigue, END 0 without buckling.
+# Layout of the failure constants of one steel. CF is 0 without fatigue, END 0 without buckling.
 CF, POWER, LOSS, END, END_FACTOR, END_STRESS, RESIDUAL = range(7)
 N_FAILURE = 7
 
-# Layout of the memory of one bar, after that of `reinforcing_steel`: five scalars, and for each level of branches the
+# Layout of one bar's memory, after the memory of `reinforcing_steel`: five scalars, and for each level of branches the
 # start of its half cycle, the damage before it, and the damage that it had done when the path reversed.
 DAMAGE, FRACTURED, UNLOADED, STRAIGHT, LOWEST, HALF_CYCLES = range(
     reinforcing_steel.N_STATE, reinforcing_steel.N_STATE + 6
@@ -71,7 +71,7 @@ MPA_100 = 100e6  # unit of the yield strength in the formulas of Dhakal and Maek
 
 @kernel
 def constants(steel, fy, cf, alpha, cd, slenderness, alpha_b, out):
-    """Fill `out` with the constants of the failure of one steel.
+    """Fill `out` with the failure constants of one steel.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def constants(steel, fy, cf, alpha, cd, slenderness, alpha_b, out):
     fy : float
         Yield strength [Pa].
     cf, alpha, cd : float
-        Coefficient and exponent of Coffin and Manson, and coefficient of the loss of strength; no fatigue if `cf` is 0.
+        Coefficient and exponent of Coffin and Manson, and coefficient of strength loss; no fatigue if `cf` is 0.
     slenderness : float
         Unsupported length of the bar divided by its diameter; no buckling if it is 0.
     alpha_b : float
@@ -112,7 +112,7 @@ def half_cycle_damage(dx, ds, c, f):
     -------
     damage : float
     slope : float
-        Derivative of the damage by the plastic strain.
+        Derivative of the damage with respect to the plastic strain.
     """
     plastic = abs(dx) - abs(ds) / c[E0]
     if plastic <= 0.0:
@@ -123,7 +123,7 @@ def half_cycle_damage(dx, ds, c, f):
 
 @kernel
 def buckling_factor(z, c, f):
-    """Return the factor of a bar at the compressive strain `z` from its unloaded point, and its derivative by z."""
+    """Return the factor of a bar at the compressive strain `z` from its unloaded point, and the factor's derivative."""
     if z <= c[YP]:
         return 1.0, 0.0
     if z <= f[END]:
@@ -139,7 +139,7 @@ def buckling_factor(z, c, f):
 
 @kernel
 def _half_cycle(level):
-    """Return the position in the memory of the half cycle of a level."""
+    """Return the position of a level's half cycle in the memory."""
     return HALF_CYCLES + 4 * (level - 1)
 
 
@@ -155,7 +155,7 @@ def _count(old, new, xc, sc, state, c, f):
         state[m + BEFORE] = state[k + BEFORE] + d
         state[m + START_X], state[m + START_S] = xc, sc
     elif level == 2:
-        # A path that leaves one backbone reaches the other one: its half cycle continues.
+        # A path that leaves one backbone reaches the other backbone: its half cycle continues.
         state[m + START_X], state[m + START_S] = state[k + START_X], state[k + START_S]
         state[m + BEFORE] = state[k + BEFORE]
     elif target == level - 2:
@@ -164,7 +164,7 @@ def _count(old, new, xc, sc, state, c, f):
         d, _ = half_cycle_damage(curve[XB] - state[k + START_X], curve[SB] - state[k + START_S], c, f)
         state[m + BEFORE] = state[k + BEFORE] + d - state[m + REVERSED]
     else:
-        # The deepest level reverses into the one above it, whose own half cycle is forgotten.
+        # The deepest level reverses into the level above it, whose half cycle is forgotten.
         d, _ = half_cycle_damage(xc - state[k + START_X], sc - state[k + START_S], c, f)
         state[m + BEFORE] = state[k + BEFORE] + d
         state[m + START_X], state[m + START_S] = xc, sc
@@ -248,7 +248,7 @@ def update(eps, state, c, f):
 def stress_tangent(eps, state, c, f, trial):
     """Return engineering stress and tangent at the trial strain `eps` without changing `state`.
 
-    `trial` (N_STATE,) is scratch; the other arguments are those of `update`.
+    `trial` (N_STATE,) is scratch; the other arguments are as for `update`.
     """
     for i in range(N_STATE):
         trial[i] = state[i]

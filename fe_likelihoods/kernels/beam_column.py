@@ -10,8 +10,8 @@ compatibility residual to Q until the work of this correction is below a toleran
 and the section states are kept from one global iteration to the next.
 
 Softening concrete makes sections locally unstable, and this iteration sometimes fails. The element then tries, in this
-order: the initial section flexibilities in every pass; the initial ones in the first pass only; a tenth of the
-increment at a time, up to four times in succession. If all of them fail, the element reports failure.
+order: the initial section flexibilities in every pass; the initial section flexibilities in the first pass only; a
+tenth of the increment at a time, up to four times in succession. If all attempts fail, the element reports failure.
 ``docs/theory/beam_column.rst`` has the equations.
 
 References
@@ -48,14 +48,14 @@ MAX_ATTEMPTS = 3000
 
 
 class Elements(NamedTuple):
-    """Constants and state of all elements of a column.
+    """Constants and state of all elements in a column.
 
     Attributes
     ----------
     points : ndarray (n_points,)
         Gauss-Lobatto points on [0, 1].
     tributary : ndarray (n_elements, n_points)
-        Length that each section stands for, its weight times the length of the element [m].
+        Length that each section represents: its weight times the element length [m].
     initial_flexibility : ndarray (3,)
         f11, f12, f22 of the virgin section.
     tolerance : float
@@ -75,7 +75,7 @@ class Elements(NamedTuple):
 
 @kernel
 def _invert(f11, f12, f13, f22, f23, f33):
-    """Return the upper half of the inverse of a symmetric 3 x 3 matrix, given by its upper half."""
+    """Invert a symmetric 3 x 3 matrix, given by its upper half; return the upper half of the inverse."""
     c11 = f22 * f33 - f23 * f23
     c12 = f13 * f23 - f12 * f33
     c13 = f12 * f23 - f13 * f22
@@ -126,7 +126,7 @@ def advance(v1, v2, v3, element, elements, sections):
     Returns
     -------
     bool
-        True if it converged. On failure the row is left as it was.
+        True if it converged. On failure the row is unchanged.
     """
     points, tributary, state, work = elements.points, elements.tributary, elements.state, elements.work
     initial_flexibility = elements.initial_flexibility

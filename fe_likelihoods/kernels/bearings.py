@@ -1,19 +1,19 @@
 """Force laws of the devices between a deck and its piers: sliding bearing and rubber restoring-force device.
 
-Friction. The slider resists the motion with mu(v) W Z, where the coefficient of friction depends on the velocity v::
+Friction. The slider resists the motion with mu(v) W Z, where the friction coefficient depends on the velocity v::
 
     mu(v) = f_min + df (1 - exp(-a |v|))
 
 and Z in [-1, 1] replaces the sign of v. There are three laws for Z.
 
 * Regularised (Bouc-Wen with exponent 2 and A = beta + gamma = 1): Z follows the displacement U over the yield
-  displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is independent of rates, so that a
-  monotone increment of U integrates exactly: tanh while Z grows, tan while it returns.
+  displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is rate-independent, so that a monotone
+  increment of U integrates exactly: tanh while Z grows, tan while it returns.
 * Exact (Coulomb): Z is the sign of v, or any value in [-1, 1] at rest.
-* Elastic-plastic: the slider is a spring of stiffness f_min W / Y that slides at mu(v) W.
+* Elastic-plastic: the slider is a spring with stiffness f_min W / Y that slides at mu(v) W.
 
 Rubber. With s = U / s_u, an odd polynomial F(s) is the skeleton, and an even polynomial D(s) is half the distance
-between the branches of loading and unloading::
+between the loading and unloading branches::
 
     F_r = F(s) + D(s) Z,    F = sum A_n s^n (n = 1, 3 ... 11),    D = sum B_m s^m (m = 0, 2, 4)
 
@@ -63,13 +63,13 @@ class Slider(NamedTuple):
     Attributes
     ----------
     f_min, df : float
-        Coefficient of friction at rest, and its increase at high velocity.
+        Friction coefficient at rest, and its increase at high velocity.
     a : float
         Rate of this increase [s/m].
     yield_displacement : float
         Y [m].
     stiffness : float
-        Of the elastic-plastic law, f_min W / Y [N/m].
+        Stiffness of the elastic-plastic law, f_min W / Y [N/m].
     """
 
     f_min: float
@@ -108,7 +108,7 @@ class RubberLaw(NamedTuple):
 
 @kernel(inline=True)
 def friction(velocity, slider):
-    """Return the coefficient of friction at `velocity` [m/s] and its derivative to the velocity [s/m]."""
+    """Return the friction coefficient at `velocity` [m/s] and its derivative with respect to the velocity [s/m]."""
     rest = slider.df * math.exp(-slider.a * abs(velocity))
     slope = slider.a * rest
     return slider.f_min + slider.df - rest, slope if velocity >= 0.0 else -slope
@@ -164,9 +164,9 @@ def regularised(increment, displacement, velocity, z, weight, slider, c, law):
     Parameters
     ----------
     increment : float
-        Of the displacement, since `z` [m].
+        Displacement increment since `z` [m].
     displacement, velocity : float
-        Of the bearing, at the end of the increment [m], [m/s].
+        Bearing displacement [m] and velocity [m/s] at the end of the increment.
     z : float
         Z before the increment.
     weight : float
@@ -185,15 +185,15 @@ def regularised(increment, displacement, velocity, z, weight, slider, c, law):
 
 @kernel(inline=True)
 def elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law):
-    """Return force [N], dF/dU [N/m], dF/dv [N s/m] and the force of the slider [N], for an elastic-plastic slider.
+    """Return force [N], dF/dU [N/m], dF/dv [N s/m] and the slider force [N], for an elastic-plastic slider.
 
-    Arguments are those of `regularised`, but `z` is the force of the slider before the increment [N].
+    Arguments as for `regularised`, but `z` is the slider force before the increment [N].
     """
     mu, dmu = friction(velocity, slider)
     force, stiffness, half_loop, slope = rubber(displacement, law)
     capacity, dcapacity = mu * weight, dmu * weight
     own, own_du, own_dv = z + slider.stiffness * increment, slider.stiffness, 0.0  # force of the slider, derivatives
-    share, dshare, share_dv = 0.0, 0.0, 0.0  # of the capacity, and its derivatives to U and v
+    share, dshare, share_dv = 0.0, 0.0, 0.0  # of the capacity, and its derivatives with respect to U and v
     if abs(own) >= capacity:  # also without a normal load
         share = 1.0 if own > 0.0 else -1.0
         own, own_du, own_dv = share * capacity, 0.0, share * dcapacity
@@ -211,7 +211,7 @@ def elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law
 def coulomb(total, displacement, velocity, pull, weight, slider, law):
     """Evaluate a set-valued slider and a rubber device at a trial force.
 
-    The trial force of the set-valued part, plus `pull` times the velocity, decides: the bearing sticks while it is
+    The trial force of the set-valued part plus `pull` times the velocity decides: the bearing sticks while this sum is
     within the bound at rest, and slides beyond.
 
     Parameters
@@ -219,7 +219,7 @@ def coulomb(total, displacement, velocity, pull, weight, slider, law):
     total : float
         Trial force, without the linear part of the rubber [N].
     displacement, velocity : float
-        Of the bearing [m], [m/s].
+        Bearing displacement [m] and velocity [m/s].
     pull : float
         Positive factor that turns a velocity into a force [N s/m].
     weight : float

@@ -20,7 +20,7 @@ __all__ = ["superpose_modes"]
 
 @kernel
 def superpose_modes(decay, before, after, participation, shapes, excitation, out):
-    """Add the real parts of the responses of all modes, which start from zero, to `out`.
+    """Add the real parts of all modal responses, which start from zero, to `out`.
 
     Parameters
     ----------

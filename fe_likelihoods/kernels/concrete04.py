@@ -13,7 +13,7 @@ Compression is negative. The memory of a fiber is (eps_min, eps_max), the extrem
 The stress is a single-valued function of the strain and of the memory. It does not depend on the direction of loading,
 and a trial evaluation changes nothing. A section can therefore evaluate its fibers side by side (SIMD).
 
-The law is that of the material Concrete04 of OpenSees. ``docs/theory/concrete.rst`` derives it.
+OpenSees has the same law as its material Concrete04. ``docs/theory/concrete.rst`` derives it.
 
 References
 ----------
@@ -63,7 +63,7 @@ def constants(fc, e0, ecu, ec, ft, etu, beta, out):
     beta : float
         Share of `ft` that is left at `etu`.
     out : ndarray (N_CONSTANTS,)
-        Overwritten. Any other consistent unit of stress serves as well.
+        Overwritten. Any other consistent stress unit serves as well.
     """
     e_secant = fc / e0
     out[FC] = fc
@@ -132,7 +132,7 @@ def unloading(eps_min, eps_max, c):
 def stress_tangent(eps, eps_min, eps_max, eps_end, slope, tension_slope, c):
     """Return stress and tangent at the trial strain `eps`.
 
-    The arguments after it are the memory and the values that `unloading` derives from it.
+    The arguments after `eps` are the memory and the values that `unloading` derives from the memory.
     """
     if eps < eps_min or eps > eps_max:
         return envelope(eps, c)

@@ -1,15 +1,15 @@
-"""Transformation between the displacements of the ends of an upright beam and its basic deformations.
+"""Transformation between the end displacements of an upright beam and its basic deformations.
 
-The basic deformations v = (elongation, theta_i, theta_j) are what remains of the displacements u of both ends after the
-rigid motion of the chord is removed. The end forces are p = T' Q with T = dv/du, and the stiffness is T'KT + Kg with
-the geometric part Kg = dT'/du Q::
+The basic deformations v = (elongation, theta_i, theta_j) remain when the rigid motion of the chord is removed from the
+displacements u of both ends. The end forces are p = T' Q with T = dv/du, and the stiffness is T'KT + Kg with the
+geometric part Kg = dT'/du Q::
 
     lx = L + d_uy,   ly = -d_ux,   Ln = sqrt(lx^2 + ly^2),   c = lx/Ln,   s = ly/Ln,   alpha = atan2(ly, lx)
     v = (Ln - L, theta_i - alpha, theta_j - alpha)
 
-The undeformed chord of a column points along global +Y, so that local x = +Y and local y = -X. The two rows of T that
-belong to rotations have the same translational part, and the translations of the two ends enter with opposite signs.
-Two vectors therefore hold all of T: one along the chord (ax, ay) and one along its normal (nx, ny).
+The undeformed chord of a column points along global +Y, so that local x = +Y and local y = -X. The two rotational rows
+of T have the same translational part, and the translations of the two ends enter with opposite signs. Two vectors
+therefore hold all of T: one along the chord (ax, ay) and one along its normal (nx, ny).
 
 The linear variant uses the direction and the length of the undeformed chord and no Kg.
 ``docs/theory/beam_column.rst`` derives the matrices.
@@ -41,7 +41,7 @@ class Chord(NamedTuple):
     c, s : float
         Direction cosines of the chord against +Y.
     length : float
-        Of the deformed chord, or of the undeformed one in the linear variant [m].
+        Length of the deformed chord, or of the undeformed chord in the linear variant [m].
     """
 
     elongation: float
@@ -58,9 +58,9 @@ class BasicForces(NamedTuple):
     Attributes
     ----------
     q1, q2, q3 : float
-        Axial force [N] and moments of the ends [N m].
+        Axial force [N] and end moments [N m].
     k11, k12, k13, k22, k23, k33 : float
-        Derivatives of q to the elongation [m] and the rotations [rad].
+        Derivatives of q with respect to the elongation [m] and the rotations [rad].
     """
 
     q1: float
@@ -81,11 +81,11 @@ def deformations(dux, duy, theta_i, theta_j, length, corotational):
     Parameters
     ----------
     dux, duy : float
-        Displacements of end J minus those of end I [m].
+        Displacements of end J relative to end I [m].
     theta_i, theta_j : float
         Rotations of the ends [rad].
     length : float
-        Of the undeformed element [m].
+        Length of the undeformed element [m].
     corotational : bool
         False for the linear variant.
     """
@@ -103,12 +103,12 @@ def deformations(dux, duy, theta_i, theta_j, length, corotational):
 
 @kernel(inline=True)
 def add_to_stiffness(first, basic, direction, corotational, force, stiffness):
-    """Add the end forces and the tangent of one element to those of the structure, in place.
+    """Add the end forces and the tangent of one element to the forces and the tangent of the structure, in place.
 
     Parameters
     ----------
     first : int
-        Degree of freedom of ux at end I; -3 at the fixed base, where only end J is free.
+        Number of the degree of freedom ux at end I; -3 at the fixed base, where only end J is free.
     basic : BasicForces
     direction : Chord
     corotational : bool

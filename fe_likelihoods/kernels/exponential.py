@@ -27,8 +27,8 @@ _LARGEST = 1e15  # largest row sum; it needs some fifty squarings
 def matrix_exponential(a, out, work):
     """Write exp(a) to `out`.
 
-    The number of squarings s makes the largest row sum of a / 2^s at most 1/2. The series ends after k = 16; the terms
-    left out are together below 1e-19 of the sum.
+    The number of squarings s makes the largest row sum of a / 2^s at most 1/2. The series ends after k = 16; the sum of
+    the omitted terms is below 1e-19 of the total.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def matrix_exponential(a, out, work):
 
 @kernel
 def _multiply(a, b, out):
-    """Write a b to `out`; zeros of `a`, of which a first-order system has many, are skipped."""
+    """Write a b to `out`; zeros in `a`, of which a first-order system has many, are skipped."""
     n = a.shape[0]
     for i in range(n):
         for j in range(n):

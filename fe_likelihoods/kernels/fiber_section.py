@@ -5,14 +5,14 @@ Plane sections stay plane, eps = e0 - y kappa::
     N = sum(sigma A),   M = -sum(sigma A y)
     k = [[sum(E A), -sum(E A y)], [-sum(E A y), sum(E A y^2)]]
 
-A trial evaluation only reads the memory of the fibers; `commit` advances it. In most trials most fibers stay within
-the strains that they have reached before, where the stress of concrete is one of three straight lines. These fibers are
-summed side by side (SIMD); the few beyond are evaluated one after the other on the envelope. Bars that have never been
-committed beyond yield have no memory: their stress is that of the backbone, and well below yield that is a series
-(`reinforcing_steel.virgin_stress_tangent`), which is again evaluated side by side.
+A trial evaluation only reads the memory of the fibers; `commit` advances it. In most trials most fibers stay within the
+strains that they have reached before, where the stress of concrete follows one of three straight lines. These fibers
+are summed side by side (SIMD); the few other fibers are evaluated one after the other on the envelope. Bars that have
+never been committed beyond yield have no memory: their stress follows the backbone. Well below yield the backbone is a
+series (`reinforcing_steel.virgin_stress_tangent`), which is also evaluated side by side.
 
-Empty fibers (no area, at y = 0) may be appended to fill whole SIMD registers. Without them the remainder of a few
-fibers would take as long as all others. ``docs/theory/fiber_section.rst`` has the equations and the mesh.
+Empty fibers (no area, at y = 0) may be appended to fill whole SIMD registers. Without them the remaining few fibers
+would take as long as all others. ``docs/theory/fiber_section.rst`` has the equations and the mesh.
 
 References
 ----------
@@ -46,34 +46,34 @@ from .reinforcing_steel import (
 __all__ = ["Sections", "reset", "forces", "commit", "cross_jumps"]
 
 NEAR_JUMP = 0.995
-"""Share of the strain of a jump of concrete, or of the damage at fracture, from which on it is taken across it."""
+"""A fiber is next to a jump from this share of the jump strain (concrete) or of the damage at fracture (bars)."""
 
 _EC = concrete04.EC
 
 
 class Sections(NamedTuple):
-    """Fibers of a section, and the memory of all sections that have these fibers.
+    """Fibers of a section, and the memory of all sections with these fibers.
 
     Attributes
     ----------
     core_count : int
-        The first `core_count` concrete fibers are of the core, the others of the cover.
+        The first `core_count` concrete fibers belong to the core, the others to the cover.
     y, area : ndarray (n_concrete,)
-        Position [m] and area [m²] of the concrete fibers, with empty ones appended.
+        Position [m] and area [m²] of the concrete fibers, with empty fibers appended.
     bar_y, bar_area : ndarray (n_bars or more,)
-        Position [m] and area [m²] of the bars, with empty ones appended.
+        Position [m] and area [m²] of the bars, with empty fibers appended.
     concrete : ndarray (2, concrete04.N_CONSTANTS)
         Constants of core and cover.
     steel : ndarray (reinforcing_steel.N_CONSTANTS,)
         Constants of the bars.
     failure : ndarray (bar_failure.N_FAILURE,) or (0,)
-        Constants of the fatigue and buckling of the bars; empty for bars that do not fail.
+        Constants of bar fatigue and buckling; empty for bars that do not fail.
     concrete_memory : ndarray (n_sections, 5, n_concrete)
         eps_min, eps_max, eps_end, slope and tension slope of each fiber.
     steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE or bar_failure.N_STATE)
     virgin : ndarray (n_sections,)
-        1 while no bar of the section has been committed beyond yield, else 0. The memory of the bars of a virgin
-        section is not kept up to date.
+        1 while no bar of the section has been committed beyond yield, else 0. The bar memory of a virgin section is not
+        kept up to date.
     trial : ndarray (reinforcing_steel.N_STATE or bar_failure.N_STATE,)
         Scratch.
     """
@@ -130,7 +130,7 @@ def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
 
 @kernel
 def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, failure, steel_memory, virgin, trial):
-    """Sum over the bars, one after the other, where some are near or beyond yield."""
+    """Sum over the bars, one after the other, if some are near or beyond yield."""
     n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(steel_memory.shape[1]):
         yi = bar_y[i]
@@ -270,7 +270,7 @@ def _commit_concrete(e0, kappa, j, core_count, y, concrete, concrete_memory):
 
 @kernel
 def _commit_bars(e0, kappa, j, bar_y, steel, failure, steel_memory, virgin):
-    """Advance the memory of the bars of a section that is, or has been, committed beyond yield."""
+    """Advance the bar memory of a section that is, or has been, committed beyond yield."""
     if virgin[j] == 1.0:
         virgin[j] = 0.0
         steel_memory[j] = 0.0
@@ -307,13 +307,13 @@ def commit(e0, kappa, j, sections):
 
 @kernel
 def cross_jumps(e0, kappa, j, sections):
-    """Take the fibers of section `j` that are next to a jump of their stress across it, in place.
+    """Take the fibers of section `j` that are next to a stress jump across the jump, in place.
 
     The laws have jumps. Concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
-    different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). Where the
-    jump itself drives the fiber back, there is equilibrium neither before nor after it, however small the step is. A
-    bar that fractures (`bar_failure`) loses its stress over a small strain, which is as sudden where the column springs
-    back by more than that. None of the four jumps can be undone, so a fiber next to one is taken across it.
+    different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). If the jump
+    drives the fiber back, there is equilibrium neither before nor after the jump, however small the step is. A bar that
+    fractures (`bar_failure`) loses its stress over a small strain, which acts like a jump if the column springs back by
+    more than this strain. None of the four jumps can be undone, so a fiber next to a jump is taken across it.
 
     Returns
     -------

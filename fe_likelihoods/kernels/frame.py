@@ -1,7 +1,7 @@
 """A column as a chain of force-based elements on a fixed base: restoring forces, tangent and commit.
 
-Nodes are numbered from the base up. Each free node has (ux, uy, theta), so that the lateral displacement of the top of
-n elements is the degree of freedom 3 (n - 1). A `Column` holds everything that one simulation reads and writes.
+Nodes are numbered from the base up. Each free node has (ux, uy, theta), so that the degree of freedom 3 (n - 1) is the
+lateral displacement at the top of n elements. A `Column` holds everything that one simulation reads and writes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Column(NamedTuple):
     Attributes
     ----------
     length : float
-        Of one element [m].
+        Length of one element [m].
     corotational : bool
         False for linear geometry.
     sections : fiber_section.Sections
@@ -48,7 +48,7 @@ class Column(NamedTuple):
     elements : beam_column.Elements
         Elements and their state.
     state_before : ndarray
-        Scratch of the shape of ``elements.state``.
+        Scratch with the shape of ``elements.state``.
     vectors : ndarray (N_VECTORS, n_dof)
         Scratch.
     matrices : ndarray (N_MATRICES, n_dof, n_dof)
@@ -78,13 +78,13 @@ def allocate(
     penetration: float = 0.0,
     bars_fail: bool = False,
 ) -> Column:
-    """Return a `Column` with its memory allocated and the constants of its materials still to be set.
+    """Return a `Column` with allocated memory, whose material constants are still to be set.
 
     Parameters
     ----------
     n_elements : int
     height : float
-        Of the column [m].
+        Height of the column [m].
     corotational : bool
         False for linear geometry.
     element_tolerance : float
@@ -94,8 +94,8 @@ def allocate(
     core, cover, bars : ndarray (n, 2)
         Position y [m] and area [m²] of the fibers.
     penetration : float
-        Length below the base over which the deformations of the base section continue (strain of the bars in the
-        foundation) [m].
+        Length below the base over which the deformations of the base section continue (bar strains in the foundation)
+        [m].
     bars_fail : bool
         Whether the bars have fatigue or buckling (`bar_failure`), whose constants are also still to be set.
     """
@@ -171,13 +171,13 @@ def initialise_column(column):
 def assemble(u, column, force, stiffness):
     """Write the restoring forces (n,) and the tangent (n, n) at the displacements `u` (n,).
 
-    An element that has become a fifth longer or shorter counts as failed, whatever force its materials still give.
-    Without this limit a crushed column could reach equilibrium on its bars alone at half its length.
+    An element that has become a fifth longer or shorter counts as failed, whatever its force. Without this limit a
+    crushed column could reach equilibrium on its bars alone at half its length.
 
     Returns
     -------
     bool
-        False when an element fails.
+        False if an element fails.
     """
     n = u.shape[0]
     state = column.elements.state
@@ -238,7 +238,7 @@ def record_sections(column, out):
 
 @kernel
 def cross_jumps(column):
-    """Take every fiber that is next to a jump of its stress across it; return the number of fibers moved.
+    """Take every fiber that is next to a stress jump across the jump; return the number of fibers moved.
 
     See `fiber_section.cross_jumps`.
     """
@@ -254,7 +254,7 @@ def cross_jumps(column):
 
 @kernel
 def bars_have_fractured(column):
-    """Return whether a bar of any section has fractured; never where the bars do not fail."""
+    """Return whether a bar of any section has fractured; always False for bars that do not fail."""
     memory = column.sections.steel_memory
     if column.sections.failure.shape[0] == 0:
         return False

@@ -5,13 +5,13 @@ are the remaining forces of the two isolators. With a_g and F linear within a st
 
     x_{n+1} = Phi x_n + G0 a_n + G1 a_{n+1} + H0 F_n + H1 F_{n+1}
 
-This is an exponential integrator with a first-order hold. No step is too long for the stability of the linear part.
-F_{n+1} has to satisfy the laws of `bearings` at the bearing displacements and velocities y = Q x_{n+1}; Newton's method
-solves these two equations.
+This is an exponential integrator with a first-order hold. The linear part is stable for steps of any length. F_{n+1}
+has to satisfy the laws of `bearings` at the bearing displacements and velocities y = Q x_{n+1}; Newton's method solves
+these two equations.
 
 The recursion is written for r_n = x_n - H1 F_n, so that one step is one product::
 
-    [r_{n+1}, Q r_{n+1}] = T [r_n, a_n, a_{n+1}, F_n],     the columns of T for F_n are those of Phi H1 + H0
+    [r_{n+1}, Q r_{n+1}] = T [r_n, a_n, a_{n+1}, F_n],     the columns of T for F_n contain Phi H1 + H0
 
 ``docs/theory/time_integration.rst`` derives the scheme, ``docs/theory/isolated_bridge.rst`` the equations of motion.
 
@@ -32,9 +32,9 @@ __all__ = ["N_MEMORY", "N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_i
 N_STATES = 12
 """Displacements (5), velocities (5), damper forces (2)."""
 N_OUT = 16
-"""Columns of the output: the state, the forces F of the isolators (2), Z (2)."""
+"""Columns of the output: the state, the isolator forces F (2), Z (2)."""
 N_MEMORY = 20
-"""Numbers from which an integration goes on: r (12), F of the last two instants (2 + 2), Z (2), displacements (2)."""
+"""Numbers from which an integration goes on: r (12), F at the last two instants (2 + 2), Z (2), displacements (2)."""
 
 
 class StepMatrices(NamedTuple):
@@ -86,8 +86,7 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
     ground : ndarray (n_steps,)
         Base acceleration at the samples of the record, linear between them [m/s²].
     weights : ndarray (n_steps, 2)
-        Load on the bearings at the samples, linear between them [N]. At instants at which it is negative, the bearing
-        carries no load.
+        Load on the bearings at the samples, linear between them [N]. While it is negative, the bearing carries no load.
     n_sub : int
         Integration steps per step of the record.
     tolerance : float
@@ -102,14 +101,14 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
         0 for an integration from rest. Otherwise `memory` holds the state at this sample, and only later samples are
         computed and written.
     memory : ndarray (20,)
-        Written: what the integration needs to go on after the last sample. Read if `first` is not 0.
+        Written: the state from which the integration can go on after the last sample. Read if `first` is not 0.
 
     Returns
     -------
     status : int
         0, or the number (from 1) of the step that did not converge or is not finite.
     iterations : int
-        Newton iterations of all steps.
+        Newton iterations over all steps.
     """
     step_matrix, end, compliance = matrices.transposed, matrices.end, matrices.compliance
     slider0, slider1 = isolators.sliders

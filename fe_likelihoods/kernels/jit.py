@@ -2,9 +2,8 @@
 
 numba identifies cached machine code by the file that defines a function. It does not notice an edit of a kernel that
 this function calls in another file, and would keep using the old machine code. Here the cache folder is named after a
-hash of the sources of all kernels: any edit opens a new folder, and an unchanged library starts without compiling. The
-same hash is part of the fingerprint of every model, so that results of other kernels are never mistaken for current
-ones.
+hash over all kernel sources: any edit opens a new folder, and an unchanged library starts without compiling. The same
+hash is part of every model fingerprint, so that results of other kernels are never mistaken for current results.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def _hash_sources() -> str:
 
 
 KERNEL_HASH: str = _hash_sources()
-"""Hash of the sources of all kernels."""
+"""Hash over all kernel sources."""
 
 
 def _is_ours(path: str) -> bool:
@@ -80,8 +79,8 @@ def _find_cache_folder() -> str | None:
     Returns
     -------
     str or None
-        A folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME or ~/.cache, or the temporary folder: the first of them
-        where it can be created. None, with a warning, if there is none: kernels are then compiled in every process.
+        A folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache or the temporary folder: the first in which it
+        can be created. None, with a warning, if this fails everywhere: kernels are then compiled in every process.
     """
     user = f"fe_likelihoods-{os.getuid()}" if hasattr(os, "getuid") else "fe_likelihoods"
     shared = os.path.join(tempfile.gettempdir(), user)
@@ -113,15 +112,15 @@ CACHE_FOLDER: str | None = _find_cache_folder()
 
 
 def _is_worker() -> bool:
-    """Whether this process was started by a pool: of this library, or by `multiprocessing` (as those of dask are)."""
+    """Whether this process was started by a pool of this library, or by `multiprocessing` (like dask workers)."""
     marked = any(name.startswith("FE_LIKELIHOODS_RUN_") for name in os.environ)
     return marked or multiprocessing.parent_process() is not None
 
 
 class _Announcer(event.Listener):
-    """Logs once per process that kernels are compiled, since a user waits meanwhile; silent in workers.
+    """Logs once per process that kernels are compiled, because users wait meanwhile; silent in workers.
 
-    numba reports a compilation only where the machine code is not in the cache.
+    numba reports a compilation only if the machine code is not in the cache.
     """
 
     def __init__(self) -> None:
@@ -139,7 +138,7 @@ class _Announcer(event.Listener):
         )
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing is said at the end: the run goes on."""
+        """Nothing is logged at the end: the run goes on."""
 
 
 event.register("numba:compile", _Announcer())
@@ -158,17 +157,17 @@ def kernel(
     function : callable
         The kernel in plain Python; it stays available as ``.py_func``.
     inline : bool
-        Merge the body into every caller. This is for functions of the inner loop that take arrays, because a call
+        Merge the body into every caller. This is for functions in the inner loop that take arrays, because a call
         passes about eight scalars per array.
     fastmath : set of str
         LLVM flags; this library uses `SUM_REORDERING` only.
     cache : bool
-        Keep the machine code on disk. Inlined functions are never cached on their own.
+        Keep the machine code on disk. Inlined functions are never cached separately.
 
     Returns
     -------
     callable
-        The compiled function, or a decorator where `function` is omitted.
+        The compiled function, or a decorator if `function` is omitted.
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)

@@ -50,7 +50,7 @@ class End(NamedTuple):
 
 @kernel
 def _fit_residual(a, r, ea, eb, es):
-    """Return g(A) of the fit, which is zero where the curve ends at (xb, sb) with slope Eb."""
+    """Return g(A) of the fit, which is zero if the curve ends at (xb, sb) with slope Eb."""
     return eb - es * (1.0 - a ** (r + 1.0)) / (1.0 - a) + ea * a * (1.0 - a**r) / (1.0 - a)
 
 
@@ -59,7 +59,7 @@ def _fit_root(r, ea, eb, es, r_min):
     """Return the root A in (0, 1) of `_fit_residual`.
 
     The search stops when A changes by less than 1e-4, so its steps affect the last digits of the stress. They follow
-    OpenSees, to which the stress histories of the tests belong.
+    OpenSees, which computed the stress histories of the tests.
     """
     alpha = 0.01
     for _ in range(60):
@@ -99,7 +99,7 @@ def fit_curve(start, end, clip, yield_strain, curve):
     ----------
     start, end : End
     clip : bool
-        Move an end slope that is on the wrong side of the slope of the chord to the other side of it.
+        Move an end slope that is on the wrong side of the chord slope to its other side.
     yield_strain : float
         Natural strain fyp/E0, which sets the curvature.
     curve : ndarray (N_CURVE,)
@@ -122,7 +122,7 @@ def fit_curve(start, end, clip, yield_strain, curve):
             r_min = max(0.0, (eb - es) / (es - ea))
             if r <= r_min:
                 r = r_min + 0.01
-            # Where the slope of the chord is not between the end slopes there is no curve: A = 0 gives a straight line.
+            # If the chord slope is not between the end slopes, there is no curve: A = 0 gives a straight line.
             a = _fit_root(r, ea, eb, es, r_min) if r_min > 0.0 else 0.0
         q = (es / ea - a) / (1.0 - a)
         sch = sa + ea * (xb - xa) * a / (1.0 - a**r) ** (1.0 / r)

@@ -8,10 +8,10 @@ last committed step, is::
 A step of size h starts from the committed (U, V, A) with U unchanged, V <- -V and A <- -A - 4 V/h. Each iteration
 solves (K + 2/h C + 4/h^2 M) dU = residual and sets U += dU, V += 2 dU/h, A += 4 dU/h^2, until ``|dU|`` < tolerance.
 
-A step that fails is repeated with a tolerance that is a hundred times larger, then halved (ground acceleration linear
-within the step), repeatedly, down to h / 2^halvings. Where that fails too, there may be no equilibrium before some
-fibers have crossed a jump of their stress, and these are taken across it (`fiber_section.cross_jumps`). The retries are
-counted. A step that still fails ends the run, which returns the number of the step. No step is accepted unconverged.
+A step that fails is repeated with a tolerance a hundred times larger, then halved repeatedly (ground acceleration
+linear within the step), down to h / 2^halvings. If the smallest step fails too, there may be no equilibrium before some
+fibers have crossed a stress jump, and these fibers are taken across the jump (`fiber_section.cross_jumps`). The retries
+are counted. A step that still fails ends the run, which returns its number. No step is accepted unconverged.
 
 Energies are summed by the trapezoidal rule. Average acceleration then balances them exactly up to the tolerance:
 kinetic + damped + absorbed = input.
@@ -80,7 +80,7 @@ class Dynamics(NamedTuple):
 
 @kernel(inline=True)
 def _record_forces(column, force, out):
-    """Write forces to `out` (6,): restoring force of the top, e0, kappa, N and M of the base section, base shear.
+    """Write forces to `out` (6,): restoring force at the top, e0, kappa, N and M of the base section, base shear.
 
     The base shear is the restoring force that the column transmits to its base: no load acts between its ends, so it is
     the sum of the nodal forces `force` (n_dof,) along x.
@@ -148,7 +148,7 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
             a[i] = 0.0
         v[top] = initial_velocity
         copy_matrix(stiffness, committed)  # Kc
-        for i in range(n):  # C V of the last committed instant
+        for i in range(n):  # C V at the last committed instant
             damping[i] = a0 * mass[i] * v[i]
             for k in range(n):
                 damping[i] += a1 * committed[i, k] * v[k]

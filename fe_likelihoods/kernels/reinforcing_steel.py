@@ -14,12 +14,12 @@ The backbone s_b(x) is odd in x. With z = abs(x)::
 
 Between reversals the path is a curve of Menegotto and Pinto (`menegotto_pinto`). A branch number selects the curve.
 Branches 1 and 2 are the backbones in tension and compression. Branches 3, 5, 7 ... are the curves of successively
-nested reversals of which the first goes down from tension; 4, 6, 8 ... are their mirror images. A branch b > 2 keeps
-its curve in the slot of level (b+1)//2. Only the rules of the odd branches are written out. An even branch is processed
-by the same rules with the signs of all strains and stresses changed.
+nested reversals whose first goes down from tension; 4, 6, 8 ... are their mirror images. A branch b > 2 keeps its curve
+in the slot of level (b+1)//2. Only the rules of the odd branches are written out. An even branch is processed by the
+same rules with the signs of all strains and stresses changed.
 
-The law is that of the material ReinforcingSteel of OpenSees with its default options: no buckling, no fatigue, no
-isotropic hardening. `bar_failure` adds buckling and fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
+OpenSees has the same law as its material ReinforcingSteel with default options: no buckling, no fatigue, no isotropic
+hardening. `bar_failure` adds buckling and fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
 
 References
 ----------
@@ -59,7 +59,7 @@ __all__ = [
 E0, FYP, YP, SHP, FSH, UP, EU, FSU, EH, EP, F0, P, FT, EHT, A_SHIFT, VIRGIN_LIMIT, YIELD_STRAIN = range(17)
 N_CONSTANTS = 17
 
-# Layout of the memory of one bar: ten scalars, then nine numbers for the curve of each level from 2 to 10.
+# Layout of one bar's memory: ten scalars, then nine numbers for the curve of each level from 2 to 10.
 BRANCH, OP, ON, XMAX, XMIN, XXMAX, XXMIN, RE, XC, SC, CURVES = range(11)
 N_STATE = 10 + 9 * N_CURVE
 
@@ -83,7 +83,7 @@ def constants(fy, fu, es, esh, eps_sh, eps_u, out):
     eps_sh, eps_u : float
         Engineering strains at the onset of hardening and at `fu`.
     out : ndarray (N_CONSTANTS,)
-        Overwritten. Any other consistent unit of stress serves as well.
+        Overwritten. Any other consistent stress unit serves as well.
     """
     out[YP] = math.log(1.0 + fy / es)
     out[FYP] = fy * (1.0 + fy / es)
@@ -173,7 +173,7 @@ def _mirror_branch(b):
 
 @kernel
 def _mirror(state):
-    """Change the sign of every strain and stress of the memory in place, so that tension becomes compression."""
+    """Change the sign of every strain and stress in the memory in place, so that tension becomes compression."""
     state[BRANCH] = _mirror_branch(int(state[BRANCH]))
     state[OP], state[ON] = -state[ON], -state[OP]
     state[XMAX], state[XMIN] = -state[XMIN], -state[XMAX]
@@ -192,7 +192,7 @@ def _mirror(state):
 
 @kernel
 def curve_slot(branch):
-    """Return the position in the memory of the curve of a branch > 2."""
+    """Return the position in the memory of the curve for a branch > 2."""
     return CURVES + N_CURVE * ((branch + 1) // 2 - 2)
 
 
@@ -217,7 +217,7 @@ def _step(x, tension, state, c):
     x : float
         Trial strain.
     tension : bool
-        False for an even branch, which is processed as the mirror image of an odd one. One rule holds in tension only.
+        False for an even branch, which is processed as a mirrored odd branch. One rule holds in tension only.
     state : ndarray (N_STATE,)
         Memory, changed in place.
     c : ndarray (N_CONSTANTS,)
@@ -225,9 +225,9 @@ def _step(x, tension, state, c):
     Returns
     -------
     done : bool
-        False where another transition has to follow.
+        False if another transition has to follow.
     stress, modulus : float
-        Natural stress and modulus, valid where `done`.
+        Natural stress and modulus, valid if `done`.
     """
     b = int(state[BRANCH])
     xc, sc = state[XC], state[SC]
@@ -326,7 +326,7 @@ def _step(x, tension, state, c):
 
 @kernel(inline=True)
 def transition(x, state, c):
-    """Make one transition of any branch at the natural strain `x`; arguments and results are those of `_step`."""
+    """Make one transition of any branch at the natural strain `x`; arguments and results as for `_step`."""
     if int(state[BRANCH]) % 2 == 1:
         return _step(x, True, state, c)
     _mirror(state)
@@ -378,8 +378,8 @@ def stress_tangent(eps, state, c, trial):
             s, modulus = evaluate_curve(x, curve)
             return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
     elif b > 0:
-        # The stress follows from a backbone alone where the strain goes on, where it reverses below yield (which leaves
-        # the memory as it is), and where it passes zero, on the other backbone.
+        # The stress follows from a backbone alone if the strain goes on, if it reverses below yield (the memory does
+        # not change), and if it passes zero, on the other backbone.
         sign = 1.0 if b == 1 else -1.0
         origin, other = (state[OP], state[ON]) if b == 1 else (state[ON], state[OP])
         onwards = sign * (x - state[XC]) >= 0.0
@@ -400,8 +400,8 @@ def stress_tangent(eps, state, c, trial):
 def switch_backbone(state, c):
     """Move a bar that is at the origin of its backbone to the other backbone, in place.
 
-    After small yielding the backbones in tension and compression have different origins. The law jumps from one to the
-    other where the stress on the present one passes zero.
+    After small yielding the backbones in tension and compression have different origins. The law jumps to the other
+    backbone when the stress on the present backbone passes zero.
 
     Returns
     -------

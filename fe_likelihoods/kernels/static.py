@@ -1,11 +1,11 @@
 """Static analysis of a column: gravity, and a lateral displacement imposed at the top.
 
-Newton's method on the equilibrium of forces, K du = load - force(u), with the tangent K. Where a displacement is
-imposed, its increment replaces the row of that degree of freedom, and the force that it takes is the restoring force
-there. A step that does not converge is repeated with a tolerance that is a hundred times larger, then halved. At the
-smallest part of a step, fibers next to a jump of their stress are taken across it (`fiber_section.cross_jumps`). Where
-this does not help, the column may have lost the axial load: after many bars have fractured, the others yield in
-compression while the cracks are open. The top is then lowered until the cracks close and the load is carried again.
+Newton's method on the equilibrium of forces, K du = load - force(u), with the tangent K. The increment of an imposed
+displacement replaces the row of its degree of freedom, and the required force is the restoring force there. A step that
+does not converge is repeated with a tolerance a hundred times larger, then halved. At the smallest part of a step,
+fibers next to a stress jump are taken across the jump (`fiber_section.cross_jumps`). If this does not help, the column
+may have lost the axial load: after many bars have fractured, the others yield in compression while the cracks are open.
+The top is then lowered until the cracks close and the load is carried again.
 
 ``docs/theory/time_integration.rst`` describes the steps and the retries.
 """
@@ -42,9 +42,9 @@ LOOSENING = 100.0
 MAX_CROSSINGS = 20
 """How often stress jumps may be crossed in one step."""
 LOWERING = 1e-5
-"""Part of the height by which the top is lowered at a time where the column does not carry the axial load."""
+"""Share of the height by which the top is lowered at a time if the column does not carry the axial load."""
 MAX_LOWERINGS = 1000
-"""How often it is lowered in succession, before the column counts as collapsed."""
+"""How often the top is lowered in succession before the column counts as collapsed."""
 
 
 class Iteration(NamedTuple):
@@ -66,7 +66,7 @@ class Iteration(NamedTuple):
 
 
 class Position(NamedTuple):
-    """Displacements of the structure with the forces and the tangent that belong to them.
+    """Displacements of the structure, with their forces and tangent.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
     Returns
     -------
     bool
-        True on success, and the fibers are committed. False on failure, and everything is as it was.
+        True on success; the fibers are then committed. False on failure; nothing has then changed.
     """
     u, force, stiffness = position.u, position.force, position.stiffness
     n = u.shape[0]
@@ -157,15 +157,15 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
 def lower(column, position, load, imposed, iteration):
     """Lower the top until the column carries the axial load again, in place; the imposed displacement is held.
 
-    Each position on the way is an equilibrium with a smaller axial load, and the fibers are committed there. This is
-    the motion of a load that comes down slowly, without the inertia of a fall.
+    Each position on the way is an equilibrium with a smaller axial load, and the fibers are committed there. The load
+    comes down slowly, without the inertia of a fall.
 
     Returns
     -------
     bool
-        True where the load is carried again. False where no bar has fractured, where the first lowered position
-        carries the load, so that it was not lost, and where it is not carried again. On failure the column stays where
-        it has come to.
+        True if the column carries the load again. False if no bar has fractured, if the first lowered position carries
+        the load (which was not lost then), or if the load is never carried again. On failure the column stays where it
+        is.
     """
     vertical = imposed + 1
     if load[vertical] == 0.0 or not bars_have_fractured(column):
@@ -183,7 +183,7 @@ def lower(column, position, load, imposed, iteration):
 
 @kernel
 def _advance_to(column, position, load, total, share, imposed, increment, iteration):
-    """Add `share` of the load `total` and an imposed displacement, in halved steps where it does not converge.
+    """Add `share` of the load `total` and an imposed displacement, in halved steps if they do not converge.
 
     Returns
     -------
