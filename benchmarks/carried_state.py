@@ -9,8 +9,8 @@ import time
 import numpy as np
 
 from fe_likelihoods import RCColumn, propagate, rrmse
+from fe_likelihoods.prediction.kept_states import KEPT_STATES
 from fe_likelihoods.problems import bridge_column_data
-from fe_likelihoods.simulation.kept_states import KEPT_STATES
 from fe_likelihoods.units import INCH
 
 from .rows import Row

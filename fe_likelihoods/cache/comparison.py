@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..noise.statistics import Statistic, needs_response
 from ..signals.comparison import Comparison, measured_values
 from ..simulation.faults import TransientReason
 from ..simulation.label import ModelLabel
@@ -19,7 +20,6 @@ from ..simulation.model import (
     simulate_batch,
 )
 from ..simulation.opened import Opened, observing
-from ..simulation.residual_statistics import Statistic, needs_response
 from ..simulation.user_code import is_of_user
 from .file import CacheFile
 from .labels import Trust, labels_of

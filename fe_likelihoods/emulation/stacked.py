@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.protocol import noise_title
+from ..noise.statistics import needs_response
 from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch
-from ..simulation.residual_statistics import needs_response
 from .quadratic import sums_of_squares
 
 __all__ = ["TIME_SHIFTS", "StackedLikelihood", "is_joint", "stack"]

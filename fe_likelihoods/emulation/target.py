@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..noise.protocol import noise_title
+from ..noise.statistics import needs_response
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
-from ..simulation.residual_statistics import needs_response
 from .quadratic import check_quadratic, sums_of_squares
 from .stacked import TIME_SHIFTS, stack
 

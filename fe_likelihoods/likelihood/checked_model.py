@@ -10,10 +10,10 @@ from ..cache.comparison import VerifyingRun
 from ..cache.guard import EarlierPoint, ModelGuard
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
+from ..noise.statistics import Statistic
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model
 from ..simulation.opened import Opened
-from ..simulation.residual_statistics import Statistic
 
 __all__ = ["CheckedModel", "opened_cache"]
 

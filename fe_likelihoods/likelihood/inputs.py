@@ -3,10 +3,10 @@
 import numpy as np
 
 from ..noise.protocol import Noise, noise_channels
+from ..noise.statistics import Statistic, apply_statistic
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison
 from ..simulation.model import Model
-from ..simulation.residual_statistics import Statistic, apply_statistic
 
 __all__ = [
     "check_model",

@@ -22,6 +22,7 @@ import numpy as np
 from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import FinishedRows, MemoryCache, ResponseMemory, RowBuffer, distinct_keys
 from ..cache.simulation_cache import SimulationCache
+from ..noise.statistics import Statistic, statistic_width
 from ..priors.points import as_rows
 from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
@@ -37,7 +38,6 @@ from ..simulation.model import (
     simulate_batch,
 )
 from ..simulation.opened import Observed, unpack
-from ..simulation.residual_statistics import Statistic, statistic_width
 from .checked_model import CheckedModel, opened_cache
 from .failures import FailureLog
 from .inputs import check_statistic, name_of_statistic

@@ -4,7 +4,7 @@ A model with memory, such as reinforced concrete after cracking, responds to an 
 before. A prediction under another record therefore starts from one of two states: "virgin", the state of the model at
 the beginning of its own excitation, or "end", the state at the end of that excitation. For the second, the model runs
 its own excitation, a pause, and the new record, and only the response to the new record is used. The states at the end
-of both are kept (`fe_likelihoods.simulation.kept_states`).
+of both are kept (`fe_likelihoods.prediction.kept_states`).
 """
 
 import warnings
@@ -14,8 +14,8 @@ import numpy as np
 
 from ..cache.stored_responses import StoredResponses
 from ..signals.records import Record
-from ..simulation.kept_states import simulate_last_part
 from ..simulation.model import Model, SimulationBatch, simulate_batch
+from .kept_states import simulate_last_part
 
 __all__ = ["STATES", "Excitation", "chosen_state", "excite", "under_record"]
 

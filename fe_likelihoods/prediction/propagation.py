@@ -37,7 +37,6 @@ from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
-from ..simulation.kept_states import KEPT_STATES
 from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
 from .excitation import chosen_state, excite, under_record
@@ -49,6 +48,7 @@ from .inputs import (
     simulates_in_batches,
     split_samples,
 )
+from .kept_states import KEPT_STATES
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator

@@ -51,6 +51,16 @@ _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
 
 
+def _forget_lock() -> None:
+    """In a forked process: another thread of the parent may have held the lock."""
+    global _lock
+    _lock = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_lock)
+
+
 def without_addresses(message: str) -> str:
     """A message without the addresses of objects, which differ between runs."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
@@ -190,12 +200,13 @@ def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
 
 def _pickled(function: Any) -> Pickled:
     """Pickle a function, or find the pickle of an earlier call that has used the same; the lock is held."""
-    seen = _snapshot(function)
-    sent = next((sent for sent in reversed(_sent.values()) if sent.seen[0] == seen[0] and sent.is_unchanged()), None)
+    seen, header = _snapshot(function), sources_digest() + _this_process(os.getpid())
+    same = (each for each in reversed(_sent.values()) if each.seen[0] == seen[0] and each.is_unchanged())
+    sent = next((each for each in same if each.pickled.payload.startswith(header)), None)
     if sent is not None and sent.is_confirmed:
         return _sent.use(sent.pickled.key).pickled
     uses = _Uses()
-    payload = sources_digest() + _this_process(os.getpid()) + dumps(function, uses)
+    payload = header + dumps(function, uses)
     pickled = Pickled(payload, _digest(payload))
     # another thread may have changed a value meanwhile, so the first pickle counts when a second one equals it
     _sent.keep(pickled.key, _Sent(pickled, seen, uses, sent is not None and sent.pickled == pickled), 3 * len(payload))

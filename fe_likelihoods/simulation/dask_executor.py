@@ -6,15 +6,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future
-from concurrent.futures import wait as wait_for
+from concurrent.futures import Future
 from functools import cache, partial
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
-from .dask_workers import WorkerWatch
 from .faults import TransientReason
-from .local_pool import Outcome
+from .local_pool import Outcome, results_of
 from .pool_executor import PoolExecutor, resolve
 from .sent_functions import FunctionReference, Missing
 
@@ -24,49 +22,40 @@ logger = logging.getLogger(__name__)
 
 MAX_ATTEMPTS = 3  # attempts of dask, each of which ends with the death of a number of workers
 SECONDS_FOR_MESSAGES = 0.2  # within which dask reports all tasks that it has given up with a worker
+SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
+SECONDS_TO_START = 60.0  # within which a worker of a cluster begins to run after it was asked for
+SECONDS_TO_RETURN = 15.0  # within which a nanny starts the process of a worker again
+LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait for a worker of a cluster that has none
 _DIED = TransientReason("the worker process died in every attempt of dask")
 
 
 class _Item(Future):
-    """Future of one item, with the function."""
+    """Future of one item."""
 
     def __init__(self, item: Any, reference: FunctionReference) -> None:
         super().__init__()
-        self.item, self.reference, self.carried = item, reference, False
+        self.item, self.function = item, reference
         self.deaths = 0  # attempts of dask that ended with the death of the worker
-
-    @property
-    def function(self) -> Callable:
-        return self.reference.carried() if self.carried else self.reference
 
 
 class _Group:
-    """Items that are one task of dask."""
+    """Items with the same function that are one task of dask."""
 
     def __init__(self, items: list[_Item], losses_before: int) -> None:
         self.items, self.losses_before = items, losses_before
         self.inner: Any = None  # dask's future
 
 
-class _Answer(NamedTuple):
-    """Outcomes of a group of items, and their total duration [s]."""
-
-    outcomes: list
-    seconds: float
-
-
 class DaskExecutor(PoolExecutor):
     """Executor for the cluster of a ``dask.distributed.Client``.
 
-    A task costs dask about 2 ms of all processors, so short simulations are sent in groups. The groups are large at
-    first and single items at last, so that the workers finish together. No group takes longer than about a second, by
-    the duration of earlier simulations, so that little is repeated if a worker dies. dask retries a group whose worker
-    died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). It counts the death also
-    against other tasks on that worker, and a job that ends at its walltime kills all of its workers, on which one task
-    may be tried in turn. So the items of a group are run again, alone and one after the other, beside those that are
-    not suspected. An item is the cause, and gets ``(None, reason)``, if dask gives it up when it runs alone and has
-    given up no other task meanwhile, or after the third time. Workers that the cluster has given up are started again,
-    and nothing waits for ever (`WorkerWatch`).
+    A task costs dask about 2 ms of all processors, so short simulations are sent in groups of about a second, by the
+    duration of earlier simulations, and single items at last, so that the workers finish together. dask retries a group
+    whose worker died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). It counts the
+    death also against other tasks on that worker. So the items of a group are run again, alone and one after the other,
+    beside those that are not suspected. An item is the cause, and gets ``(None, reason)``, if dask gives it up when it
+    runs alone and has given up no other task meanwhile, or after the third time. Workers that the cluster has given up
+    are started again.
 
     Parameters
     ----------
@@ -93,9 +82,9 @@ class DaskExecutor(PoolExecutor):
         self.resources = dict(resources or {})
         if longest_wait is not None and not longest_wait > 0:
             raise ValueError(f"longest_wait must be a positive number of seconds, or None; got {longest_wait!r}")
-        self._options = {"resources": self.resources} if resources else {}
         if any(not amount > 0 for amount in self.resources.values()):
             raise ValueError(f"resources must be positive amounts by name, such as {{'GPU': 1}}; got {resources}")
+        self._longest_wait = longest_wait
         self._seconds: float | None = None  # mean duration of an item in the last map or stream
         self._total, self._done = 0.0, 0
         self._lock = threading.RLock()
@@ -104,7 +93,8 @@ class DaskExecutor(PoolExecutor):
         self._suspects: deque[_Item] = deque()
         self._suspect: _Group | None = None  # the one that runs
         self._losses = 0  # tasks that dask has given up
-        self._watch = WorkerWatch(self.pool, lambda: [group.inner for group in self._sent], longest_wait)
+        self._no_workers: RuntimeError | None = None
+        self._workers = _Workers()
 
     @property
     def n_workers(self) -> int | None:
@@ -115,42 +105,11 @@ class DaskExecutor(PoolExecutor):
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """As `PoolExecutor.map`."""
-        futures = self._enqueue(self._reference(function), list(items))
-        try:
-            for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
-                future.result()
-            return [future.result() for future in futures]
-        except BaseException:
-            self.give_up(futures)
-            raise
+        return results_of(self.submit_all(function, list(items)), self)
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
         """As `PoolExecutor.submit_all`; short simulations of one call may be one task."""
-        return self._enqueue(self._reference(function), items)
-
-    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
-        """Cancel items; with `running`, also those that a worker has received."""
-        with self._lock:
-            wanted = set(futures)
-            at_work = set() if running else {key for keys in self.pool.processing().values() for key in keys}
-            self._suspects = deque(item for item in self._suspects if item not in wanted)
-            groups = [
-                group
-                for group in self._sent
-                if wanted.issuperset(group.items) and getattr(group.inner, "key", None) not in at_work
-            ]
-            left = {item for group in self._sent for item in group.items}
-            self._forget(groups)
-        if groups:
-            self.pool.cancel([group.inner for group in groups])
-        cancelled = {item for group in groups for item in group.items}
-        for future in futures:
-            if future in cancelled or future not in left:
-                future.cancel()
-
-    # sending ------------------------------------------------------------------------------------------------------
-
-    def _enqueue(self, reference: FunctionReference, items: Sequence[Any]) -> list[_Item]:
+        reference = self._reference(function)
         futures = [_Item(item, reference) for item in items]
         if not futures:
             return futures
@@ -169,120 +128,202 @@ class DaskExecutor(PoolExecutor):
             self._send(_groups(futures, n_workers or 1, largest))
         return futures
 
+    def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
+        """Cancel items; with `running`, also those that a worker has received."""
+        with self._lock:
+            wanted = set(futures)
+            at_work = set() if running else {key for keys in self.pool.processing().values() for key in keys}
+            self._suspects = deque(item for item in self._suspects if item not in wanted)
+            left = {item for group in self._sent for item in group.items}
+            groups = [
+                group
+                for group in self._sent
+                if wanted.issuperset(group.items) and getattr(group.inner, "key", None) not in at_work
+            ]
+            self._forget(groups)
+        if groups:
+            self.pool.cancel([group.inner for group in groups])
+        for future in wanted.difference(left).union(*(group.items for group in groups)):
+            future.cancel()
+
     def _send(self, groups: list[list[_Item]]) -> list[_Group]:
         """Send groups of items with the same function; the lock is held."""
         sent = [_Group(items, self._losses) for items in groups]
         if not self._sent:
-            self._watch.start()
-            self._ended = SimpleQueue()
+            self._ended, self._no_workers = SimpleQueue(), None
+            self._workers.note(getattr(self.pool, "cluster", None))
             # not in the threads of dask, for which Python waits at its end: a lost scheduler sends no result
-            threading.Thread(target=self._receive_all, args=(self._ended,), name="results of dask", daemon=True).start()
+            for target in (self._receive_all, self._watch):
+                threading.Thread(target=target, args=(self._ended,), name="results of dask", daemon=True).start()
         self._sent.update(sent)
         function = partial(_run_group, groups[0][0].function)
+        options = {"resources": self.resources} if self.resources else {}
         try:
-            contents = [[item.item for item in items] for items in groups]
-            inner = self.pool.map(function, contents, pure=False, **self._options)
+            inner = self.pool.map(function, [[each.item for each in items] for items in groups], pure=False, **options)
         except BaseException:
             self._forget(sent)
             raise
         for group, future in zip(sent, inner, strict=True):
             group.inner = future
         for group in sent:
-            group.inner.add_done_callback(partial(self._report, self._ended, group))
+            group.inner.add_done_callback(lambda _, group=group, ended=self._ended: ended.put(group))
         return sent
 
     def _forget(self, groups: Iterable[_Group]) -> None:
         """Groups have ended; the lock is held."""
         self._sent.difference_update(groups)
-        if self._suspect is not None and self._suspect not in self._sent:
+        if self._suspect not in self._sent:
             self._suspect = None
         if not self._sent:
-            self._watch.stop()
             self._ended.put(None)
 
-    # receiving, in a thread of its own ----------------------------------------------------------------------------
+    # in threads of their own --------------------------------------------------------------------------------------
 
-    @staticmethod
-    def _report(queue: "SimpleQueue[_Group | None]", group: _Group, inner: Any) -> None:
-        """Pass on that a group has ended; in a thread of dask."""
-        queue.put(group)
-
-    def _receive_all(self, queue: "SimpleQueue[_Group | None]") -> None:
-        """Receive groups as they end, until none is left."""
-        while (group := queue.get()) is not None:
-            ended = [group]
+    def _receive_all(self, ended: "SimpleQueue[_Group | None]") -> None:
+        """Receive groups as they end, those that have ended meanwhile together, until none is left."""
+        goes_on = True
+        while goes_on:
+            groups = [ended.get()]
             with contextlib.suppress(Empty):
-                while (group := queue.get_nowait()) is not None:
-                    ended.append(group)
-            self._receive_groups(ended)
-            if group is None:
-                return
+                while True:
+                    groups.append(ended.get_nowait())
+            goes_on = None not in groups
+            finished = [group for group in groups if group is not None and group.inner.status == "finished"]
+            answers: dict[_Group, Any] = {}
+            with contextlib.suppress(Exception):  # a worker was lost with its results: dask has repeated them
+                answers = dict(zip(finished, self.pool.gather([group.inner for group in finished]), strict=True))
+            for group in groups:
+                if group in self._sent:
+                    self._receive(group, answers.get(group))
 
-    def _receive_groups(self, ended: list[_Group]) -> None:
-        finished = [group for group in ended if group.inner.status == "finished"]
+    def _receive(self, group: _Group, answer: tuple[list, float] | None) -> None:
+        """Pass on the outcomes of a group, or the error."""
         try:
-            answers = self.pool.gather([group.inner for group in finished]) if finished else []
-        except Exception:  # a worker was lost with its results: dask has repeated them, with another end
-            answers = [None] * len(finished)
-        known = dict(zip(finished, answers, strict=True))
-        for group in ended:
-            if group in self._sent:
-                self._receive(group, known.get(group))
-
-    def _receive(self, group: _Group, answer: _Answer | None) -> None:
-        try:
-            answer = group.inner.result() if answer is None else answer
+            (outcomes, seconds), failure = answer or group.inner.result(), None
+            self._total, self._done = self._total + seconds, self._done + len(outcomes)
         except BaseException as error:
-            with self._lock:
-                gave_up = self._watch.gave_up
-                if type(error).__name__ == "KilledWorker":
-                    self._lose(group)
-                    return
-                self._forget([group])
-                self._try_next_suspect()
-            if gave_up:
-                error = self._watch.error
-            elif not isinstance(error, Exception) or type(error).__name__ == "FutureCancelledError":
-                error = RuntimeError(f"dask has cancelled a simulation ({error}); run again with a new client")
-            for item in group.items:
-                resolve(item, error=error)
-            return
+            if type(error).__name__ == "KilledWorker":
+                self._lose(group)
+                return
+            outcomes, failure = [None] * len(group.items), self._no_workers or error
+            if not isinstance(failure, Exception) or type(failure).__name__ == "FutureCancelledError":
+                failure = RuntimeError(f"dask has cancelled a simulation ({error}); run again with a new client")
         with self._lock:
             self._forget([group])
-            self._total, self._done = self._total + answer.seconds, self._done + len(answer.outcomes)
-            missing = [
-                item for item, outcome in zip(group.items, answer.outcomes, strict=True) if _again(item, outcome)
-            ]
-            if missing:
-                for item in missing:
-                    item.carried = True
-                self._send([[item] for item in missing])
+            pairs = list(zip(group.items, outcomes, strict=True))
+            again = [item for item, outcome in pairs if isinstance(outcome, Missing) and not item.cancelled()]
+            for item in again:
+                item.function = item.function.carried()
+            if again:
+                self._send([[item] for item in again])
             self._try_next_suspect()
-        for item, outcome in zip(group.items, answer.outcomes, strict=True):
-            if item not in missing:
-                resolve(item, outcome)
+        for item, outcome in pairs:
+            if item not in again:
+                resolve(item, outcome, failure)
 
     def _lose(self, group: _Group) -> None:
         """Give up the item of a task whose worker died in every attempt, or suspect the items."""
         time.sleep(SECONDS_FOR_MESSAGES)
-        others = self._losses > group.losses_before or any(
-            other is not group and other.inner is not None and other.inner.status == "error" for other in self._sent
-        )
-        self._losses += 1
-        for item in group.items:
-            item.deaths += 1
-            if item.deaths == MAX_ATTEMPTS or (item.deaths > 1 and not others):
-                resolve(item, (None, _DIED))
-            else:
-                self._suspects.append(item)
-        self._forget([group])
-        self._try_next_suspect()
+        with self._lock:
+            others = self._losses > group.losses_before or any(
+                other is not group and other.inner is not None and other.inner.status == "error" for other in self._sent
+            )
+            self._losses += 1
+            for item in group.items:
+                item.deaths += 1
+                if item.deaths == MAX_ATTEMPTS or (item.deaths > 1 and not others):
+                    resolve(item, (None, _DIED))
+                else:
+                    self._suspects.append(item)
+            self._forget([group])
+            self._try_next_suspect()
 
     def _try_next_suspect(self) -> None:
         while self._suspect is None and self._suspects:
             item = self._suspects.popleft()
             if not item.cancelled():
                 (self._suspect,) = self._send([[item]])
+
+    def _watch(self, ended: "SimpleQueue[_Group | None]") -> None:
+        """While items are waited for: ask for workers that are lost, and cancel everything after a time without any."""
+        last_seen = time.monotonic()
+        while True:
+            time.sleep(SECONDS_BETWEEN_CHECKS)
+            if not self._sent or ended is not self._ended:
+                return
+            with contextlib.suppress(Exception):  # the cluster or the client is closing
+                self._workers.ask_for_lost(self.pool.cluster)
+            with contextlib.suppress(Exception):
+                last_seen = time.monotonic() if self.pool.nthreads() else last_seen
+            longest = LONGEST_WITHOUT_WORKER if self._longest_wait is None else self._longest_wait
+            if time.monotonic() - last_seen > longest and ended is self._ended:
+                self._no_workers = RuntimeError(
+                    f"the dask cluster has had no worker for {longest:g} s: start workers or scale the cluster, or "
+                    "wait longer by DaskExecutor(client, longest_wait=...), and run again. Evaluations that are stored "
+                    "are not repeated"
+                )
+                with contextlib.suppress(Exception):
+                    self.pool.cancel([group.inner for group in self._sent], force=True)
+                return
+
+
+class _Workers:
+    """Workers of a cluster that were here, and since when others are absent.
+
+    A cluster of dask closes the nanny of a worker that is absent at the instant 15 s after it was lost
+    (``distributed.deploy.lost-worker-timeout``), and never starts it again: on a busy machine the new process may need
+    longer, or a simulation has killed it once more. So it is asked for again, and so is one that has not started within
+    `SECONDS_TO_START`. A job of dask-jobqueue with several workers that has ended, as by its walltime, is never noticed
+    by the cluster. It is submitted again if its workers were here and are gone; one in the queue is left alone.
+    """
+
+    def __init__(self) -> None:
+        self._started: set = set()
+        self._seen: dict[Any, float] = {}  # when they were last here, or asked for
+
+    def note(self, cluster: Any) -> tuple[dict, set, set]:
+        """Workers and jobs that the cluster wants, those that it has, and those that are here."""
+        wanted, present = (
+            dict(getattr(cluster, "worker_spec", None) or {}),
+            set(getattr(cluster, "workers", None) or ()),
+        )
+        jobs = {name: spec["group"] for name, spec in wanted.items() if "group" in spec}
+        info = cluster.scheduler_info["workers"].values() if jobs else ()
+        names = {worker["name"] for worker in info}
+        here = {n for n in present if n not in jobs or any(f"{n}{suffix}" in names for suffix in jobs[n])}
+        now = time.monotonic()
+        self._seen = {name: now if name in here else self._seen.get(name, now) for name in wanted}
+        self._started = (self._started | here) & wanted.keys()
+        return wanted, present, here
+
+    def ask_for_lost(self, cluster: Any) -> None:
+        """Ask a cluster for what it should have by its own specification, and has given up."""
+        wanted, present, here = self.note(cluster)
+        absent = {name: time.monotonic() - seen for name, seen in self._seen.items() if name not in here}
+        jobs = {name for name in wanted if "group" in wanted[name]}
+        ended = {n for n in self._started & jobs & present & absent.keys() if absent[n] > SECONDS_TO_RETURN}
+        lost = self._started & absent.keys() - jobs
+        late = {n for n in absent.keys() - jobs - self._started if absent[n] > SECONDS_TO_START}
+        if lost or ended:
+            logger.warning(
+                "The dask cluster has given up %d of its %d %s: starting them again",
+                len(lost | ended),
+                len(wanted),
+                "jobs" if ended else "workers",
+            )
+        if late:
+            logger.warning(
+                "%d of %d workers of the dask cluster have not started within %g s: asking for them again",
+                len(late),
+                len(wanted),
+                SECONDS_TO_START,
+            )
+        if ended:
+            cluster.sync(cluster.scale_down, ended)
+        if lost or late or ended:
+            self._started -= lost | ended
+            self._seen |= dict.fromkeys(lost | late, time.monotonic())
+            cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))
 
 
 def _places(resources: dict[str, float], dask_scheduler: Any) -> int:
@@ -293,16 +334,11 @@ def _places(resources: dict[str, float], dask_scheduler: Any) -> int:
     )
 
 
-def _again(item: _Item, outcome: Any) -> bool:
-    """Whether an item has to be sent again, together with the function."""
-    return isinstance(outcome, Missing) and not item.carried and not item.cancelled()
-
-
-def _run_group(function: Callable, items: list) -> _Answer:
-    """Run the items of a group one after the other; called in the worker."""
+def _run_group(function: Callable, items: list) -> tuple[list, float]:
+    """Outcomes of the items of a group, and their total duration [s]; called in the worker."""
     wait_for_nanny()
     start = time.perf_counter()
-    return _Answer([function(item) for item in items], time.perf_counter() - start)
+    return [function(item) for item in items], time.perf_counter() - start
 
 
 @cache

@@ -72,12 +72,8 @@ def _check_picklable(model: Any) -> None:
         Pickled.of(model)
     except ValueError as error:
         name, value = _culprit(model)
-        kind = type(model).__name__
-        if not name:
-            raise ValueError(f"with this pool the model must be sent to other processes. {error}") from error
-        raise ValueError(
-            f"the {name} of {kind}, of type {type(value).__name__}, cannot be sent to other processes. {error}"
-        ) from error
+        what = f"the {name} of {type(model).__name__}, of type {type(value).__name__}," if name else "the model"
+        raise ValueError(f"{what} cannot be sent to other processes, as this pool needs. {error}") from error
 
 
 def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
@@ -86,8 +82,7 @@ def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
         state = thing.__getstate__()
     except Exception:
         return "", thing
-    state = state if isinstance(state, dict) else getattr(thing, "__dict__", {})
-    for name, value in state.items():
+    for name, value in (state if isinstance(state, dict) else getattr(thing, "__dict__", {})).items():
         try:
             dumps(value)
         except Exception:

@@ -44,10 +44,7 @@ __all__ = [
     "value_digest",
 ]
 
-SOURCES = (
-    *("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "simulation/residual_statistics.py"),
-    *("noise/*.py", "units.py"),
-)
+SOURCES = ("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "noise/*.py", "units.py")
 MOST_OBJECTS = 1_000_000  # of one value; the rest is left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
 _WRAPPED = ("__func__", "__self__", "fget", "fset", "fdel", "func", "args", "keywords", "__wrapped__", "cell_contents")
@@ -274,11 +271,8 @@ class _Walk:
             for value in [] if module.__name__ in SCRIPTS else list(vars(module).values()):
                 name = value.__name__ if isinstance(value, types.ModuleType) else _attribute(value, "__module__")
                 if isinstance(name, str) and name not in self._modules and name in sys.modules:
-                    if is_of_user(name):
-                        self._modules[name] = sys.modules[name]
+                    if name.partition(".")[0] != LIBRARY and self._is_of_user(name):
                         waiting.append(name)
-                    elif name.partition(".")[0] != LIBRARY:
-                        self._refer(name)
         return self._modules.values()
 
     def _digest(self, value: Any) -> str:
@@ -371,42 +365,34 @@ class _Walk:
     def _add_function(self, function: types.FunctionType) -> None:
         module = function.__module__ or ""
         self._text(f"{_name_of(module)}.{function.__qualname__}")
-        if not is_of_user(module):
-            self._refer(module)
-            return
-        self._meet(module)
-        self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
-        self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
-        self._add(_attribute(function, "__wrapped__"))
-        for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
-            self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
+        if self._is_of_user(module):
+            self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
+            self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
+            self._add(_attribute(function, "__wrapped__"))
+            for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
+                self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
 
     def _add_class(self, cls: type) -> None:
-        self._text(f"{_name_of(cls.__module__)}.{cls.__qualname__}")
-        if not is_of_user(cls.__module__):
-            self._refer(cls.__module__)
+        name = f"{_name_of(cls.__module__)}.{cls.__qualname__}"
+        self._text(name)
+        if not self._is_of_user(cls.__module__):
             return
-        self._meet(cls.__module__)
         self._add_all(cls.__bases__)
         if type(cls) is not type:
             self._add(type(cls))
-        for name, member in sorted(vars(cls).items()):
-            if name in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
+        for attribute, member in sorted(vars(cls).items()):
+            if attribute in _OF_CLASSES or isinstance(member, types.MemberDescriptorType):
                 continue
-            self._text(name)
-            if isinstance(member, _DATA) and "<locals>" not in cls.__qualname__:
-                self._waiting.setdefault(f"{_name_of(cls.__module__)}.{cls.__qualname__}.{name}", member)
+            self._text(attribute)
+            if isinstance(member, _DATA) and "<locals>" not in name:
+                self._waiting.setdefault(f"{name}.{attribute}", member)
             else:
                 self._add(member)
 
     def _add_module(self, module: types.ModuleType) -> None:
         """Data of a module of the user by value; its functions and classes are in its source."""
         self._text(module.__name__)
-        if not is_of_user(module.__name__):
-            self._refer(module.__name__)
-            return
-        self._meet(module.__name__)
-        for name, value in list(vars(module).items()):
+        for name, value in list(vars(module).items()) if self._is_of_user(module.__name__) else ():
             if not name.startswith("__") and not isinstance(value, types.ModuleType | type | types.FunctionType):
                 self._waiting.setdefault(f"{module.__name__}.{name}", value)
 
@@ -429,17 +415,17 @@ class _Walk:
             self._text(name)
             self._add(part)
 
-    def _meet(self, module: str) -> None:
-        if module in sys.modules:
-            self._modules[module] = sys.modules[module]
-
-    def _refer(self, module: str) -> None:
-        """A package is represented by its version, the standard library by the version of Python."""
+    def _is_of_user(self, module: str) -> bool:
+        """Whether a module is the user's; a package is represented by its version, Python by that of Python."""
         top = module.partition(".")[0]
+        if is_of_user(module):
+            self._modules.update({module: sys.modules[module]} if module in sys.modules else {})
+            return True
         if top == LIBRARY and module in sys.modules:
             self._library.add(module)
-        elif top and top not in sys.stdlib_module_names:
+        elif top and top not in (LIBRARY, *sys.stdlib_module_names):
             self._packages.add(top)
+        return False
 
 
 def _name_of(module: str) -> str:
@@ -480,14 +466,6 @@ def _global_names(code: types.CodeType) -> set[str]:
         if isinstance(constant, types.CodeType):
             names |= _global_names(constant)
     return names
-
-
-def _has_weakref(model: Any) -> bool:
-    try:
-        weakref.ref(model)
-    except TypeError:
-        return False
-    return True
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:

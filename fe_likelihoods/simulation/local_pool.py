@@ -17,7 +17,7 @@ from typing import Any
 from .by_value import Pickled
 from .worker import Worker, WorkerDied
 
-__all__ = ["LocalPool", "Outcome"]
+__all__ = ["LocalPool", "Outcome", "results_of"]
 
 MAX_ATTEMPTS = 3
 _LINGER = 0.1  # [s] for which a thread waits for another item before it ends; its start takes as long as a short item
@@ -25,6 +25,17 @@ _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
 """Result and an empty reason, or None and the reason of a failure; mapped functions return this."""
+
+
+def results_of(futures: Sequence[Future], executor: Any) -> list[Any]:
+    """Results of futures; after the first exception, which is raised, and after Ctrl-C the others are given up."""
+    try:
+        for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
+            future.result()
+        return [future.result() for future in futures]
+    except BaseException:
+        executor.give_up(futures)
+        raise
 
 
 class _Job(Future):
@@ -152,14 +163,7 @@ class LocalPool:
         Exception
             The first exception that `function` raises; no further items are started.
         """
-        jobs = self._enqueue(function, list(items), first=True)
-        try:
-            for job in wait_for(jobs, return_when=FIRST_EXCEPTION).done:
-                job.result()
-            return [job.result() for job in jobs]
-        except BaseException:
-            self.give_up(jobs)
-            raise
+        return results_of(self._enqueue(function, list(items), first=True), self)
 
     def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
         """Future of the result of a function for one item, as `map` gives it.

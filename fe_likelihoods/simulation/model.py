@@ -19,11 +19,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of
 from .opened import Observed, note, unpack
-from .residual_statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 
 __all__ = [
     "ContinuedResponse",
@@ -132,7 +132,7 @@ class Model(Protocol):
     ``rest`` seconds and another excitation; the response must end with the samples of the latter.
 
     With ``simulate_from(theta, state) -> ContinuedResponse`` such predictions do not run the earlier excitation again
-    where theta is the same (`fe_likelihoods.simulation.kept_states`).
+    where theta is the same (`fe_likelihoods.prediction.kept_states`).
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation. The response of that model must be the first samples
@@ -224,7 +224,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     if pool is None and getattr(model, "simulate_batch", None) is not None:
         with _one_by_one_if_it_fails(model):
             return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
-    return SimulationBatch(*_run_each(_response, model, thetas, shape, pool))
+    return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
 
 
 def misfit_batch(
@@ -238,13 +238,10 @@ def misfit_batch(
 
     Parameters
     ----------
-    model : Model
-    thetas : (n, n_parameters) float
-        Parameter sets.
+    model, thetas, pool
+        As for `simulate_batch`.
     measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
-    pool : object with ``map(function, items)``, optional
-        As for `simulate_batch`.
     statistic : Statistic, optional
         Statistic of the residuals instead of the sums of squares; the model's own ``misfit_batch`` is then not used.
 
@@ -252,32 +249,30 @@ def misfit_batch(
     -------
     MisfitBatch
     """
-    reduce = sums_of_squares if statistic is None else statistic
     shape = (statistic_width(measured, statistic),)
     own = (
         statistic is None and not isinstance(measured, Comparison) and getattr(model, "misfit_batch", None) is not None
     )
     if pool is None and (own or hasattr(model, "simulate_batch")):
         with _one_by_one_if_it_fails(model):
-            batch = (
-                model.misfit_batch(thetas, measured) if own else _misfit_from_responses(model, thetas, measured, reduce)
-            )
+            if own:
+                batch = model.misfit_batch(thetas, measured)
+            else:
+                batch = _misfit_from_responses(model, thetas, measured, statistic or sums_of_squares)
             return MisfitBatch(*_checked_batch(model, batch, (len(thetas), *shape)))
-    return MisfitBatch(*_run_each(partial(_misfit, measured, reduce), model, thetas, shape, pool))
+    return MisfitBatch(*_run_each(sent_simulation(model, measured, statistic), thetas, shape, pool))
 
 
 def sent_simulation(
     model: Model, measured: np.ndarray | Comparison | None = None, statistic: Statistic | None = None
 ) -> Callable[[np.ndarray], tuple[np.ndarray | None, str]]:
-    """A function that runs one simulation in a worker of a pool, to be submitted to an executor.
+    """A function that runs one simulation, in this process or in a worker of a pool.
 
     Parameters
     ----------
     model : Model
-    measured : (n_channels, n_steps) float, or Comparison, optional
-        Measured response [SI]. Without it, the result is the response.
-    statistic : Statistic, optional
-        As for `misfit_batch`.
+    measured, statistic
+        As for `misfit_batch`. Without `measured`, the result is the response.
 
     Returns
     -------
@@ -285,30 +280,15 @@ def sent_simulation(
         Takes parameters (n_parameters,); returns the result with an empty reason, or None and the reason of a failure,
         as in `misfit_batch` or `simulate_batch`.
     """
-    reduce = sums_of_squares if statistic is None else statistic
-    return partial(_attempt, _response if measured is None else partial(_misfit, measured, reduce), model)
+    run = _response if measured is None else partial(_misfit, measured, statistic or sums_of_squares)
+    return partial(_attempt, run, model)
 
 
 def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another statistic of them, for given responses.
-
-    Parameters
-    ----------
-    model : Model
-    batch : SimulationBatch
-    measured : (n_channels, n_steps) float, or Comparison
-        Measured response [SI].
-    statistic : Statistic, optional
-        As for `misfit_batch`.
-
-    Returns
-    -------
-    MisfitBatch
-    """
-    reduce = sums_of_squares if statistic is None else statistic
-    rows = [reduce_response(response, measured, reduce) for response in batch.response]
+    """Sums of squared residuals, or another statistic of them, for given responses; arguments as of `misfit_batch`."""
+    rows = [reduce_response(response, measured, statistic or sums_of_squares) for response in batch.response]
     misfit = np.reshape(rows, (len(rows), statistic_width(measured, statistic)))
     reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
@@ -406,14 +386,14 @@ def _attempt(
 
 
 def _run_each(
-    run: Callable[[Model, np.ndarray], np.ndarray], model: Model, thetas: np.ndarray, shape: tuple[int, ...], pool: Any
+    run: Callable[[np.ndarray], tuple], thetas: np.ndarray, shape: tuple[int, ...], pool: Any
 ) -> tuple[np.ndarray, list[str]]:
     """Run simulations one by one, in this process or in the pool's workers."""
     if pool is None:
-        outcomes = [_attempt(run, model, theta) for theta in thetas]
+        outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
-        for outcome in pool.map(Observed(partial(_attempt, run, model)), list(thetas)):
+        for outcome in pool.map(Observed(run), list(thetas)):
             result, opened = unpack(outcome)
             outcomes.append(result)
             note(opened)

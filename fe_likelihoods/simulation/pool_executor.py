@@ -132,25 +132,19 @@ class PoolExecutor:
             else:
                 resolve(task, result)
 
+        def ended(inner: Future) -> None:
+            if inner.cancelled():
+                Future.cancel(task)
+            elif (error := inner.exception()) is not None:
+                resolve(task, error=error)
+            else:
+                received(inner.result())
+
         function = reference.carried() if carried else reference
         if hasattr(self.pool, "submit"):
             task.inner = self.pool.submit(function, item)
-            task.inner.add_done_callback(partial(_forward, task, received))
+            task.inner.add_done_callback(ended)
         else:
-            failed = partial(_fail, task)
+            failed = partial(resolve, task, None)
             task.inner = self.pool.apply_async(function, (item,), callback=received, error_callback=failed)
         return task
-
-
-def _fail(task: _Task, error: BaseException) -> None:
-    resolve(task, error=error)
-
-
-def _forward(task: _Task, received: Callable[[Any], None], inner: Any) -> None:
-    """Pass the end of a pool's future on."""
-    if inner.cancelled():
-        Future.cancel(task)
-    elif (error := inner.exception()) is not None:
-        resolve(task, error=error)
-    else:
-        received(inner.result())

@@ -48,56 +48,12 @@ class _Supervisor:
         """Whether it runs and is a child of this process (not of the one this was forked from)."""
         return self._owner == os.getpid() and self._process.poll() is None
 
-    def start(
-        self,
-        command: Sequence[str],
-        environment: Mapping[str, str],
-        folder: Path,
-        stdout: Path,
-        stderr: Path,
-        place: Path,
-    ) -> None:
-        """Start a program; `wait` reports its end."""
-        request = {
-            "command": list(command),
-            "environment": dict(environment),
-            "folder": str(folder),
-            "stdout": str(stdout),
-            "stderr": str(stderr),
-            "place": str(place),
-        }
-        self._send(request)
+    def send(self, request: dict | None) -> None:
+        """Send a request, as `supervisor.main` describes it."""
+        with suppress(OSError):  # `receive` reports that the supervisor has died
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
-    def wait(self, seconds: float) -> int | None:
-        """Exit code of the program, None if it has not ended within a time [s].
-
-        Raises
-        ------
-        OSError
-            If the program could not be started.
-        RunFailed
-            If the supervisor has died.
-        """
-        answer = self._receive(seconds)
-        if "error" in answer:
-            raise OSError(answer["errno"], answer["error"])
-        return answer.get("exit_code")
-
-    def stop(self) -> None:
-        """Kill the program and everything that it has started."""
-        self._send(None)
-        with suppress(RunFailed):
-            # the program may have ended by itself at the same time, which is answered first
-            while answer := self._receive(_STOP_SECONDS):
-                if "stopped" in answer:
-                    return
-            self.kill()
-
-    def kill(self) -> None:
-        """End the supervisor as well."""
-        self._end()
-
-    def _receive(self, seconds: float) -> dict:
+    def receive(self, seconds: float) -> dict:
         """Next answer, empty if there is none within a time [s]; RunFailed if the supervisor has died."""
         if not wait([self._process.stdout], seconds):
             return {}
@@ -107,9 +63,19 @@ class _Supervisor:
             raise RunFailed(TransientReason("the supervisor of the program died"))
         return json.loads(line)
 
-    def _send(self, request: dict | None) -> None:
-        with suppress(OSError):  # `wait` reports that the supervisor has died
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+    def stop(self) -> None:
+        """Kill the program and everything that it has started."""
+        self.send(None)
+        with suppress(RunFailed):
+            # the program may have ended by itself at the same time, which is answered first
+            while answer := self.receive(_STOP_SECONDS):
+                if "stopped" in answer:
+                    return
+            self.kill()
+
+    def kill(self) -> None:
+        """End the supervisor as well."""
+        self._end()
 
 
 def run_program(
@@ -151,17 +117,18 @@ def run_program(
     RunFailed
         If its supervisor dies.
     """
-    keeper = _take()
-    running = True
+    paths = {"folder": str(folder), "stdout": str(stdout), "stderr": str(stderr), "place": str(place)}
+    keeper, answer = _take(), {}
     try:
-        keeper.start(command, environment, folder, stdout, stderr, place)
+        keeper.send({"command": list(command), "environment": dict(environment), **paths})
         start = time.monotonic()
-        while (exit_code := keeper.wait(watch(time.monotonic() - start))) is None:
-            pass
-        running = False
-        return exit_code
+        while not answer:
+            answer = keeper.receive(watch(time.monotonic() - start))
+        if "error" in answer:
+            raise OSError(answer["errno"], answer["error"])
+        return answer["exit_code"]
     finally:
-        if running and keeper.alive:
+        if not answer and keeper.alive:
             keeper.stop()
         with _lock:
             if keeper.alive and len(_idle) < _MOST_IDLE:

@@ -10,7 +10,7 @@ from typing import Any
 
 from .by_value import Pickled
 from .faults import ChangedModel, RunFailed, TransientReason
-from .worker import Answer, Worker, WorkerDied, last_lines
+from .worker import Answer, Worker
 
 __all__ = ["Sandbox"]
 
@@ -54,7 +54,7 @@ class Sandbox:
     ) -> None:
         self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
         self.max_output, self.runs_per_process = max_output, runs_per_process
-        self._free: list[tuple[Worker, Any]] = []
+        self._free: list[Worker] = []
         Pickled.of(function)  # raises here what would be raised in the first call
 
     def __getstate__(self) -> dict:
@@ -70,23 +70,22 @@ class Sandbox:
         Exception
             Any exception that the function raises.
         """
-        worker, output = self._take(Pickled.of(self.function))
+        worker = self._take(Pickled.of(self.function))
         start = time.monotonic()
         try:
             worker.send(item)
-            answer = self._receive(worker, output)
-        except RunFailed as error:
+            answer = self._receive(worker, start)
+        except BaseException as error:
             worker.kill()
-            raise RunFailed(error.reason, time.monotonic() - start) from None
-        except BaseException:
-            worker.kill()
+            if isinstance(error, RunFailed):
+                raise RunFailed(error.reason, time.monotonic() - start) from None
             raise
         if worker.calls >= (self.runs_per_process or math.inf):
             worker.kill()
         else:
-            os.ftruncate(output.fileno(), 0)
-            os.lseek(output.fileno(), 0, os.SEEK_SET)
-            self._free.append((worker, output))
+            os.ftruncate(worker.output.fileno(), 0)
+            os.lseek(worker.output.fileno(), 0, os.SEEK_SET)
+            self._free.append(worker)
         if answer.error is not None:
             raise answer.error
         return answer.value
@@ -94,44 +93,32 @@ class Sandbox:
     def close(self) -> None:
         """End the idle processes."""
         while self._free:
-            self._free.pop()[0].kill()
+            self._free.pop().kill()
 
-    def _take(self, function: Pickled) -> tuple[Worker, Any]:
-        """A process that has loaded the function, and the file with its output."""
+    def _take(self, function: Pickled) -> Worker:
+        """A process that has loaded the function."""
         worker = None
         with suppress(IndexError):
             while worker is None or not worker.alive:
-                worker, output = self._free.pop()
+                worker = self._free.pop()
         if worker is None or not worker.alive:
-            output = tempfile.TemporaryFile()
-            worker = Worker(memory_limit=self.memory_limit, output=output)
+            worker = Worker(memory_limit=self.memory_limit, output=tempfile.TemporaryFile())
         try:
             worker.load(function, _START_LIMIT)
         except BaseException as error:
             worker.kill()
-            if isinstance(error, WorkerDied):
-                raise _with_output(error, output) from None
             if isinstance(error, ValueError) and not isinstance(error, ChangedModel):  # it cannot be loaded there
                 raise RunFailed(TransientReason(str(error))) from error
             raise
-        return worker, output
+        return worker
 
-    def _receive(self, worker: Worker, output: Any) -> Answer:
+    def _receive(self, worker: Worker, start: float) -> Answer:
         """Answer of a worker; RunFailed if there is none within the limit, or it dies or prints too much."""
         limit = math.inf if self.time_limit is None else self.time_limit
-        stop = time.monotonic() + limit
-        while (left := stop - time.monotonic()) > 0.0:
-            try:
-                answer = worker.receive(min(left, _POLL_INTERVAL))
-            except WorkerDied as error:
-                raise _with_output(error, output) from None
-            if os.fstat(output.fileno()).st_size > self.max_output:
+        while (left := start + limit - time.monotonic()) > 0.0:
+            answer = worker.receive(min(left, _POLL_INTERVAL))
+            if os.fstat(worker.output.fileno()).st_size > self.max_output:
                 raise RunFailed(TransientReason(f"stopped because it printed more than {self.max_output} bytes"))
             if answer is not None:
                 return answer
         raise RunFailed(TransientReason(f"stopped at the time limit of {limit:g} s", time_limit=limit))
-
-
-def _with_output(error: WorkerDied, output: Any) -> RunFailed:
-    """The death of a process with the last line that it has printed."""
-    return RunFailed(TransientReason("; ".join(filter(None, [error.reason, last_lines(output, 1)]))))

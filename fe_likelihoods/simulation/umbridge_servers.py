@@ -15,8 +15,8 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from typing import Any
 from urllib.parse import urlsplit
@@ -34,6 +34,12 @@ SIMULATION_FAILED = "SimulationFailed"
 _CONNECT_SECONDS = 10.0  # longest time until a server accepts a connection
 _LONGEST_WAIT = 60.0  # [s] between two attempts
 _RECENT = 30.0  # [s] after a fault during which other servers are preferred
+# the system ends a connection within minutes after the other machine has vanished without a word
+_KEEP_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
+    (socket.IPPROTO_TCP, getattr(socket, option), value)
+    for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4))
+    if hasattr(socket, option)  # not on every system
+]
 _BUSY = {429, 502, 503, 504}  # HTTP status of a load balancer without a free or living server
 
 
@@ -61,12 +67,12 @@ class ServerError(RuntimeError):
         self.kind, self.message = kind, message
 
 
-class _Refused(Exception):
-    """The server did not accept the request."""
+class _Fault(Exception):
+    """The server did not accept the request, or (`is_loss`) the connection was lost after it had received it."""
 
-
-class _Lost(Exception):
-    """The connection was lost after the server had received the request."""
+    def __init__(self, text: str, is_loss: bool = False) -> None:
+        super().__init__(text)
+        self.is_loss = is_loss
 
 
 class UMBridgeServers:
@@ -137,63 +143,49 @@ class UMBridgeServers:
         Unavailable
             If all attempts have failed.
         """
-        faults = 0
-        while True:
-            try:
-                return self._attempt(request, time_limit)
-            except Unavailable as error:
-                faults += 1
-                if faults > self.retries:
-                    attempts = f"{faults} attempts" if faults > 1 else "1 attempt"
-                    raise Unavailable(f"{error} ({attempts})") from error
-            time.sleep(min(self.retry_wait * 2.0 ** (faults - 1), _LONGEST_WAIT))
-
-    def _attempt(self, request: dict[str, Any], time_limit: float | None) -> Any:
-        """Answer of the first server that accepts a request."""
-        asked: list[str] = []
-        while len(asked) < len(self.urls):
-            with self._least_busy(asked) as url:
-                asked.append(url)
+        for attempt in range(self.retries + 1):
+            if attempt:
+                time.sleep(min(self.retry_wait * 2.0 ** (attempt - 1), _LONGEST_WAIT))
+            asked: list[str] = []
+            while len(asked) < len(self.urls):
+                asked.append(self._least_busy(asked))
                 try:
-                    answer = _ask(url, "/Evaluate", request, time_limit)
-                    if "output" not in answer:
-                        raise _Refused("the answer has no output")
-                except (_Refused, _Lost) as error:
-                    self._had_fault(url, error)
-                    text = f"{url}: {error}"
-                    if isinstance(error, _Lost):  # perhaps because of the parameters: no other server for now
-                        raise Unavailable(text) from error
-                else:
-                    self._is_well(url)
-                    return answer["output"]
-        raise Unavailable(text if len(self.urls) == 1 else f"none of {len(self.urls)} servers is available; {text}")
+                    return self._output(asked[-1], request, time_limit)
+                except _Fault as fault:
+                    text = f"{asked[-1]}: {fault}"
+                    if fault.is_loss:  # perhaps because of the parameters: no other server for now
+                        break
+            else:
+                text = text if len(self.urls) == 1 else f"none of {len(self.urls)} servers is available; {text}"
+        raise Unavailable(f"{text} ({attempt + 1} attempt{'s' if attempt else ''})")
 
-    @contextmanager
-    def _least_busy(self, asked: Sequence[str]) -> Iterator[str]:
-        """The server with the fewest requests among those that were not asked."""
+    def _least_busy(self, asked: Sequence[str]) -> str:
+        """The server with the fewest requests among those that were not asked, which has one more from now on."""
         with self._lock:
             now = time.monotonic()
             left = [url for url in self.urls if url not in asked]
             url = min(left, key=lambda u: (now - self._fault_times.get(u, -_RECENT) < _RECENT, self._running[u]))
             self._running[url] += 1
+            return url
+
+    def _output(self, url: str, request: dict[str, Any], time_limit: float | None) -> Any:
+        """Output of one server; faults are noted."""
+        fault = None
         try:
-            yield url
+            return _ask(url, "/Evaluate", request, time_limit, "output")
+        except _Fault as error:
+            fault = error
+            raise
         finally:
             with self._lock:
                 self._running[url] -= 1
-
-    def _had_fault(self, url: str, error: Exception) -> None:
-        with self._lock:
-            first = url not in self._fault_times
-            self._fault_times[url] = time.monotonic()
-        if first:
-            logger.warning("UM-Bridge server %s: %s. The request is repeated", url, error)
-
-    def _is_well(self, url: str) -> None:
-        with self._lock:
-            returned = self._fault_times.pop(url, None) is not None
-        if returned:
-            logger.warning("UM-Bridge server %s answers again", url)
+                had_fault = self._fault_times.pop(url, None) is not None
+                if fault is not None:
+                    self._fault_times[url] = time.monotonic()
+            if fault is not None and not had_fault:
+                logger.warning("UM-Bridge server %s: %s. The request is repeated", url, fault)
+            elif fault is None and had_fault:
+                logger.warning("UM-Bridge server %s answers again", url)
 
     def sizes(self, url: str, name: str, config: dict[str, Any]) -> tuple[list[int], list[int]]:
         """Sizes of the inputs and of the outputs of a model on one of the servers.
@@ -225,14 +217,11 @@ class UMBridgeServers:
                 raise ServerError("protocol", f"expected version 1.0 of the protocol of UM-Bridge; got {version!r}")
             if name not in models:
                 raise ServerError("ModelNotFound", f"expected one of its models {', '.join(map(repr, models))}")
-            support = _ask(url, "/ModelInfo", {"name": name}).get("support", {})
-            if not support.get("Evaluate"):
+            if not _ask(url, "/ModelInfo", {"name": name}).get("support", {}).get("Evaluate"):
                 raise ServerError("UnsupportedFeature", "the model cannot be evaluated")
             request = {"name": name, "config": config}
-            sizes = [
-                _ask(url, f"/{what[0].upper()}{what[1:]}", request).get(what) for what in ("inputSizes", "outputSizes")
-            ]
-        except (_Refused, _Lost, ServerTimeout) as error:
+            sizes = [_ask(url, f"/{end}Sizes", request).get(f"{end.lower()}Sizes") for end in ("Input", "Output")]
+        except (_Fault, ServerTimeout) as error:
             raise Unavailable(f"{url}: {error}") from error
         for given in sizes:
             if not isinstance(given, list) or not all(isinstance(size, int) and size >= 0 for size in given):
@@ -252,11 +241,13 @@ def _address(url: str) -> str:
     return url.rstrip("/")
 
 
-def _ask(url: str, path: str, content: Any = None, time_limit: float | None = _CONNECT_SECONDS) -> dict[str, Any]:
-    """JSON object that a server answers; GET without `content`."""
+def _ask(
+    url: str, path: str, content: Any = None, time_limit: float | None = _CONNECT_SECONDS, key: str | None = None
+) -> Any:
+    """JSON object that a server answers, or its value of a key; GET without `content`."""
     status, body = _exchange(url, path, content, time_limit)
     if status in _BUSY:
-        raise _Refused(f"HTTP {status}, no server is free")
+        raise _Fault(f"HTTP {status}, no server is free")
     text = body.decode(errors="replace")
     answer = None
     with suppress(ValueError):
@@ -265,13 +256,15 @@ def _ask(url: str, path: str, content: Any = None, time_limit: float | None = _C
     if isinstance(error, dict):
         raise ServerError(str(error.get("type", "error")), str(error.get("message", "")))
     if status == 200 and isinstance(answer, dict):
-        return answer
+        if key is not None and key not in answer:
+            raise _Fault(f"the answer has no {key}")
+        return answer if key is None else answer[key]
     beginning = " ".join(text[:200].split())
     if status == 500:  # what servers in Python answer if the model raises an exception
         raise ServerError("HTTP 500", beginning)
     if status == 200 and answer is None and re.search(r"\b(nan|inf)\b", text):  # Python's text of such numbers
         raise ServerError("not finite", "the output contains nan or inf")
-    raise _Refused(f"HTTP {status}, not an answer of UM-Bridge: {beginning}")
+    raise _Fault(f"HTTP {status}, not an answer of UM-Bridge: {beginning}")
 
 
 def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tuple[int, bytes]:
@@ -279,14 +272,14 @@ def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tu
     parts = urlsplit(url)
     kind = HTTPSConnection if parts.scheme == "https" else HTTPConnection
     body = None if content is None else json.dumps(content, allow_nan=False)
-    connection = kind(parts.hostname, parts.port, timeout=_CONNECT_SECONDS)
-    try:
+    with closing(kind(parts.hostname, parts.port, timeout=_CONNECT_SECONDS)) as connection:
         try:
             connection.connect()
-            _notice_lost_machine(connection.sock)
+            for level, option, value in _KEEP_ALIVE:
+                connection.sock.setsockopt(level, option, value)
             connection.sock.settimeout(time_limit)
         except OSError as error:
-            raise _Refused(f"no connection ({error})") from error
+            raise _Fault(f"no connection ({error})") from error
         try:
             headers = {} if body is None else {"Content-Type": "application/json"}
             connection.request("POST" if body else "GET", parts.path + path, body, headers)
@@ -294,17 +287,7 @@ def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tu
             return response.status, response.read()
         except TimeoutError as error:
             if time_limit is None or error.errno is not None:  # the other machine has vanished
-                raise _Lost(f"the connection was lost ({error})") from error
+                raise _Fault(f"the connection was lost ({error})", is_loss=True) from error
             raise ServerTimeout(f"stopped at the time limit of {time_limit:g} s") from error
         except (OSError, HTTPException) as error:
-            raise _Lost(f"the connection was lost ({type(error).__name__}: {error})") from error
-    finally:
-        connection.close()
-
-
-def _notice_lost_machine(connection: socket.socket) -> None:
-    """Let the system end a connection within minutes after the other machine has vanished without a word."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
-        if hasattr(socket, option):  # not on every system
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+            raise _Fault(f"the connection was lost ({type(error).__name__}: {error})", is_loss=True) from error

@@ -106,6 +106,7 @@ class Worker:
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
+        self.output = output
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -172,7 +173,9 @@ class Worker:
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
-            raise WorkerDied(TransientReason(describe_exit(self.kill(), "the worker process"))) from None
+            reason = describe_exit(self.kill(), "the worker process")
+            said = "" if self.output is None else last_lines(self.output, 1)
+            raise WorkerDied(TransientReason("; ".join(filter(None, [reason, said])))) from None
 
     def _send(self, message: bytes) -> None:
         with suppress(OSError):  # `receive` reports that the process has died

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import DaskExecutor
-from fe_likelihoods.simulation import dask_workers
+from fe_likelihoods.simulation import dask_executor
 from samplers import SMCSampler
 from samplers.record import Record
 from tests.clusters import noted, slurm_machine
@@ -286,8 +286,8 @@ def jobs(tmp_path, monkeypatch):
     class Cluster(LocalCluster):
         job_cls = Job
 
-    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.1)
-    monkeypatch.setattr(dask_workers, "SECONDS_TO_RETURN", 0.5)
+    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.1)
+    monkeypatch.setattr(dask_executor, "SECONDS_TO_RETURN", 0.5)
     options = ["--nthreads", "1", "--no-dashboard"]
     with (
         Cluster(

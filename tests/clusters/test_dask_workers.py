@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from fe_likelihoods.simulation import dask_workers
+from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import DaskExecutor
 from samplers.evaluation.pool_queue import PoolQueue
 from tests.clusters.noted import Gate
@@ -30,7 +30,7 @@ def cluster(monkeypatch):
     import dask
     from dask.distributed import Client, LocalCluster
 
-    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.05)
+    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.05)
     opened = []
 
     def make(seconds):
@@ -56,7 +56,7 @@ def test_workers_that_are_still_starting_are_not_called_lost(cluster, caplog):
 
 
 def test_workers_that_do_not_start_are_asked_for_again(cluster, caplog, monkeypatch):
-    monkeypatch.setattr(dask_workers, "SECONDS_TO_START", 0.4)
+    monkeypatch.setattr(dask_executor, "SECONDS_TO_START", 0.4)
     client = cluster(1.0)
     client.cluster.scale(2)
     posterior_of(Treacherous(), pool=client)([[0.5, 0.1, 0.5]])

@@ -15,7 +15,7 @@ import pytest
 
 from fe_likelihoods.likelihood.failures import TooManyFailures
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.simulation import dask_executor, dask_workers, executors
+from fe_likelihoods.simulation import dask_executor, executors
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -213,8 +213,8 @@ class Waiting:
 
 @pytest.mark.parametrize("restarts", [True, False])
 def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypatch):
-    monkeypatch.setattr(dask_workers, "SECONDS_BETWEEN_CHECKS", 0.01)
-    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
+    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.01)
+    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
     monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
     client = Cluster(restarts)
     pool = executors.DaskExecutor(client)
@@ -235,7 +235,7 @@ def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
     import dask
     from dask.distributed import Client, LocalCluster
 
-    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 300.0)
+    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 300.0)
     x = np.column_stack([np.concatenate([theta(bad.FINE, 2), theta(bad.KILLED)]), np.full(3, 0.5)])
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 2, "distributed.deploy.lost-worker-timeout": "0s"}),
@@ -254,7 +254,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
     import dask
     from dask.distributed import Client, LocalCluster
 
-    monkeypatch.setattr(dask_workers, "LONGEST_WITHOUT_WORKER", 300.0)
+    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 300.0)
 
     thetas = np.concatenate([theta(bad.FINE, 3), theta(bad.KILLED), theta(bad.FINE, 3)])
     x = np.column_stack([thetas, np.full(7, 0.5)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ContinuedResponse, Record, SimulationCache, peak, propagate
-from fe_likelihoods.simulation.kept_states import KEPT_STATES
+from fe_likelihoods.prediction.kept_states import KEPT_STATES
 from fe_likelihoods.simulation.model import SimulationFailed
 from tests.prediction.flexible import Flexible
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, DisplacementHistory, Events, IsolatedBridge, RCColumn, Record, propagate
+from fe_likelihoods.prediction.kept_states import KEPT_STATES, StateMemory, simulate_last_part
 from fe_likelihoods.problems import bridge_column_data
-from fe_likelihoods.simulation.kept_states import KEPT_STATES, StateMemory, simulate_last_part
 from fe_likelihoods.simulation.model import ContinuedResponse, SimulationFailed
 
 SETTINGS = {"from_state": "end", "rest": 0.5, "progress": False}

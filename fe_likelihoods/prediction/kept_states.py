@@ -20,11 +20,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .faults import raise_if_it_ends_the_run, reason_of
-from .label import items_of, note_own_changes, steady_digest
-from .model import Model, SimulationBatch, SimulationFailed, first_part, not_finite, real_response, simulate_batch
-from .threads import run_on_threads
-from .user_code import LIBRARY
+from ..simulation.faults import raise_if_it_ends_the_run, reason_of
+from ..simulation.label import items_of, note_own_changes, steady_digest
+from ..simulation.model import (
+    Model,
+    SimulationBatch,
+    SimulationFailed,
+    first_part,
+    not_finite,
+    real_response,
+    simulate_batch,
+)
+from ..simulation.threads import run_on_threads
+from ..simulation.user_code import LIBRARY
 
 __all__ = ["KEPT_STATES", "StateMemory", "simulate_last_part"]
 
