@@ -1,7 +1,7 @@
-r"""Whether the posteriors of several tests, or of parts of one record, agree on their parameters.
+r"""Whether the posteriors of several tests, or of several parts of a record, agree on their parameters.
 
-Two posteriors of one and the same parameter differ by chance. The difference of their means is compared with its own
-standard deviation: for K tests with means :math:`m_k` and covariances :math:`C_k`,
+Two posteriors of the same parameter differ by chance. The difference between their means is compared with the standard
+deviation of this difference: for K tests with means :math:`m_k` and covariances :math:`C_k`,
 
 .. math::
 
@@ -131,7 +131,7 @@ class Agreement(NamedTuple):
 
     @property
     def smallest_p(self) -> float:
-        """The smaller of the p-values of all tests together and of the pairs (corrected), times two for the choice."""
+        """Twice the smaller p-value, of all tests together and the pairs (corrected); twice because it is chosen."""
         of_pairs = min(pair.adjusted for pair in self.pairs)
         if len(self.pairs) == 1 or np.isnan(self.p_value):
             return of_pairs
@@ -215,10 +215,10 @@ def compare_tests(
     Parameters
     ----------
     tests : mapping of str to StoredPosterior
-        Two tests or more, each with data of its own. Their effective sample sizes matter: state
-        ``effective_sample_size`` for the correlated samples of a chain.
+        Two tests or more, with independent data. Their effective sample sizes matter: state ``effective_sample_size``
+        for the correlated samples of a chain.
     names : sequence of str
-        Parameters to compare, which every test has. Other parameters, such as those of the noise, are integrated out.
+        Parameters to compare, which every test has. Other parameters, such as noise parameters, are integrated out.
     scales : mapping of str to {"log", "linear"}, optional
         Scale on which a parameter is compared, and on which the prior that is taken out becomes flat. Default: "log"
         for parameters whose priors are positive, else "linear".
@@ -243,13 +243,13 @@ def compare_tests(
     are too narrow because their noise model is wrong (`residual_checks`). In each case the error of the mean is not the
     uncertainty of a further test.
 
-    The distribution of the distances under agreement has these assumptions: the error of the estimate of a test has the
-    distribution of its samples about their mean, mirrored (exact where the likelihood is a location family on the
-    chosen scale, such as a normal one), and covariances of n effective samples have the errors of a Wishart
-    distribution. Probabilities beyond the simulated ones have the tail of a chi-squared distribution.
+    The distribution of the distances under agreement assumes that a test's estimation error is distributed like its
+    samples about their mean, mirrored (exact where the likelihood is a location family on the chosen scale, such as a
+    normal one), and that covariances of n effective samples have the errors of a Wishart distribution. Probabilities
+    beyond the simulated ones have the tail of a chi-squared distribution.
 
-    A test says too little about a parameter if the variance of its posterior is more than half of that of its prior;
-    the parameter is then left out of pairs with this test, and a message says so.
+    A test says too little about a parameter if the posterior variance is more than half the prior variance; the
+    parameter is then left out of pairs with this test, and a message says so.
 
     Examples
     --------
@@ -327,7 +327,7 @@ def _check(
 def _likelihood(
     stored: StoredPosterior, names: list[str], logarithmic: np.ndarray, what: str, messages: list[str]
 ) -> _Test:
-    """The posterior of a test without its prior, of the parameters that it has information about."""
+    """A test's posterior without its prior, for the parameters that it has information about."""
     scales = scales_of(["log" if each else "linear" for each in logarithmic])
     prior, points = on_scale(stored, names, scales)
     draws = prior.rvs(_PRIOR_DRAWS, 0)
@@ -385,7 +385,7 @@ def _likelihood(
 
 
 def _selected(test: _Test, names: list[str]) -> _Test:
-    """Some of the parameters of a test."""
+    """The test with a subset of its parameters."""
     rows = [test.names.index(name) for name in names]
     return _Test(
         names, test.points[:, rows], test.weights, test.mean[rows], test.covariance[np.ix_(rows, rows)], test.effective
@@ -411,8 +411,8 @@ def _pair(
 def _homogeneity(tests: list[_Test], rng: np.random.Generator) -> tuple[float, float]:
     """Cochran's Q of several tests, and the probability of one at least as large if their parameters are the same.
 
-    In each of the simulated cases the error of a test is one of its samples, mirrored about the mean, plus the error of
-    the mean of its finite samples; its covariance has the error of a Wishart distribution.
+    In each simulated case a test's error is one of its samples, mirrored about the mean, plus the error that the mean
+    has because the samples are finite; its covariance has the error of a Wishart distribution.
     """
     from scipy.stats import chi2
 

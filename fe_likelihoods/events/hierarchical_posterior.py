@@ -46,24 +46,23 @@ _SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a poin
 
 @dataclass(frozen=True)
 class Varying:
-    """Prior of the population of a parameter that varies between tests.
+    """Population prior of a parameter that varies between tests.
 
     Parameters
     ----------
     location : Distribution
-        Prior of the median (scales "log" and "logit") or the mean (scale "linear") of the population, in the unit of
-        the parameter.
+        Prior of the population median (scales "log" and "logit") or mean (scale "linear"), in the parameter's unit.
     sd : Distribution
-        Prior of the standard deviation of the population: of the natural logarithm of the parameter (scale "log"), of
-        ln((x - a) / (b - x)) (scale "logit"), or of the parameter, in its unit (scale "linear").
+        Prior of the population's standard deviation, for the parameter's natural logarithm (scale "log"), for
+        ``ln((x-a)/(b-x))`` (scale "logit"), or for the parameter, in its unit (scale "linear").
     scale : {"log", "linear", "logit"}
         Whether the logarithm of the parameter, the parameter itself, or its logit has a normal distribution. The scale
         "logit" is for parameters between two bounds a and b that are physical, such as shares, which no test can
         exceed. Near a, a change of the logit is a relative change of x - a; in the middle it is 4 / (b - a) times the
         change of x.
     bounds : (float, float), optional
-        Bounds (a, b) of the scale "logit". Default: those of the prior of this parameter, which must then be the same
-        in all tests.
+        Bounds (a, b) of the scale "logit". Default: the parameter's prior bounds, which must then be the same in all
+        tests.
 
     Raises
     ------
@@ -103,7 +102,7 @@ class Varying:
 
 
 class HierarchicalPosterior:
-    """Posterior density of the hyper-parameters of several tests.
+    """Posterior density of the hyper-parameters, given several tests.
 
     It has the interface of `Posterior`: every density takes one point (ndim,) and returns a float, or n points
     (n, ndim) and returns (n,). No simulation is run.
@@ -113,16 +112,16 @@ class HierarchicalPosterior:
     tests : mapping of str to StoredPosterior
         The posterior of each test, under its name.
     varying : mapping of str to Varying
-        The parameters that vary between the tests, and the priors of their populations.
+        The parameters that vary between the tests, and their population priors.
     common : mapping of str to Distribution, optional
         Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
         belong to each test alone, with the prior of its stored posterior.
     correlation : float, optional
-        Shape eta >= 1 of the LKJ prior of the correlations between the varying parameters: 1 is uniform over
-        correlation matrices, larger values favour small correlations. Below 1 the density is infinite at correlations
-        of 1 and -1. Default: the varying parameters are independent.
+        Shape eta >= 1 of the LKJ prior for correlations between the varying parameters: 1 is uniform over correlation
+        matrices, larger values favour small correlations. Below 1 the density is infinite at correlations of 1 and -1.
+        Default: the varying parameters are independent.
     max_samples : int
-        Largest number of samples of each test. More are thinned; the time of an evaluation is proportional to it.
+        Largest number of samples per test. More are thinned; the time of an evaluation is proportional to it.
 
     Attributes
     ----------
@@ -146,16 +145,16 @@ class HierarchicalPosterior:
     The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), ``median_NAME`` and ``sd_logit_NAME``
     (scale "logit"), or ``mean_NAME`` and ``sd_NAME`` (scale "linear"), then ``correlation_A_B``, then the names of the
     common parameters. With three varying parameters or more, the correlations after those with the first parameter are
-    partial: ``partial_correlation_B_C`` is that of B and C given the parameters before B.
+    partial: ``partial_correlation_B_C`` correlates B and C given the parameters before B.
 
-    The likelihood is taken as zero outside the bounds of the prior of a test.
+    The likelihood is taken as zero outside the prior bounds of a test.
 
     The result is exact up to the finite number of samples if no parameter is common. The exact value of a common
-    parameter is not among the samples, so the density of common and varying parameters is that of the mixture which is
-    fitted to the samples of each test: correlations between them are kept, and shapes that the mixture does not
-    describe are lost. `Hierarchy` states the errors. Where a common parameter is within 4 standard deviations of a
-    bound of its prior, its density is fitted on the scale of its normal score, so that a test that says nothing about
-    it adds a constant (docs/theory/hierarchy.rst).
+    parameter is not among the samples, so the density of common and varying parameters is described by a mixture that
+    is fitted to each test's samples: correlations between them are kept, and shapes that the mixture cannot describe
+    are lost. `Hierarchy` states the errors. Where a common parameter is within 4 standard deviations of a prior bound,
+    its density is fitted on the scale of its normal score, so that a test that says nothing about it adds a constant
+    (docs/theory/hierarchy.rst).
 
     Examples
     --------
@@ -263,7 +262,7 @@ class HierarchicalPosterior:
         return self.log_prior(x) + self.log_likelihood(x)
 
     def log_prior(self, x: Any) -> np.ndarray | float:
-        """Normalised log-density of the prior of the hyper-parameters."""
+        """Normalised log prior density of the hyper-parameters."""
         return self.prior.logpdf(as_points(x, self.prior.names))
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
@@ -304,7 +303,7 @@ class HierarchicalPosterior:
         return np.stack(columns, axis=1)
 
     def population(self, x: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Center and spread of the populations of the varying parameters, on their scales.
+        """Population center and spread of the varying parameters, on their scales.
 
         Parameters
         ----------
@@ -316,7 +315,7 @@ class HierarchicalPosterior:
         center : (n, n_varying + n_common) float
             Means of the varying parameters on their scales, then the common parameters.
         factor : (n, n_varying, n_varying) float
-            Cholesky factors of the covariances of the varying parameters.
+            Cholesky factors of the varying parameters' covariances.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)
@@ -346,7 +345,7 @@ def _checked_bounds(varying: Varying, bounds: Any) -> tuple[float, float]:
 
 
 def _bounds_of(name: str, varying: Varying, tests: Mapping[str, StoredPosterior]) -> tuple[float, float] | None:
-    """Bounds of a varying parameter with the scale "logit": as stated, or those of its prior in all tests."""
+    """Bounds of a varying parameter with the scale "logit": as stated, or its prior bounds, equal in all tests."""
     if varying.scale != "logit" or varying.bounds is not None:
         return varying.bounds
     found = {

@@ -20,11 +20,11 @@ from .population_marginal import draw_parameters, sample_weights
 __all__ = ["Hierarchy"]
 
 _HYPER_SAMPLES = 200
-_LARGEST_OUTSIDE = 0.01  # of the draws of a new test, outside the bounds of the priors of the tests
+_LARGEST_OUTSIDE = 0.01  # of the draws of a new test, outside the tests' prior bounds
 
 
 class Hierarchy:
-    """Population of the parameters of several tests.
+    """Parameter population over several tests.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class Hierarchy:
         Warns
         -----
         UserWarning
-            If more than 1 % of the draws are outside the bounds of the priors of the tests, with the parameters.
+            If more than 1 % of the draws are outside the tests' prior bounds; the parameters are named.
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
@@ -152,8 +152,8 @@ class Hierarchy:
         Returns
         -------
         dict of str to float
-            Means over the hyper-samples of the centers on the scales of the populations: the geometric mean of the
-            medians for the scale "log", the mean of the logits for the scale "logit".
+            Population centers, averaged over the hyper-samples on the scales of the populations: the geometric mean of
+            medians for the scale "log", the mean logit for the scale "logit".
         """
         center, _ = self.posterior.population(self.samples)
         names = [*self.posterior.varying, *self.posterior.common]
@@ -162,9 +162,9 @@ class Hierarchy:
     def population_weights(self, draws: Mapping[str, np.ndarray], n: int = 200) -> np.ndarray:
         """Weights by which draws of a new test are draws from single populations.
 
-        The draws of `new_test` are those of many populations together, each from one sample of the hyper-parameters.
-        With these weights they stand for each population alone, without further simulations: the difference between
-        populations is what is unknown of them, and the difference between draws of one is the spread between tests.
+        The draws of `new_test` come from many populations, one per hyper-sample. With these weights they represent each
+        population alone, without further simulations: differences between populations show the uncertainty of the
+        population, and differences between draws of one population show the spread between tests.
 
         Parameters
         ----------
@@ -172,7 +172,7 @@ class Hierarchy:
             Result of `new_test`. Common parameters, which do not vary within a population, and parameters that belong
             to each test alone are not compared.
         n : int
-            Number of populations, at most the number of samples of the hyper-parameters.
+            Number of populations, at most the number of hyper-samples.
 
         Returns
         -------
@@ -206,10 +206,10 @@ class Hierarchy:
         return weights / weights.sum(axis=1, keepdims=True)
 
     def weights(self, test: str) -> np.ndarray:
-        """Weights of the stored samples of one test, by which they are samples of its posterior in the hierarchy.
+        """Weights with which the stored samples of one test represent its posterior in the hierarchy.
 
-        Together with the other tests, the parameters of a test are known better than from the test alone: its posterior
-        shrinks towards the population.
+        Given the other tests, the parameters of a test are better known than from the test alone: its posterior shrinks
+        towards the population.
 
         Parameters
         ----------
@@ -219,8 +219,7 @@ class Hierarchy:
         Returns
         -------
         (n,) ndarray
-            Weights of all samples of the test, which sum to one. Their mean over the hyper-samples, of which at most
-            200 are used.
+            Weights for all the test's samples, which sum to one: the mean over at most 200 hyper-samples.
 
         Raises
         ------
@@ -249,8 +248,8 @@ class Hierarchy:
     def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Draw the varying and common parameters of one test, one draw for each sample of the hyper-parameters.
 
-        Unlike `weights` it also draws points between the stored samples, from the fitted mixture, and therefore serves
-        populations that are narrow and common parameters. The draws and the rows of `samples` belong together.
+        Unlike `weights` it also draws points between the stored samples, from the fitted mixture, and therefore works
+        for narrow populations and common parameters. The draws and the rows of `samples` belong together.
 
         Parameters
         ----------
@@ -279,7 +278,7 @@ class Hierarchy:
             raise ValueError(f"there is no test {test!r}; the tests are {', '.join(map(repr, self.posterior.tests))}")
 
     def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws of the prior of a parameter that belongs to each test alone."""
+        """Prior draws of a parameter that belongs to each test alone."""
         priors = {}
         for test, stored in self.posterior.tests.items():
             if name not in stored.prior.names:

@@ -23,10 +23,10 @@ _LARGEST_ERROR = 0.2  # of the mean of a hyper-parameter, in posterior standard 
 _FEWEST_EFFECTIVE = ((20.0, 0.15), (1.0, 0.0))  # if the error of a mean is above the second number
 _LARGEST_SHAPES = ((LARGEST_SHAPE, 0.1), (0.8, 0.0))  # Pareto shape, if the error of a mean is above the second number
 _LARGEST_SHARE = 0.1  # of the hyper-samples at which weights may be unusable
-_LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that the samples of a test reach
-_LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without bounds at zero, which are those of positive parameters
+_LARGEST_OUTSIDE = 0.05  # of a population beyond bounds that a test's samples reach
+_LARGEST_OUTSIDE_SUM = 0.06  # sum over the tests, without the bounds at zero that positive parameters have
 _OUTER = 0.02  # probability of the prior next to a bound
-_PILED = 0.09  # probability of the posterior of a test there, above which one bound alone is an alarm
+_PILED = 0.09  # posterior probability there, above which one bound alone is an alarm
 _NEAR = 2.0  # standard deviations from the mean to a bound that is reached; 1.95 if 5 % of a normal density are cut off
 _ROUND_OFF = 1e-9  # of the width of a prior, by which equal bounds may differ
 _NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal density describes
@@ -50,12 +50,11 @@ class ReweightingCheck(NamedTuple):
     outside : float
         Mean probability of the population beyond bounds of the prior that the samples reach.
     cut_off : float
-        The same without bounds at zero, which are those of positive parameters.
+        The same without the bounds at zero that positive parameters have.
     error : float
-        Standard error of the logarithm of the marginal likelihood, root mean square over the hyper-samples, from
-        resampled samples.
+        Standard error of the log marginal likelihood, root mean square over the hyper-samples, from resampled samples.
     shift : float
-        Largest standard error of the mean of a hyper-parameter that this test causes, in posterior standard deviations.
+        Largest standard error that this test causes in a hyper-parameter's mean, in posterior standard deviations.
     """
 
     effective_samples: float
@@ -75,11 +74,11 @@ class HierarchyChecks(NamedTuple):
     tests : dict of str to ReweightingCheck
         The checks of each test.
     mean_errors : dict of str to float
-        Standard error of the posterior mean of each hyper-parameter from the finite samples of all tests, in its
-        posterior standard deviations. The error of the sampler of the hyper-parameters is not included.
+        Standard error of each hyper-parameter's posterior mean from the finite samples of all tests, in posterior
+        standard deviations. Errors from sampling the hyper-parameters are not included.
     log_evidence_error : float
-        Standard error of the log-evidence of the hierarchical model from the finite samples of all tests and the errors
-        of their evidences. The error of the sampler of the hyper-parameters is not included.
+        Standard error of the hierarchical model's log-evidence from the finite samples of all tests and the errors of
+        their evidences. Errors from sampling the hyper-parameters are not included.
     messages : tuple of str
         What is not reliable and what to do; empty if nothing was found.
     """
@@ -189,12 +188,12 @@ def _outside(
 
 
 def _reached(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Whether the samples of a test reach the lower and the upper end of the prior of each varying parameter."""
+    """Whether a test's samples reach the lower and the upper end of each varying parameter's prior."""
     return _probability_at_bounds(posterior, name) > 0.5 * _OUTER
 
 
 def _probability_at_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Probability (n_varying, 2) of the samples of a test in the outer 2 % of the prior at its lower and upper end."""
+    """Share (n_varying, 2) of a test's samples in the outer 2 % of the prior at its lower and upper end."""
     samples = posterior.from_scale(posterior.described[name].points)[:, : len(posterior.varying)]
     weights, prior = np.exp(posterior.described[name].log_weights), _prior_draws(posterior, name)
     low, high = np.quantile(prior, [_OUTER, 1.0 - _OUTER], axis=0)
@@ -218,7 +217,7 @@ def _far(draws: np.ndarray) -> bool:
 
 
 def _prior_draws(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Draws (n, n_varying) of the prior of the varying parameters in a test."""
+    """Prior draws (n, n_varying) of the varying parameters in a test."""
     prior = posterior.tests[name].prior
     return prior.rvs(20_000, 0)[:, [prior.names.index(each) for each in posterior.varying]]
 
@@ -271,7 +270,7 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
 
 
 def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
-    """Bounds of the prior of a test that leave out values of common parameters which other priors permit.
+    """Prior bounds of a test that leave out values of common parameters which other priors permit.
 
     Parameters
     ----------
@@ -303,7 +302,7 @@ def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[
 
 
 def _common_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Bounds (n_common, 2) of the prior of the common parameters in a test."""
+    """Prior bounds (n_common, 2) of the common parameters in a test."""
     return posterior.described[name].prior.bounds[len(posterior.varying) :]
 
 

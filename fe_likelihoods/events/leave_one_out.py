@@ -1,6 +1,7 @@
 r"""A hierarchical model without one of its tests, for all tests in turn, from one set of hyper-samples.
 
-The posterior of the hyper-parameters without test k is that of all tests divided by the marginal likelihood of test k:
+The posterior of the hyper-parameters without test k is their posterior given all tests, divided by the marginal
+likelihood of test k:
 
 .. math::
 
@@ -10,10 +11,10 @@ The posterior of the hyper-parameters without test k is that of all tests divide
 the expectation over :math:`p(\varphi \mid D)`. The hyper-samples are weighted with :math:`1 / m_k` where these weights
 are nearly even. Otherwise the population without the test may be where no hyper-sample is, which weights cannot show:
 it is sampled anew, through populations in which the test counts less and less, :math:`p(\varphi \mid D_{-k}) m_k^t`
-with t from 1 to 0. The predictive density is then the product of the ratios of neighbouring populations, each by bridge
-sampling. A test whose prior of a common parameter is narrower than what the other priors permit is always left out by
-sampling anew: beyond its bounds :math:`m_k` is zero, so that no hyper-sample is there. No model is simulated in either
-case. See ``docs/theory/hierarchy.rst``.
+with t from 1 to 0. The predictive density is then a product of ratios between neighbouring populations, each by bridge
+sampling. If a test's prior of a common parameter is narrower than the other priors, the population is always sampled
+anew: beyond the bounds of this prior :math:`m_k` is zero, so that no hyper-sample is there. No model is simulated in
+either case. See ``docs/theory/hierarchy.rst``.
 
 References
 ----------
@@ -53,19 +54,19 @@ class LeftOut(NamedTuple):
     hierarchy : Hierarchy
         Population of the other tests.
     pareto_shape : float
-        Shape of the tail of the weights 1 / m_k [-].
+        Tail shape of the weights 1 / m_k [-].
     effective_samples : float
         Effective number of hyper-samples after weighting, or of the new samples.
     sampled : bool
         Whether the population was sampled anew, because the shape is 0.7 or more, less than half of the hyper-samples
         are effective, or the prior of the test leaves out values of a common parameter that the others permit.
     log_density : float
-        Logarithm of the predictive density of all data of the test given the other tests, a proper score: larger is
-        better. NaN if its `StoredPosterior` has no `log_evidence`, and where no sample of the population without the
-        test is within the prior of the test.
+        Log predictive density of all the test's data given the other tests, a proper score: larger is better. NaN if
+        its `StoredPosterior` has no `log_evidence`, and where no sample of the population without the test is within
+        the test's prior.
     log_density_error : float
-        Standard error of it from the number of hyper-samples, which are taken as independent, that of the new samples,
-        and the error of the evidence.
+        Its standard error, from the number of hyper-samples (taken as independent), the number of new samples, and the
+        error of the evidence.
     """
 
     hierarchy: Hierarchy
@@ -200,11 +201,11 @@ def _log_mean(log_values: np.ndarray, weights: np.ndarray) -> tuple[float, float
 
 
 def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]:
-    """Logarithm of the ratio of two normalising constants, and its standard error (Meng and Wong 1996, section 3).
+    """Log ratio of two normalising constants, and its standard error (Meng and Wong 1996, section 3).
 
-    The densities have the ratio r, up to the wanted constant. Given is log r at independent samples of the density with
-    r as a factor (upper), and of that without it (lower), where r may be zero; if it is zero at all of them, the result
-    is NaN.
+    The densities have the ratio r, up to the wanted constant. Arguments are log r at independent samples of the density
+    with r as a factor (upper) and of the density without it (lower). There r may be zero; if it is zero at all samples,
+    the result is NaN.
     """
     from scipy.optimize import brentq  # slow to import
     from scipy.special import expit
@@ -226,7 +227,7 @@ def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]
 def _sample_anew(
     posterior: HierarchicalPosterior, k: int, samples: np.ndarray, own: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, float]:
-    """Samples without test k, log-density of its data and its error, by a sequence in which the test counts less."""
+    """Samples without test k, its log predictive density and error, by a sequence in which the test counts less."""
     power, log_density, variance = 1.0, 0.0, 0.0
     while power > 0.0:
         lower = _next_power(own, power)

@@ -1,7 +1,7 @@
 r"""Marginal likelihood of one test under a normal population of its parameters, from stored posterior samples.
 
-With the samples :math:`u_j` of the posterior of a test, of weights :math:`w_j`, its prior density :math:`p_0` and its
-evidence :math:`Z`, the marginal likelihood under a population density :math:`p(u \mid \varphi)` is
+With a test's posterior samples :math:`u_j` of weights :math:`w_j`, its prior density :math:`p_0` and its evidence
+:math:`Z`, the marginal likelihood under a population density :math:`p(u \mid \varphi)` is
 
 .. math::
 
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 _LOG_TWO_PI = np.log(2.0 * np.pi)
-_LARGEST_EXCESS = 3.0  # of the logarithm of the inverse prior density over its largest value at the samples
+_LARGEST_EXCESS = 3.0  # by which the log inverse prior density may exceed its largest value at the samples
 _CHUNK = 2**15  # values of a temporary array, which fits into the cache of the processor
 _RANDOM_NODES = 128
 _LARGEST_EXPONENT = 700.0
@@ -54,7 +54,7 @@ class PopulationMarginal(NamedTuple):
     log_value : ndarray[n]
         Logarithm of the marginal likelihood divided by the evidence.
     sample_share : ndarray[n]
-        Share of it that is from the samples; the rest is from the fitted mixture.
+        Share of this value that is from the samples; the rest is from the fitted mixture.
     """
 
     log_value: np.ndarray
@@ -67,7 +67,7 @@ class Product(NamedTuple):
     Attributes
     ----------
     log_masses : ndarray[n, n_components]
-        Logarithms of the integrals of the components times the population density.
+        Logarithms of the integrals over each component times the population density.
     means : ndarray[n, n_components, n_varying]
         Means of the products.
     factors : ndarray[n, n_components, n_varying, n_varying]
@@ -89,7 +89,7 @@ def population_marginal(described: DescribedPosterior, center: np.ndarray, facto
     center : (n, d) ndarray
         Means of the varying parameters, and values of the common ones, for n hyper-parameters.
     factor : (n, n_varying, n_varying) ndarray
-        Cholesky factors of the covariances of the varying parameters.
+        Cholesky factors of the varying parameters' covariances.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def population_marginal(described: DescribedPosterior, center: np.ndarray, facto
 
 
 def sample_weights(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Weights (n, m) of the samples of a test under n populations, which sum to one in each row.
+    """Weights (n, m) of a test's samples under n populations, which sum to one in each row.
 
     Parameters
     ----------
@@ -127,9 +127,9 @@ def sample_weights(described: DescribedPosterior, center: np.ndarray, factor: np
 def draw_parameters(
     described: DescribedPosterior, center: np.ndarray, factor: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """One draw (n, d) of the parameters of a test given each of n hyper-parameters.
+    """One draw (n, d) of a test's parameters given each of n hyper-parameters.
 
-    It is chosen among the stored samples and random points of the product of mixture and population, with the weights
+    It is chosen among the stored samples and random points from the product of mixture and population, with the weights
     of `population_marginal`.
     """
     result = np.empty((len(center), center.shape[-1]))
@@ -166,7 +166,7 @@ def draw_products(
 
 
 def inverse_prior(described: DescribedPosterior, points: np.ndarray) -> np.ndarray:
-    """Inverse of the prior density (...) of points (..., d), times its smallest value at the samples.
+    """Inverse prior density (...) of points (..., d), times its smallest value at the samples.
 
     It is zero outside the bounds of the prior, where the likelihood is taken as zero. Where no samples are, it is
     limited.
@@ -176,7 +176,7 @@ def inverse_prior(described: DescribedPosterior, points: np.ndarray) -> np.ndarr
 
 
 def product_with_population(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> Product:
-    """Product of the mixture of a test and normal populations; arguments as of `population_marginal`."""
+    """Product of a test's mixture and normal populations; arguments as for `population_marginal`."""
     varying, dim = factor.shape[-1], center.shape[-1]
     spread = factor @ factor.swapaxes(-1, -2)
     total = np.tile(described.covariances, (len(center), 1, 1, 1))
@@ -196,7 +196,7 @@ def product_with_population(described: DescribedPosterior, center: np.ndarray, f
 
 
 def _log_correction(described: DescribedPosterior, values: np.ndarray) -> np.ndarray:
-    """Logarithm (n,) by which the density of common values (n, n_common) exceeds that of the mixture.
+    """Log ratio (n,) of the density of common values (n, n_common) to the mixture's density.
 
     The mixture then gives the density of the varying parameters for these common values only. Zero beyond the bounds of
     the prior, where `inverse_prior` is zero.

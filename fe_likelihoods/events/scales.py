@@ -48,7 +48,7 @@ class Scales(NamedTuple):
             return np.where(is_bounded, np.log(above) - np.log(below), values)
 
     def from_scale(self, points: np.ndarray) -> np.ndarray:
-        """Parameters (..., dim) from points on the scales; those of the scale "logit" never reach their bounds."""
+        """Parameters (..., dim) from points on the scales; with the scale "logit" they never reach their bounds."""
         is_logit = np.isfinite(self.high)
         with np.errstate(over="ignore", invalid="ignore"):
             found = np.where(np.isfinite(self.low), np.exp(np.where(np.isfinite(self.low), points, 0.0)), points)
@@ -61,7 +61,7 @@ class Scales(NamedTuple):
         return np.where(is_logit, between, found)
 
     def log_jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Logarithms (..., dim) of the derivatives of the parameters at points on the scales."""
+        """Logarithms (..., dim) of the derivatives dx / du at points on the scales."""
         is_logit = np.isfinite(self.high)
         width = np.where(is_logit, self.high - np.where(is_logit, self.low, 0.0), 1.0)
         size = np.abs(points)
@@ -70,7 +70,7 @@ class Scales(NamedTuple):
 
 
 def scales_of(kinds: Sequence[str], bounds: Sequence[tuple[float, float] | None] | None = None) -> Scales:
-    """Scales from their names; those of "logit" need finite bounds (a, b), which are not used for the others."""
+    """Scales from their names; "logit" needs finite bounds (a, b), which are not used for the others."""
     pairs = [None] * len(kinds) if bounds is None else bounds
     ends = {"log": (0.0, np.inf), "linear": (-np.inf, np.inf)}
     found = [pair if kind == "logit" else ends[kind] for kind, pair in zip(kinds, pairs, strict=True)]

@@ -33,27 +33,27 @@ _NEAR = 4.0  # distance of a bound from the mean, in standard deviations, within
 
 @dataclass(frozen=True, eq=False)
 class StoredPosterior:
-    """Samples of the posterior of one test, with the prior and the evidence.
+    """Posterior samples of one test, with the prior and the evidence.
 
     Parameters
     ----------
     samples : (n, dim) array_like, or mapping of str to (n,) array_like
-        Posterior samples of all parameters of `prior`, in its order, such as ``sampler.get_chain(flat=True)``, or
+        Posterior samples with all parameters of `prior`, in its order, such as ``sampler.get_chain(flat=True)``, or
         ``emcee.backends.HDFBackend("run.h5").get_chain(flat=True)`` for a stored run.
     prior : Prior
         Prior with which the samples were drawn (``posterior.prior``).
     log_weights : (n,) array_like, optional
         Logarithms of the importance weights of the samples, up to a constant. Default: equal weights.
     log_evidence : float, optional
-        Logarithm of the evidence of the test. It adds a constant to the log-likelihood of the hyper-parameters. Without
-        it the evidence of the hierarchical model lacks this constant; nothing else changes.
+        Log-evidence of the test. It adds a constant to the log-likelihood of the hyper-parameters. Without it the
+        evidence of the hierarchical model lacks this constant; nothing else changes.
     log_evidence_error : float
         Standard error of `log_evidence`.
     effective_sample_size : float, optional
         Effective number of independent samples, for the statistical errors. Default: the number of distinct samples,
         or for weighted samples the effective sample size of the weights.
     measurements : Measurements, optional
-        What was measured in the test. `predict_new_event` warns of predictions outside of the range of all tests.
+        What was measured in the test. `predict_new_event` warns of predictions outside the range of all tests.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class DescribedPosterior(NamedTuple):
     scales : Scales
         Scales of the parameters.
     log_shares : ndarray[n_components]
-        Logarithms of the shares of the components of the mixture.
+        Logarithms of the components' shares in the mixture.
     means : ndarray[n_components, dim]
         Means of the components.
     covariances : ndarray[n_components, dim, dim]
@@ -158,8 +158,8 @@ class DescribedPosterior(NamedTuple):
     effective_sample_size : float
         Effective number of independent samples.
     common : MixtureDistribution, optional
-        Density of the common parameters alone, fitted on the scale of the normal scores of their priors, if a sample
-        of one of them is near a bound of its prior.
+        Density of the common parameters alone, fitted on the scale of their normal scores under the priors, if a sample
+        of one common parameter is near a prior bound.
     """
 
     points: np.ndarray
@@ -308,8 +308,8 @@ def _fit_common(
 ) -> MixtureDistribution | None:
     """Density of the common parameters, the last columns of points (n, dim), if one of them is near a bound.
 
-    A mixture of normal distributions of the parameter itself cannot describe a density that ends at a bound. That of
-    its normal score under the prior can: where a test says nothing, the score is standard normal.
+    A mixture of normal distributions cannot describe a parameter density that ends at a bound. A mixture for its normal
+    score under the prior can: where a test says nothing, the score is standard normal.
     """
     names = prior.names[len(prior.names) - n_common :]
     if not n_common or any(name not in prior.distributions for name in names):  # a joint prior
@@ -318,7 +318,7 @@ def _fit_common(
     distances = np.abs(bounds - values.mean(axis=0)[:, None]) / values.std(axis=0)[:, None]
     if (distances > _NEAR).all():
         return None
-    # without near bounds, the coordinate is that of the joint mixture, which is accurate far from the prior too
+    # without near bounds, the coordinate of the joint mixture is used, which is accurate far from the prior too
     far = (distances > _NEAR).all(axis=1)
     scores = Prior(
         {

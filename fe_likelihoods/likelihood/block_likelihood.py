@@ -4,10 +4,10 @@ Neighbouring samples of a response have correlated errors. If single samples are
 them, and the cross-validation measures interpolation instead of prediction. Blocks of time that are longer than the
 correlation of the errors are nearly independent, and are left out as a whole [1]_.
 
-The term of block k is log p(y_k | y_1 ... y_{k-1}, theta), the difference of the log-likelihoods of the measurements up
-to the end of the block and up to its beginning. The terms add up to the log-likelihood for every noise. For white noise
-the term is the log-likelihood of the block alone; for autoregressive noise only its first sample depends on the block
-before it.
+The term of block k is log p(y_k | y_1 ... y_{k-1}, theta): the log-likelihood of the measurements up to the end of the
+block, minus the log-likelihood up to its beginning. The terms add up to the log-likelihood for every noise. For white
+noise the term is the log-likelihood of the block alone; for autoregressive noise only its first sample depends on the
+block before it.
 
 References
 ----------
@@ -41,11 +41,11 @@ class BlockLogLikelihood(NamedTuple):
     Attributes
     ----------
     values : ndarray, shape (n, n_blocks)
-        Terms of the log-likelihood of n samples of the parameters. Their sum over the blocks is the log-likelihood.
+        Log-likelihood terms for n parameter samples. Their sum over the blocks is the log-likelihood.
     starts, stops : ndarray, shape (n_blocks,)
         Times of the blocks [s]: samples of all channels with start <= time < stop.
     parts : tuple of str
-        Name of the likelihood of each block for a `JointLikelihood`, otherwise empty texts.
+        For a `JointLikelihood`, the likelihood's name for each block; otherwise empty texts.
     seconds : float
         Length of the longest block [s].
     note : str
@@ -123,7 +123,7 @@ def block_log_likelihood(
     parameters: np.ndarray,
     stops: Sequence[float],
 ) -> np.ndarray:
-    """Terms of the log-likelihood of blocks of time.
+    """Log-likelihood terms for blocks of time.
 
     Parameters
     ----------
@@ -134,9 +134,9 @@ def block_log_likelihood(
     values : (n_channels, n_samples) float
         The samples that are compared [SI], NaN where there is none.
     residuals : (n, n_channels, n_samples) float
-        Residuals of n samples of the parameters [SI].
+        Residuals for n parameter samples [SI].
     parameters : (n, n_noise) float
-        Parameters of the noise.
+        Noise parameters.
     stops : (n_blocks,) float
         Ends of the blocks [s], ascending.
 

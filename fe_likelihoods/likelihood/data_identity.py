@@ -19,7 +19,7 @@ __all__ = ["combined_digest", "data_digests"]
 
 
 def data_digests(model: Model, measurements: Measurements) -> list[str]:
-    """Digests of independent parts of the measurements: of each measured event, or one of all measurements.
+    """Digests of independent parts of the measurements: one per measured event, or one for all measurements.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def data_digests(model: Model, measurements: Measurements) -> list[str]:
 
 
 def combined_digest(digests: Sequence[str]) -> str:
-    """One digest for several data sets, in any order; that of a single one is itself."""
+    """One digest for several data sets, in any order; a single digest is returned unchanged."""
     if len(digests) == 1:
         return digests[0]
     return hashlib.blake2b(json.dumps(sorted(digests)).encode(), digest_size=16).hexdigest()

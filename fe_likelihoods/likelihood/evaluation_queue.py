@@ -47,7 +47,7 @@ class _Part:
     ----------
     likelihood : FELikelihood
     columns : list of int
-        Indices of its parameters among those of the posterior.
+        Indices of its parameters among the posterior's parameters.
     """
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
@@ -65,7 +65,7 @@ class _Part:
 
 
 class EvaluationQueue:
-    """Queue of points of a posterior, see `Posterior.evaluation_queue`.
+    """Queue of points at which a posterior is evaluated, see `Posterior.evaluation_queue`.
 
     Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
     is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect` runs
@@ -75,7 +75,7 @@ class EvaluationQueue:
     ----------
     likelihood : FELikelihood or JointLikelihood
     prior : Prior
-        Of the same parameters.
+        Prior of the same parameters.
     responses : bool
         Whether the likelihood caches the responses as well, for its method `simulate`.
     """
@@ -184,7 +184,7 @@ class EvaluationQueue:
         return self._collected
 
     def ended(self) -> list[tuple[int, float]]:
-        """Tickets and log-probabilities of points that have ended, without waiting, also of those last collected.
+        """Tickets and log-probabilities of points that have ended, including the last collected ones, without waiting.
 
         For the end of a run by Ctrl-C, before `close`: what is known shall be kept. Errors are left to `collect`.
         """

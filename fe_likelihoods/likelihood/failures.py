@@ -54,7 +54,7 @@ class FailureLog:
     Attributes
     ----------
     outcomes : int
-        Simulations of which is known whether they failed: run here, read from the disk, or recalled.
+        Simulations with a known outcome: run here, read from the disk, or recalled.
     count : int
         Number of failures.
     records : list of dict
@@ -65,7 +65,7 @@ class FailureLog:
         Number of failures whose cause is not the model.
     reasons : collections.Counter
         Number of failures per reason. After the first 100 reasons, further ones are counted by their text without
-        numbers (`reason_without_numbers`), and after 100 of these together, those of the model and the others apart.
+        numbers (`reason_without_numbers`), and after 100 of these in two groups: failures of the model and others.
 
     Raises
     ------

@@ -25,7 +25,7 @@ __all__ = ["JointLikelihood"]
 
 
 class JointLikelihood:
-    """Sum of the log-likelihoods of several data sets over the union of their parameters.
+    """Sum of log-likelihoods of several data sets over the union of their parameters.
 
     Parameters with the same name are one parameter. `Posterior` accepts the object like an `FELikelihood`. Calling it
     is `log_likelihood`.
@@ -57,9 +57,9 @@ class JointLikelihood:
 
     Notes
     -----
-    Units are compared where they are known: those of ``sigma_<channel>`` and ``sigma_<channel>_<event>`` from the
-    quantities of the channels, the nominal values of which parameters are multiples from the attribute ``nominal`` of
-    the models, and the mapping ``parameter_units`` (name to text) that a model of your own may have.
+    Units are compared where they are known: units of ``sigma_<channel>`` and ``sigma_<channel>_<event>`` from the
+    channels' quantities, nominal values from the models' attribute ``nominal``, and other units from the mapping
+    ``parameter_units`` (name to text) that your own model may have.
 
     Examples
     --------
@@ -143,8 +143,8 @@ class JointLikelihood:
         Returns
         -------
         float or (n,) float
-            -inf where one of the terms is; never NaN. Nothing is simulated where the noise parameters of one of the
-            likelihoods are impossible.
+            -inf where one of the terms is; never NaN. Nothing is simulated where the noise parameters are impossible
+            for one likelihood.
         """
         points = as_points(x, self.parameter_names)
         rows = np.atleast_2d(points)
@@ -171,21 +171,21 @@ class JointLikelihood:
         return next(filter(None, faults), "")
 
     def samples_of(self, name: str, samples: Any, noise: bool = False) -> dict[str, np.ndarray]:
-        """Samples of the parameters of one likelihood, under its own names.
+        """Parameter samples for one likelihood, under its own names.
 
         Parameters
         ----------
         name : str
             Name of the likelihood.
         samples : (n, ndim) array_like, or named values of shape (n,)
-            Samples of all parameters, or without `noise` of the structural ones. Those of `draw_noise` have names.
+            Samples of all parameters, or without `noise` of the structural ones. `draw_noise` returns named values.
         noise : bool
             Whether the noise parameters are needed.
 
         Returns
         -------
         dict of str to (n,) ndarray
-            Structural parameters, and with `noise` those of the noise.
+            Structural parameters, and with `noise` also noise parameters.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class JointLikelihood:
         return reported(self, name)
 
     def report(self) -> dict:
-        """Summary of all simulations, and under ``"likelihoods"`` that of each likelihood, see `Posterior.report`."""
+        """Summary of all simulations, and under ``"likelihoods"`` a summary for each, see `Posterior.report`."""
         parts = {key: likelihood.report() for key, likelihood in self.likelihoods.items()}
         total = {name: sum(part[name] for part in parts.values()) for name in COUNTS}
         total["failures"] = [{"likelihood": key, **each} for key, part in parts.items() for each in part["failures"]]
@@ -292,7 +292,7 @@ class JointLikelihood:
         return named
 
     def _joint_name(self, key: str, name: str) -> str:
-        """Name in the joint likelihood of a parameter of one likelihood."""
+        """Name that a parameter of one likelihood has in the joint likelihood."""
         return f"{name}_{key}" if name in self.separate else name
 
     def _check_units(self) -> None:

@@ -1,8 +1,8 @@
-"""Log-likelihood of the parameters of a model and of the noise, given measurements.
+"""Log-likelihood of model and noise parameters, given measurements.
 
 The steps are: structural parameters to the response of the model, response to the sums of squared residuals J per
-channel, J and the parameters of the noise to the log-likelihood. (A noise may need more numbers than J, its statistic
-of the residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches the simulations
+channel, J and the noise parameters to the log-likelihood. (A noise may need more numbers than J, its statistic of the
+residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches the simulations
 (`fe_likelihoods.likelihood.simulator`). The equations are on the page ``docs/theory/likelihood.rst``.
 """
 
@@ -47,36 +47,36 @@ class FELikelihood:
     model : Model
         Computes the response from structural parameters (see `fe_likelihoods.simulation.model`).
     measurements : Measurements, or mapping of str to Measurements
-        Those of single events, by their names, for a model whose excitation is `Events`; pauses and events without
-        measurements are not compared (`Events.join`). Otherwise the model's channels (matched by name, in any order),
-        up to the end of the model's response. NaN marks missing samples, which are left out. A channel may have its own
-        step and start: the response is interpolated at the times of its samples, without a filter
-        (`fe_likelihoods.signals.comparison`).
+        For a model whose excitation is `Events`: measurements of single events, by their names; pauses and events
+        without measurements are not compared (`Events.join`). Otherwise measurements of the model's channels (matched
+        by name, in any order), up to the end of the model's response. NaN marks missing samples, which are left out. A
+        channel may have its own step and start: the response is interpolated at the times of its samples, without a
+        filter (`fe_likelihoods.signals.comparison`).
     noise : Noise, optional
         `GaussianNoise`, `AutoregressiveNoise`, or any object with the protocol `Noise`. Default: `GaussianNoise` of the
         model's channels.
     pool : int, or object with ``map(function, items)``, optional
-        Runs the simulations in parallel: a number of processes of this machine, a client of dask.distributed, an
-        executor or a pool (see `fe_likelihoods.simulation.executors`). Without it, simulations run in this process:
-        compiled models on threads, others one after the other. It is not pickled with the likelihood.
+        Runs the simulations in parallel: a number of local processes, a dask.distributed client, an executor or a pool
+        (see `fe_likelihoods.simulation.executors`). Without it, simulations run in this process: compiled models on
+        threads, others one after the other. It is not pickled with the likelihood.
     memory_rows : int
         Number of simulations whose statistics are cached in memory (about 250 bytes each), failures included, so that
         they are not simulated again; 0 for none. The contents are not pickled with the likelihood: every process caches
         its own simulations.
     memory_bytes : int
-        Largest size of the responses that are cached in memory [bytes], at 8 bytes per channel and sample: those that
+        Largest size of the responses cached in memory [bytes], at 8 bytes per channel and sample: responses that
         `simulate` returned, as for a guide. The oldest are dropped. `with_noise` and `first` share them; they are not
         pickled. The default holds 1300 responses of two channels of 12 800 samples, more than a run with a guide needs.
     cache : SimulationCache or path, optional
         Cache on disk, used after the one in memory: simulations of earlier runs and of other processes are not run
-        again, and a killed run loses only its last few seconds. With a pool, each simulation is stored when it arrives,
-        those of a second together. Without one, or with a pool that has ``map`` only, a batch is simulated in chunks of
-        a few seconds that are stored one by one. The responses of `simulate` are stored as well, up to the
+        again, and a killed run loses only its last few seconds. With a pool, simulations are stored as they arrive,
+        about once per second. Without one, or with a pool that has ``map`` only, a batch is simulated in chunks of a
+        few seconds that are stored one by one. The responses of `simulate` are stored as well, up to the
         `max_response_bytes` of the cache.
     max_failure_share : float
         Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
-        simulation raises `TooManyFailures`; with a pool also a request of which simulations still run, if more have
-        failed even when all of these succeed.
+        simulation raises `TooManyFailures`; with a pool also a request whose simulations still run, if more have failed
+        even when all of these succeed.
     time_shifts : mapping of str to float, optional
         Largest unknown time shift in both directions [s], by the names of channels whose clock may differ from the
         clock of the excitation. Each has a parameter ``time_shift_<channel>`` [s] after the noise parameters; the prior
@@ -88,7 +88,7 @@ class FELikelihood:
     parameter_names : tuple of str
         Names of the structural parameters, then of the noise parameters.
     fast_parameters : tuple of int
-        Indices of the parameters whose change needs no simulation: those of the noise.
+        Indices of the parameters whose change needs no simulation: the noise parameters.
     simulator : Simulator
         Runs, counts and caches the simulations.
     n_samples : int or (n_channels,) ndarray
@@ -109,7 +109,7 @@ class FELikelihood:
     Warns
     -----
     UserWarning
-        If noise is a share of the level of a part of the motion only, because samples are missing.
+        If noise is a share of the level in only a part of the motion, because samples are missing.
     """
 
     def __init__(
@@ -197,14 +197,14 @@ class FELikelihood:
     def data_fingerprint(self) -> str:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 
-        The order of the channels has no effect. The times are those of each event and missing samples do not count, so
-        that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared. A noise with unknown time
-        shifts leaves out samples near the ends of the response, so its digest depends on the largest shift.
+        The order of the channels has no effect. Times count from the start of each event and missing samples do not
+        count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared. A noise with unknown
+        time shifts leaves out samples near the ends of the response, so its digest depends on the largest shift.
         """
         return combined_digest(self.data_digests())
 
     def data_digests(self) -> list[str]:
-        """Digests of the samples of each event that are compared; one digest if there are no events."""
+        """Digests of the compared samples, one for each event; one digest if there are no events."""
         compared = replace(self.measurements, values=getattr(self.measured, "values", self.measured))
         return data_digests(self.model, compared)
 

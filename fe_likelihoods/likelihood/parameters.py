@@ -62,7 +62,7 @@ def describe_parameters(model: Model, noise: Noise) -> tuple[Parameter, ...]:
     model : Model
         Optional members are used: ``nominal``, a mapping of names to the nominal values [SI] of which the parameters
         are multiples; ``nominal_units``, a mapping of names to the units in which these are shown; ``parameter_units``,
-        a mapping of the names of other parameters to their units in words.
+        a mapping of other parameter names to their units in words.
     noise : Noise
 
     Returns

@@ -82,7 +82,7 @@ class Posterior:
 
     @property
     def parameter_names(self) -> list[str]:
-        """Structural parameters first, then those of the noise; a list, as emcee, arviz and corner expect."""
+        """Structural parameters first, then noise parameters; a list, as emcee, arviz and corner expect."""
         return list(self.prior.names)
 
     @property
@@ -216,10 +216,9 @@ class Posterior:
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.
 
-        Its parameters are the structural ones, its evidence is the same, and its coarse posterior is the marginal one
-        of this posterior's. `draw_noise` draws the standard deviations afterwards. A sampler has fewer dimensions to
-        search, which saves simulations; the quadrature costs a few microseconds per row, and about 100 for a single
-        row.
+        Its parameters are the structural ones, its evidence is the same, and its coarse posterior is marginal as well.
+        `draw_noise` draws the standard deviations afterwards. A sampler has fewer dimensions to search, which saves
+        simulations; the quadrature costs a few microseconds per row, and about 100 for a single row.
 
         Raises
         ------
@@ -246,7 +245,7 @@ class Posterior:
         Returns
         -------
         dict of str to (n,) float
-            Structural parameters, then those of the noise; accepted as samples by
+            Structural parameters, then noise parameters; accepted as samples by
             `fe_likelihoods.prediction.propagation.propagate`.
 
         Raises
@@ -261,7 +260,7 @@ class Posterior:
         """A guide for samplers: finds the modes from the responses and emulates the responses around them.
 
         It reduces the simulations from thousands to hundreds: ``SMCSampler(..., guide=posterior.guide())``. The result
-        is that of the posterior in any case, since every draw of the guide is simulated and weighted.
+        does not depend on the guide, since every draw of the guide is simulated and weighted.
 
         Parameters
         ----------
@@ -343,8 +342,8 @@ class Posterior:
     def evaluation_queue(self, responses: bool = False) -> EvaluationQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
 
-        Samplers that propose points while others still run keep all workers of a pool busy with it. The values are
-        those of `log_prob`.
+        Samplers that propose points while others still run keep all workers of a pool busy with it. The values are the
+        same as from `log_prob`.
 
         Parameters
         ----------
@@ -374,8 +373,8 @@ class Posterior:
         Parameters
         ----------
         callback : callable, or None
-            Called with a number of points: simulations of this process that have ended, each divided by the number of
-            likelihoods of a `JointLikelihood`. It must not raise. None: no longer.
+            Called with a number of points: ended simulations of this process, divided by the number of likelihoods in a
+            `JointLikelihood`. It must not raise. None ends the announcements.
         """
         parts = self.likelihood.parts()
         share = 1.0 / len(parts)
@@ -404,13 +403,12 @@ class Posterior:
         -------
         dict
             ``simulations``, ``verifications`` (rows of the cache on disk that were compared with a further simulation),
-            ``unverified`` (rows that could not be compared, because the further simulation was stopped),
-            ``cache_hits`` (rows whose statistics were cached), ``disk_hits`` (rows among them that
-            came from the cache on disk), ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where
-            known and ``"transient"`` where the cause is not the model; the first 1000), ``failure_count``,
-            ``transient_failures`` (those of them that a later run simulates again, see `FailureLog`),
-            ``failure_reasons`` (count per reason), ``seconds`` (wall time of the simulations). For a `JointLikelihood`
-            also ``likelihoods``, the report of each part.
+            ``unverified`` (rows that could not be compared, because the further simulation was stopped), ``cache_hits``
+            (rows whose statistics were cached), ``disk_hits`` (how many of these came from the cache on disk),
+            ``failures`` (list of ``{"parameters", "reason"}``, with ``"seconds"`` where known and ``"transient"`` where
+            the cause is not the model; the first 1000), ``failure_count``, ``transient_failures`` (failures that a
+            later run simulates again, see `FailureLog`), ``failure_reasons`` (count per reason), ``seconds`` (wall time
+            of the simulations). For a `JointLikelihood` also ``likelihoods``, the report of each part.
         """
         return self.likelihood.report()
 

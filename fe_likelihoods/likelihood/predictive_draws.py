@@ -39,7 +39,7 @@ class MeasuredHistory(NamedTuple):
     time : ndarray, shape (n_samples,)
         Times [s].
     values : ndarray, shape (n_samples,)
-        Samples [SI], without those that are missing.
+        Samples [SI], without missing ones.
     """
 
     name: str
@@ -246,7 +246,7 @@ def _blocks(
     block: float | None,
     name: str,
 ) -> BlockLogLikelihood:
-    if isinstance(noise, ShiftedNoise):  # the residuals are those at the shifts already
+    if isinstance(noise, ShiftedNoise):  # the residuals are at the shifts already
         parameters, noise = parameters[:, : len(noise.noise.parameter_names)], noise.noise
     whole = np.array([np.inf])
     total = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, whole)[:, 0]

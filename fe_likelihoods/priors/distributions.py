@@ -187,7 +187,7 @@ class Distribution(ABC):
     def to_normal(self, x: np.ndarray | float) -> np.ndarray | float:
         """Map from the parameter to a standard normal variable, the inverse of `from_normal`.
 
-        The logarithm of the density at x is that of the standard normal at z minus log(dx / dz).
+        The log density at x is the standard normal log density at z minus log(dx / dz).
 
         Parameters
         ----------
@@ -270,8 +270,8 @@ class TruncatedNormal(Distribution):
 
     Notes
     -----
-    Quantiles are computed from the nearer tail, which resolves both tails; their error is a few units of round-off of
-    max(abs(mean), sd).
+    Quantiles are computed from the nearer tail, which resolves both tails; their error is a few round-off units at the
+    magnitude max(abs(mean), sd).
     """
 
     mean: float
@@ -433,12 +433,12 @@ class Uniform(Distribution):
 class LogNormal(Distribution):
     """Distribution of a positive parameter whose logarithm is normal.
 
-    It is defined by its median, which has the unit of the parameter, instead of the mean of the logarithm.
+    It is defined by its median, which has the parameter's unit, instead of the logarithmic mean.
 
     Parameters
     ----------
     median : float
-        Median (> 0), in the unit of the parameter: the exponential of the mean of its logarithm.
+        Median (> 0), in the unit of the parameter; its logarithm is the mean of log x.
     log_sd : float
         Standard deviation of the natural logarithm (> 0); if small, about the coefficient of variation.
     """

@@ -2,7 +2,7 @@
 
 The samples are mapped to the coordinates in which the first prior is standard normal (`Prior.to_normal`), and a mixture
 is fitted there by expectation maximisation. Bounds of the prior are therefore kept, and correlations are described. The
-number of components is that with the smallest Bayesian information criterion. See ``docs/events.rst``.
+number of components minimises the Bayesian information criterion. See ``docs/events.rst``.
 
 References
 ----------
@@ -47,14 +47,14 @@ class MixtureDistribution(MultivariateDistribution):
     covariances : (n_components, dim, dim) array_like
         Covariances in the coordinates.
     fit_error : float
-        Standard error of the logarithm of the density [-], root mean square over the samples, from fits to resampled
-        samples. An evidence with this prior has this error in addition to that of the sampler, as long as the next data
-        move the posterior by up to about 1.5 standard deviations. It is too small for larger moves: for a move of 3
-        standard deviations to a posterior with 0.7 times the standard deviation it was 0.03 to 0.14, and the root mean
-        square error of the log-evidence 0.09 to 0.23, because the samples determine the tails poorly.
+        Standard error of the log density [-], root mean square over the samples, from fits to resampled samples. An
+        evidence with this prior has this error in addition to the sampling error, as long as the next data move the
+        posterior by up to about 1.5 standard deviations. It is too small for larger moves: for a move of 3 standard
+        deviations to a posterior with 0.7 times the standard deviation it was 0.03 to 0.14, and the root mean square
+        error of the log-evidence 0.09 to 0.23, because the samples determine the tails poorly.
     misfit : float or None
-        Standard deviation over the samples of the logarithm of the ratio of the posterior to the mixture [-], which is
-        zero for a perfect fit. None if the posterior density was not given.
+        Standard deviation over the samples of the log density ratio of posterior and mixture [-], which is zero for a
+        perfect fit. None if the posterior density was not given.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class MixtureDistribution(MultivariateDistribution):
         means = np.tile(self.means[:, i], (len(z), 1))
         deviations = np.tile(self._factors[:, i, i], (len(z), 1))
         for k, factor in enumerate(self._factors if i else ()):
-            # the inverse of the leading part of a Cholesky factor is that of the leading block
+            # the leading block of a Cholesky factor has the leading block of the inverse factor as its inverse
             y = np.linalg.solve(factor[:i, :i], (z[:, :i] - self.means[k, :i]).T)
             log_shares[:, k] -= 0.5 * np.square(y).sum(axis=0) + np.log(np.diag(factor)[:i]).sum()
             means[:, k] += factor[i, :i] @ y
@@ -181,7 +181,7 @@ def fit_mixture(
     Parameters
     ----------
     samples : (n, dim) array_like, or named values of shape (n,)
-        Posterior samples of equal weight: of all parameters of `prior`.
+        Posterior samples of equal weight, with all parameters of `prior`.
     prior : Prior
         Prior of these samples. Its parameters are independent.
     names : sequence of str, optional

@@ -1,4 +1,4 @@
-"""Distributions of several correlated parameters, for `Prior`: normal, truncated normal, and those of scipy.
+"""Distributions of several correlated parameters, for `Prior`: normal, truncated normal, and scipy's distributions.
 
 A distribution has a normalised density and draws. Nested samplers and guides also need a map between the parameters and
 independent standard normal variables. `MultivariateNormal` and `MixtureDistribution` have one; a distribution without
@@ -93,8 +93,8 @@ class MultivariateNormal(MultivariateDistribution):
     mean : (dim,) array_like
         Mean.
     covariance : (dim, dim) array_like
-        Covariance, positive definite, and symmetric to 1e-8 of the product of the two standard deviations. It is
-        made symmetric.
+        Covariance, positive definite, and symmetric to 1e-8 times the product of both standard deviations. It is made
+        symmetric.
 
     Raises
     ------
@@ -173,7 +173,7 @@ class TruncatedMultivariateNormal(MultivariateNormal):
     Attributes
     ----------
     log_probability : float
-        Logarithm of the probability of the box before truncation, which normalises the density.
+        Log probability of the box before truncation, which normalises the density.
     log_probability_error : float
         Its standard error, by which the logarithm of every density and every evidence may be shifted. Zero for
         independent parameters.
@@ -383,7 +383,7 @@ def as_distribution(name: str, distribution: Any) -> Distribution:
 
 
 def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDistribution:
-    """The distribution of several parameters; ValueError if it is none, or one of other parameters."""
+    """The distribution of several parameters; ValueError if it is none, or has other parameters."""
     if not isinstance(distribution, MultivariateDistribution):
         if not all(hasattr(distribution, member) for member in ("logpdf", "rvs")) or hasattr(distribution, "ppf"):
             raise ValueError(

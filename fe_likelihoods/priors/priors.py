@@ -19,11 +19,11 @@ class Prior:
 
     Parameters
     ----------
-    distributions : mapping of str to Distribution, and of tuples of str to MultivariateDistribution
+    distributions : mapping of str to Distribution, and tuple of str to MultivariateDistribution
         Parameter names and their distributions, in the order of the parameters. A tuple of names has a distribution of
-        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`, which has names of its
-        own: the tuple must have the same names, in any order. Frozen continuous distributions of `scipy.stats` are
-        accepted as well.
+        these parameters together, such as `MultivariateNormal` or the result of `fit_mixture`, which has names itself:
+        the tuple must have the same names, in any order. Frozen continuous distributions of `scipy.stats` are accepted
+        as well.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Prior:
     bounds : ndarray[dim, 2]
         Lower and upper bound of every parameter.
     distributions : dict
-        As given; those of scipy as objects of this package.
+        As given; scipy's distributions as objects of this package.
     logarithmic : tuple of bool
         `Distribution.logarithmic` of every parameter; False for parameters with a joint distribution.
 
@@ -130,7 +130,7 @@ class Prior:
         return values
 
     def logpdf(self, x: np.ndarray) -> np.ndarray | float:
-        """Sum of the logarithms of the densities.
+        """Sum of the log densities.
 
         Parameters
         ----------
@@ -189,9 +189,9 @@ class Prior:
 
         Notes
         -----
-        The map of each parameter is increasing and accurate in both tails, see `Distribution.from_normal`. With z of x,
-        the logarithm of the prior density at x is the sum over the parameters of log phi(z) - log(dx / dz), with the
-        standard normal density phi.
+        The map of each parameter is increasing and accurate in both tails, see `Distribution.from_normal`. With z =
+        z(x), the log prior density at x is the sum over the parameters of log phi(z) - log(dx / dz), with the standard
+        normal density phi.
         """
         z = self._checked(z, "z")
         x = np.empty(z.shape)
@@ -266,12 +266,12 @@ class Prior:
         return prior
 
     def subset(self, names: Iterable[str]) -> "Prior":
-        """The prior of some of the parameters, in the order of `names`.
+        """The prior of a subset of the parameters, in the order of `names`.
 
         Parameters
         ----------
         names : iterable of str
-            Names of parameters; all or none of those with a joint distribution.
+            Names of parameters; all or none of the parameters with a joint distribution.
 
         Returns
         -------

@@ -26,16 +26,16 @@ def bridge_column_prior(
 ) -> Prior:
     """Make the prior of Ramancha et al. (2022).
 
-    The structural parameters are normal with mean 1, truncated at zero, with coefficients of variation of 0.30 (Ec),
-    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal. Their 0.1 g and 1.2 in are taken
-    as scales, the standard deviations of the normal before taking the absolute value (`HalfNormal`). The paper does not
-    say whether they are these or the standard deviations of the half-normal distributions, which would give scales that
+    The structural parameters are normal with mean 1, truncated at zero, with the coefficients of variation 0.30 (Ec),
+    0.20 (Es), 0.60 (a0), 0.60 (a1) and 0.40 (ft). The noise levels are half-normal. Their 0.1 g and 1.2 in are taken as
+    scales: standard deviations of the normal before taking the absolute value (`HalfNormal`). The paper does not say
+    whether they are scales or standard deviations of the half-normal distributions; the latter would give scales that
     are 1.66 times as large.
 
     Parameters
     ----------
     noise_parameters : sequence of str
-        Parameters of the noise. For another noise than that of the paper: a shared ``sigma`` in root mean squares of
+        Noise parameters. For a noise that differs from the paper's noise: a shared ``sigma`` in root mean squares of
         the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
         assumed).
     measured : mapping of str to float
@@ -50,7 +50,7 @@ def bridge_column_prior(
     Raises
     ------
     ValueError
-        If there is no default prior for a parameter of the noise.
+        If there is no default prior for a noise parameter.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
     scales = {f"sigma_{name}": _NOISE_SCALE * value for name, value in measured.items()} | {

@@ -59,7 +59,7 @@ def quantile_of_normal(
     mean, sd, lower, upper : float
         Normal before truncation, and its bounds.
     log_mass : float
-        Logarithm of the probability of [lower, upper] before truncation.
+        Log probability of [lower, upper] before truncation.
 
     Returns
     -------
