@@ -46,10 +46,10 @@ class BilbyProblem(NamedTuple):
 def to_bilby(posterior: Posterior) -> BilbyProblem:
     """Convert a posterior for bilby.
 
-    The likelihood is zero outside the support of the prior of `posterior`, even if other priors are passed to bilby. A
+    The likelihood is zero outside the prior support of `posterior`, even if other priors are passed to bilby. A
     likelihood of zero is returned as a log-likelihood of -1e100. bilby would replace a live point with an infinite
-    log-likelihood, and its evidence would be too large: the logarithm of the share of the prior in which simulations
-    succeed would be missing.
+    log-likelihood, and its evidence would be too large: it would lack the logarithm of the prior probability that a
+    simulation succeeds.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def to_bilby(posterior: Posterior) -> BilbyProblem:
     Raises
     ------
     ValueError
-        If bilby has no prior that is equal to one of the posterior.
+        If bilby has no equivalent of a prior in the posterior.
 
     Examples
     --------

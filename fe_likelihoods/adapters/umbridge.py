@@ -74,7 +74,7 @@ def serve(
     port : int
         Port; 0 for a free one.
     pool : int or pool, optional
-        Runs the simulations of models, as in `FELikelihood`. A posterior has that of its likelihood.
+        Runs the simulations of models, as in `FELikelihood`. A posterior uses the pool of its likelihood.
     block : bool
         Whether to return only after Ctrl-C.
 
@@ -163,7 +163,7 @@ class _Evaluator(NamedTuple):
     input_size : int
         Number of parameters.
     output_sizes : list of int
-        Lengths of the vectors of the output.
+        Lengths of the output vectors.
     densities : tuple of str
         Values that ``"density"`` may have in the configuration, the default first; empty for a model.
     evaluate : callable
@@ -315,7 +315,7 @@ class _HTTPServer(ThreadingHTTPServer):
         self.server_name, self.server_port = self.server_address[:2]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log the error of a connection, such as that of a client that was killed."""
+        """Log the error of a connection, for example after a client was killed."""
         logger.debug("The connection of %s has ended", client_address, exc_info=True)
 
 

@@ -107,7 +107,7 @@ def _read_record(job: Job, path: Path) -> Record:
 
 
 def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:
-    """The measurements of channels of a model, without samples before and after the record.
+    """The measurements of a model's channels, without samples before and after the record.
 
     Raises
     ------

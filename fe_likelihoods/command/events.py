@@ -111,10 +111,10 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
 
 
 def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
-    """The result of `propagate`, without those of its warnings that the result keeps as remarks.
+    """The result of `propagate`, without the warnings that the result keeps as remarks.
 
-    The command says and writes the remarks, which are in the words of the TOML file. All other warnings, such as those
-    of a model of the user, are given after the prediction.
+    The command says and writes the remarks, which are in the words of the TOML file. All other warnings, such as
+    warnings by a user's model, are given after the prediction.
     """
     from ..prediction.propagation import propagate
 
@@ -144,10 +144,10 @@ def predict_events(
 ) -> dict[str, dict[str, Prediction] | SimulationFailed]:
     """Predict histories and peaks under other base motions, one simulation per sample and event if there is a cache.
 
-    Peaks with a noise in shares of the response have the error of the model (``noise="model"`` of `propagate`), because
-    noise that is independent from sample to sample makes them too large.
+    Peaks with a noise in shares of the response have the model error (``noise="model"`` of `propagate`), because noise
+    that is independent from sample to sample makes them too large.
 
-    Responses are stored in the cache of the likelihood, so that events whose prediction was interrupted go on there.
+    Responses are stored in the likelihood's cache, so that an interrupted prediction continues there.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def _predict_event(
 def describe_events(
     events: tuple[Event, ...], predictions: Mapping[str, dict[str, Prediction] | SimulationFailed]
 ) -> tuple[OtherEvent, ...]:
-    """Numbers, scores and sentences of the events, also of those of which all simulations have failed."""
+    """Numbers, scores and sentences of the events, including events whose simulations have all failed."""
     return tuple(
         describe_event(event.name, predictions[event.name], event.measured)
         for event in events

@@ -33,7 +33,7 @@ class Job:
     events : dict of str to dict
         Keys of the events to predict, by name.
     event : str
-        The event whose record and measurements these are; empty for those of the calibration.
+        The event to which record and measurements belong; empty for the calibration.
     runs_code : bool
         Whether Python files and programs that the file names may be imported and run.
     """
@@ -60,7 +60,7 @@ class Job:
         return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
 
     def of_event(self, name: str) -> "Job":
-        """The same update with record and measurements of one of its events; `measurements` is empty without them."""
+        """The same update with record and measurements of one event; `measurements` is empty without them."""
         given = dict(self.events[name])
         measured = {"file": given.pop("measured")} if "measured" in given else {}
         if measured and "zero" in given:

@@ -44,7 +44,7 @@ class Problem(NamedTuple):
     assumed : dict of str to Distribution
         Priors of noise parameters that the file does not give.
     truth : dict of str to float or None
-        True values of the parameters of bundled synthetic data that are known.
+        Known true parameter values of bundled synthetic data.
     """
 
     posterior: Posterior
@@ -185,7 +185,7 @@ def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any
     """A part of the built-in structure with the values of the file."""
     changes = dict(changes)
     if part in ("bars", "hoops") and "diameter" in changes:
-        changes.setdefault("area", None)  # that of the new diameter
+        changes.setdefault("area", None)  # from the new diameter
     try:
         return replace(usual, **changes)
     except ValueError as error:
@@ -281,7 +281,7 @@ def load_function(job: Job, text: str) -> Callable:
 
 
 def _make_priors(job: Job, likelihood: FELikelihood) -> tuple[dict[str, Distribution], dict[str, Distribution]]:
-    """The priors of all parameters, and those of them that the file does not give."""
+    """The priors of all parameters, and the assumed ones, which the file does not give."""
     names, structural = likelihood.parameter_names, tuple(likelihood.model.parameter_names)
     channels = noise_channels_of(likelihood)
     for name in job.priors:

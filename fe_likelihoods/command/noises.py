@@ -39,7 +39,7 @@ def make_noise(job: Job, model: Model) -> Any:
 
 
 def _sensor(job: Job, given: dict[str, Any], channels: tuple[Channel, ...]) -> dict[str, float]:
-    """Standard deviation of the noise of each sensor [SI]."""
+    """Standard deviation of each sensor's noise [SI]."""
     known, values = {channel.name: channel for channel in channels}, {}
     for name, value in given.items():
         if name not in known:

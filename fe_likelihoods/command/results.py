@@ -99,7 +99,7 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
 
 
 def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
-    """How many runs of the model are stored, where a guide has made some of a part of the record, as a line of text."""
+    """How many model runs are stored if a guide has made some with parts of the record, as a line of text."""
     if likelihood.simulator.cache is None or float(simulations).is_integer():
         return []
     stored = likelihood.simulator.cache.info()

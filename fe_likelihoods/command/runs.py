@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
         The sampler.
     problem : Problem
     files : tuple of str
-        Names of the files of the results.
+        Names of the result files.
     cautions : tuple of str
         What speaks against the predictions.
     usable : bool
@@ -70,7 +70,7 @@ class Outcome(NamedTuple):
 
 
 def default_folder(file: Path) -> Path:
-    """Folder of the results of a TOML file, in the current folder: ``results-column`` for ``column.toml``."""
+    """Folder for the results of a TOML file, in the current folder: ``results-column`` for ``column.toml``."""
     return Path(f"results-{file.stem}")
 
 

@@ -100,7 +100,7 @@ def _make_emcee(job: Job, problem: Problem, backend: Any) -> Any:
 
 
 def run_sampler(job: Job, problem: Problem, sampler: Any, progress: bool) -> None:
-    """Run a sampler, or continue its run, until it has the number of steps of the file."""
+    """Run a sampler, or continue its run, until it has made the steps that the file asks for."""
     if not is_emcee(job):  # the annealing of a stored run is made again from its record, also where no step is missing
         sampler.run_mcmc(None, max(job.sampler.get("steps", STEPS) - sampler.iteration, 0), progress=progress)
         return

@@ -70,14 +70,14 @@ _STEEL = (
 _BARS = (
     Key("number", "whole number", "number of bars"),
     Key("diameter", "displacement", "diameter of one bar"),
-    Key("area", "number", "area of one bar [m²]; by default that of its diameter"),
+    Key("area", "number", "area of one bar [m²]; by default from its diameter"),
     Key("first_angle", "rotation", "angle of the first bar"),
 )
 _HOOPS = (
     Key("diameter", "displacement", "diameter of the hoop bar"),
     Key("spacing", "displacement", "distance between hoops"),
     Key("fy", "stress", "yield strength"),
-    Key("area", "number", "area of one set [m²]; by default that of its diameter"),
+    Key("area", "number", "area of one set [m²]; by default from its diameter"),
     Key("ultimate_strain", "number", "strain at fracture"),
     Key("spiral", "yes or no", "whether it is a spiral"),
 )
@@ -90,7 +90,7 @@ _BUCKLING = (
     Key(
         "slenderness",
         "number",
-        "unsupported length of a bar by its diameter; by default that of the spacing of the hoops",
+        "unsupported bar length divided by the diameter; by default from the hoop spacing",
     ),
     Key("alpha", "number", "1 for steel that hardens linearly (the default), 0.75 for steel that does not"),
 )
@@ -239,7 +239,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key(
             "kind",
             "text",
-            '"gaussian" (the default), or "autoregressive", each error depends on the one before, with a correlation '
+            '"gaussian" (the default), or "autoregressive": each error depends on the one before, with a correlation '
             "per channel; takes sensor only",
         ),
         Key(
@@ -300,7 +300,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 EVENT: tuple[Key, ...] = (
     *(key for key in SECTIONS["record"] if key.name != "every"),
     Key("measured", "text", "measured response in this event, to be compared: a file as in [measurements]"),
-    Key("zero", "time", "time in this file at which the base motion begins; by default that of [measurements]"),
+    Key("zero", "time", "time in this file at which the base motion begins; by default as in [measurements]"),
     Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),
     Key("rest", "time", 'pause before the motion, for "end" (10 s)'),
 )

@@ -122,7 +122,7 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
     yield_strain = physical["fy"] / physical["Es"]
     for drift in _DRIFTS:
         push = DisplacementHistory("monotonic", np.linspace(0.0, drift * column.height, _STEPS + 1))
-        # with a parameter that does not change the column, if all parameters were those of damping
+        # with a parameter that does not change the column, if there were only damping parameters
         static = replace(column, loading=push, outputs=outputs, units=(), parameters=names or ("Ec",))
         expect_fracture(static)
         force, tension, compression = static.simulate(values[kept] if names else np.ones(1))

@@ -27,7 +27,7 @@ _ROUNDS = 6
 _DRAWS = 3000  # per round of the adaptation
 _POOL = 20_000
 _ENOUGH_PER_DIMENSION = 6.0  # effective points per dimension for a covariance
-_WIDENED = 1.1  # variances of a fitted component, as multiples of those of its points
+_WIDENED = 1.1  # variances of a fitted component, as multiples of its points' variances
 _CURVED = 0.15  # share of effective points in the pool below which kernels are used
 _KERNELS = 300
 _KERNEL_SHARE = 0.7
@@ -42,13 +42,13 @@ class Region(NamedTuple):
     Attributes
     ----------
     centre : (ndim,) float
-        Mean, or the mode as long as the mean is not known.
+        Mean, or the mode while the mean is not known.
     covariance : (ndim, ndim) float
         Covariance of the part.
     emulator : ResponseEmulator, optional
         Emulator of the response; None before there are enough runs.
     log_evidence : float
-        Evidence of the part; of the Laplace approximation before there is an emulator.
+        Evidence of the part; from the Laplace approximation before there is an emulator.
     """
 
     centre: np.ndarray
@@ -91,9 +91,9 @@ class EmulatedPosterior:
     Attributes
     ----------
     log_evidence : float
-        Logarithm of the integral of the emulated density.
+        Log of the integral over the emulated density.
     log_evidence_error : float
-        Its standard error, that of the importance sampling in memory.
+        Its standard error, from the importance sampling in memory.
     top : float
         Largest log-density in the pool.
     effective_share : float

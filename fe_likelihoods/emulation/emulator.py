@@ -1,12 +1,12 @@
 """Emulator of the response near a mode: principal components of simulated residuals, a Gaussian process for each.
 
-The residual, measured minus response, at structural parameters u is r(u) = r_0 + sum_k c_k(w) P_k, with the mean r_0
-of the training residuals, their principal components P_k in units of the noise of each channel, and coefficients c_k
-that a Gaussian process predicts from the whitened parameters w (`fe_likelihoods.emulation.gaussian_process`). The
-emulated response is R(u) = y - r(u). A response is a smooth function of the parameters where its misfit, summed over
-thousands of samples, is a narrow and curved one; and the same emulator serves every noise. It is a function of the
-parameters, not of their standard normal coordinates: near a bound of a prior the coordinates go to infinity while the
-response hardly changes, and an emulator in coordinates extrapolates there.
+The residual, measured minus response, at structural parameters u is r(u) = r_0 + sum_k c_k(w) P_k, with the mean r_0 of
+the training residuals, their principal components P_k in units of each channel's noise, and coefficients c_k that a
+Gaussian process predicts from the whitened parameters w (`fe_likelihoods.emulation.gaussian_process`). The emulated
+response is R(u) = y - r(u). A response is a smooth function of the parameters even where its misfit, summed over
+thousands of samples, is narrow and curved; and the same emulator serves every noise. Its inputs are parameters, not
+their standard normal coordinates, which go to infinity near a prior bound while the response hardly changes: an
+emulator in coordinates would extrapolate there.
 
 With means m_k of the coefficients, the statistics of the mean residual are, in closed form,
 
@@ -24,8 +24,8 @@ with the t that is best for the quadratic. Where the emulator is certain, this i
 residuals within its own uncertainty cost little, so that draws are made there and the emulator is trained there next.
 
 A Gaussian process with one length scale per input underestimates its error where the response has a kink or a jump. The
-variances are therefore widened, per component, until the largest error of a left-out run is as large as that of as many
-normal variables, sqrt(2 log m) standard deviations.
+variances are therefore widened, per component, until the largest error of a left-out run is as large as the largest of
+m normal variables, sqrt(2 log m) standard deviations.
 
 References
 ----------
@@ -50,7 +50,7 @@ __all__ = ["ResponseEmulator", "TrainingSet", "fit_emulator"]
 _MAX_COMPONENTS = 60
 _NEGLIGIBLE_VARIANCE = 1e-3  # of the left-out components together, per run, in units of the noise variance
 _SMALLEST_SHARE = 1e-10  # of the leading component
-_REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the largest of the training points
+_REACH = 2.5  # squared distance up to which the emulator is used, as a multiple of the training points' largest one
 _SMALLEST_SLOPE = 1e-6  # of a parameter by its coordinate, in units of its spread in the prior
 _TINY = 1e-300
 _WIDEST = 9.0  # factor by which variances are widened at most
@@ -121,9 +121,9 @@ class ResponseEmulator:
     reach : float
         Largest squared distance, see `squared_distance`, at which the emulator is used.
     process : GaussianProcess
-        Predicts the coefficients of the components.
+        Predicts the components' coefficients.
     left_out : (m, k) float
-        Errors of the coefficients of every training run, predicted from the other runs.
+        Errors of each training run's coefficients, predicted from the other runs.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class ResponseEmulator:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the structural parameters, those of the emulated model."""
+        """Names of the structural parameters, as in the emulated model."""
         return tuple(self._target.model.parameter_names)
 
     @property
@@ -185,11 +185,11 @@ class ResponseEmulator:
         return whitened(self._target, self._whitening, coords)
 
     def statistics(self, coords: np.ndarray) -> np.ndarray:
-        """Statistics (n, n_numbers) of the residuals of the mean response at structural coordinates (n, d)."""
+        """Statistics (n, n_numbers) of the mean residuals at structural coordinates (n, d)."""
         return self._at(predict(self.process, self._inputs(coords))[0])
 
     def log_likelihood(self, coords: np.ndarray) -> np.ndarray:
-        """Logarithm (n,) of the likelihood that is expected in view of the uncertainty of the emulator.
+        """Logarithm (n,) of the expected likelihood, given the emulator's uncertainty.
 
         Parameters
         ----------
@@ -229,7 +229,7 @@ class ResponseEmulator:
         return np.maximum(np.stack(columns, axis=1), np.finfo(float).tiny)
 
     def left_out_statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics (m, n_numbers) of the training runs as predicted from the other runs, and of their own."""
+        """Statistics (m, n_numbers) of training runs, predicted from the other runs, and their true statistics."""
         return self._at(self._coefficients - self.left_out), self._at(self._coefficients)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:

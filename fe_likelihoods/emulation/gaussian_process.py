@@ -57,7 +57,7 @@ class GaussianProcess(NamedTuple):
     variances : (k,) float
         s_k^2.
     levels : tuple
-        Groups of outputs of equal nugget, for the variance.
+        Groups of outputs with equal nugget, for the variance.
     """
 
     inputs: np.ndarray
@@ -104,9 +104,9 @@ def fit_process(
     importance : (k,) float
         Weights of the outputs in the choice of the length scales.
     log_scales : (d,) float, optional
-        Where the search for the length scales starts, such as those of an earlier fit.
+        Where the search for the length scales starts, such as the result of an earlier fit.
     iterations : int
-        Largest number of iterations of this search; 0 to keep the start.
+        Largest number of iterations in this search; 0 to keep the start.
 
     Returns
     -------

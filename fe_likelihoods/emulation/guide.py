@@ -6,8 +6,8 @@
 
 the emulated posterior q_e (`fe_likelihoods.emulation.density`), a wide t mixture q_t around the modes, and the prior.
 q_t and the prior bound the weights posterior / q where the emulator is wrong or does not reach. Before there are enough
-runs for an emulator, q_e is absent. Every simulation, also those of the search for modes, trains the emulators. A draw
-that is far more probable than expected, away from the known modes, starts another ascent.
+runs for an emulator, q_e is absent. Every simulation, including the search for modes, trains the emulators. A draw that
+is far more probable than expected, away from the known modes, starts another ascent.
 
 The equations are on the page ``docs/theory/guided.rst``.
 """
@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 _WIDE_SHARE, _PRIOR_SHARE = 0.10, 0.05
 _WIDE_SHARE_ALONE = 0.9  # before there is an emulator
 _WIDE_FREEDOM = 5.0
-_WIDENED = 1.5  # variances of the wide components, as multiples of those of their regions
+_WIDENED = 1.5  # variances of the wide components, as multiples of their regions' variances
 _SHARE_OF_MODES = 0.25  # of the wide mixture around the modes that were found, the rest around the emulated means
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
@@ -42,8 +42,8 @@ _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
-_IMPLAUSIBLE = 10.0  # emulated log-density above that of all runs, besides 1 per dimension, at which a fit is refused
-_SURPRISE = 10.0  # log-density above that of any known mode minus this, at which a far point starts an ascent
+_IMPLAUSIBLE = 10.0  # emulated log-density above all runs, besides 1 per dimension, at which a fit is refused
+_SURPRISE = 10.0  # a far point starts an ascent if its log-density is above any known mode minus this
 _MOST_ASCENTS = 2  # of these, per refinement
 _NOT_A_MODE = (
     "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
@@ -73,12 +73,12 @@ class ResponseGuide:
     simulations : float
         Simulations run by the guide itself, parts of a record counted as fractions.
     log_density_error : float
-        Standard error of the logarithm of the normalising constant of `log_density`.
+        Standard error of the log normalising constant of `log_density`.
     concerns : tuple of str
         Why parts of the posterior may be missing.
     """
 
-    # whatever the durations are, the response at a point is that at this point
+    # a response does not depend on how long its simulation takes
     learns_from_parts = True
 
     def __init__(self, posterior: Any, starts: int = 8) -> None:
@@ -230,7 +230,7 @@ class ResponseGuide:
             )
 
     def _counted(self, search: Generator[float, None, Any]) -> Generator[None, None, Any]:
-        """Result of a search; the simulations of each of its batches are counted as soon as they are made."""
+        """Result of a search; simulations are counted batch by batch, as soon as they are made."""
         while True:
             try:
                 cost = next(search)

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt on the responses: ascents to modes, run side by side.
 
-The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - z.z / 2 with residuals r of
-which the log-likelihood is a function through quadratic statistics S. With J = dr/dz by finite differences and
+The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - z.z / 2 with residuals r that
+enter the log-likelihood through quadratic statistics S. With J = dr/dz by finite differences and
 f = d log L / dS at the noise parameters that fit best, its gradient and its Gauss-Newton Hessian are::
 
     g = 2 sum_a f_a B_a(J, r) - z,        H = -2 sum_a f_a B_a(J, J) + 1,
@@ -274,8 +274,8 @@ def _is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
     """Whether coordinates (n_structural,) belong to the mode at the end of an ascent.
 
     Their distance is measured in units of the Laplace approximation. A part of the record does not determine all
-    coordinates: in those that it leaves as they are, this distance is small, although a longer part may lead to
-    different modes. On a part of the record, no coordinate may therefore differ by `apart` or more.
+    coordinates: in undetermined coordinates this distance is small, although a longer part may lead to different modes.
+    On a part of the record, no coordinate may therefore differ by `apart` or more.
     """
     difference = coords - end.coords
     near = float(difference @ end.hessian @ difference) < _SAME_MODE * len(coords)
@@ -285,7 +285,7 @@ def _is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
 def _difference(
     target: ResponseTarget, coords: np.ndarray, residuals: np.ndarray, steps: np.ndarray
 ) -> Generator[np.ndarray, Runs, np.ndarray]:
-    """Derivatives (d, n_channels, n_steps) of the residuals; zero for a parameter all of whose differences fail."""
+    """Derivatives (d, n_channels, n_steps) of the residuals; zero for a parameter whose differences all fail."""
     runs = yield coords + np.diag(steps)
     slopes = (runs.residuals - residuals) / steps[:, None, None]
     for k in np.flatnonzero(runs.failed):
@@ -310,7 +310,7 @@ class Batches:
     remember, fits : callable
         As for `fe_likelihoods.emulation.modes.search_modes`.
     overlap : bool
-        Whether each generator goes on as soon as its own points have been simulated. By default the requests of all are
+        Whether each generator goes on as soon as its own points have been simulated. By default all requests are
         simulated as one batch. The order in which requests end is stored with `remember`.
     """
 
@@ -323,7 +323,7 @@ class Batches:
     def complete(
         self, ascents: Sequence[Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
     ) -> Iterator[int]:
-        """Advance all generators to their ends; yields the number of points of each batch.
+        """Advance all generators to their ends; yields the number of points in each batch.
 
         Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget; what runs by then
         is kept by the target.
@@ -378,9 +378,9 @@ class Batches:
 
 
 def distinct_ends(ends: Sequence[Ascent], apart: float = np.inf) -> list[Ascent]:
-    """Ends that are different modes, the highest first; each carries the starts of those that it stands for.
+    """Ends that are different modes, the highest first; each carries the starts of all ends in its mode.
 
-    `apart` is that of `_is_same_mode`.
+    `apart`: as in `_is_same_mode`.
     """
     kept: list[Ascent] = []
     for end in sorted(ends, key=lambda end: -end.log_density):

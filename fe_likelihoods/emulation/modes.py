@@ -1,9 +1,9 @@
 """Modes of a posterior, by ascents from several starts on growing parts of the record.
 
 A model that can be shortened (``first(seconds)``) is first fitted to the start of its record, from all starts, and then
-to longer parts, from the distinct ends so far (`fe_likelihoods.emulation.levenberg_marquardt`). The short runs are
-cheap and their misfit is smoother, because errors in a period have had less time to add up to a phase. There the prior
-is centred on each start, so that starts keep their differences in parameters that the early part does not depend on.
+to longer parts, from the distinct ends so far (`fe_likelihoods.emulation.levenberg_marquardt`). Short runs are cheap,
+and their misfit is smoother, because errors in a period have had less time to add up to a phase. There the prior is
+centred on each start, so that starts keep their differences in parameters without effect on the early part.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -85,7 +85,7 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     """Laplace approximation at the end of an ascent, over structural and noise coordinates together.
 
     The residuals are taken as linear in the structural coordinates, so that nothing is simulated. The Hessian of the
-    log-density is computed by central differences with steps of a third of a standard deviation.
+    log-density is computed by central differences with steps of 1/3 standard deviation.
     """
     statistics = target.statistic(end.residuals)
     noise = max(end.noise, target.fit_noise(statistics), key=lambda fit: fit.log_density)

@@ -1,9 +1,9 @@
-"""Several likelihoods with parameters in common, as one whose channels are those of all.
+"""Several likelihoods with parameters in common, as one likelihood that has all their channels.
 
 Data sets are independent given the parameters, so their log-likelihoods are added. The responses of all models at the
 same parameters are one response with the channels of all, and a statistic that is quadratic in the residuals of each
-data set is quadratic in all residuals. Modes and emulators therefore need to know nothing of several data sets. Data
-sets of fewer steps are filled up with residuals of zero, which no statistic counts.
+data set is quadratic in all residuals. Modes and emulators therefore need no code for several data sets. Data sets of
+fewer steps are filled up with residuals of zero, which no statistic counts.
 """
 
 import hashlib
@@ -83,7 +83,7 @@ class _StackedNoise:
         return np.concatenate([part.statistic(each) for part, each in zip(self._parts, own, strict=True)])
 
     def log_likelihood(self, statistics: np.ndarray, n_samples: Sequence[Any], parameters: np.ndarray) -> np.ndarray:
-        """Sum (n,) of the log-likelihoods of statistics (n, n_numbers) at noise parameters (n, n_noise)."""
+        """Sum (n,) of the log-likelihoods for statistics (n, n_numbers) at noise parameters (n, n_noise)."""
         return sum(
             part.likelihood.noise.log_likelihood(statistics[:, part.numbers], samples, parameters[:, part.noise])
             for part, samples in zip(self._parts, n_samples, strict=True)

@@ -1,4 +1,4 @@
-"""Mixtures of multivariate Student-t distributions with one number of degrees of freedom."""
+"""Mixtures of multivariate Student-t distributions with equal degrees of freedom."""
 
 from typing import NamedTuple
 

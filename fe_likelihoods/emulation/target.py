@@ -284,8 +284,8 @@ class ResponseTarget:
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural), or their logarithms where the prior says that they vary by factors.
 
-        Responses are smooth functions of these. They are not of the coordinates, which go to infinity as a parameter
-        goes to a bound of its prior.
+        Responses are smooth functions of these, but not of the coordinates, which go to infinity as a parameter goes to
+        a prior bound.
         """
         parameters = self.structural_parameters(coords)
         parameters[:, self._logarithmic] = np.log(np.maximum(parameters[:, self._logarithmic], _SMALLEST))

@@ -358,7 +358,7 @@ def _bounds_of(name: str, varying: Varying, tests: Mapping[str, StoredPosterior]
     if len(found) > 1:
         raise ValueError(
             f"HierarchicalPosterior: the bounds of the prior of {name} differ between the tests ({sorted(found)}); "
-            "state those of scale='logit', Varying(..., bounds=(a, b))"
+            "state bounds for scale='logit', Varying(..., bounds=(a, b))"
         )
     try:
         return _checked_bounds(varying, next(iter(found)))

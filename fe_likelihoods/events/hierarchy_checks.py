@@ -254,7 +254,7 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
     if named := ", ".join(f"{each} in {test!r}" for test, names in flat.items() for each in names):
         messages.append(
             f"{named}: the samples reach both bounds of the prior, or pile up at one, and with common parameters "
-            f"({', '.join(posterior.common)}) the likelihood is that of a fitted mixture, which is not reliable at a "
+            f"({', '.join(posterior.common)}) the likelihood is from a fitted mixture, which is not reliable at a "
             "bound. Sample these tests again with a prior that is normal on the scale of the population, such as "
             "LogNormal for scale='log' and scipy.stats.johnsonsb(0.0, 0.6, low, high - low) for scale='logit', or, "
             "where they say little about the parameter, leave them out"

@@ -404,7 +404,7 @@ class LevelRatios:
         t = special.stdtrit(self.degrees_of_freedom, probability)
         ends = [center + scale * t for center, scale in components]
         low, high = np.min(ends, axis=0), np.max(ends, axis=0)
-        for _ in range(60):  # bisection: the quantile of a mixture is between those of its parts
+        for _ in range(60):  # bisection: the quantile of a mixture is between its parts' quantiles
             middle = 0.5 * (low + high)
             further = self._above(middle, components) > 1.0 - probability
             low, high = np.where(further, middle, low), np.where(further, high, middle)

@@ -132,7 +132,7 @@ class EvaluationQueue:
         rows = np.array(as_points(coords, names))
         if rows.ndim != 2:
             raise ValueError(f"submit: expected points of shape (n, {len(names)}); got shape {rows.shape}")
-        # row by row, so that the values are those of single points to the last bit
+        # row by row, so that the values are the same as for single points to the last bit
         log_prior = [float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows]
         first, self._tickets = self._tickets, self._tickets + len(rows)
         self._pending += len(rows)

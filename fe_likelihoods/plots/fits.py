@@ -45,7 +45,7 @@ def draw_fit(
     errors : mapping of str to mapping of str to float
         Relative root mean square error [-], by title and channel; missing where it is not known.
     windows : mapping of str to (float, float)
-        Begin and end of the window of each channel [s]; a channel without one has no window. Empty: no such column.
+        Begin and end of each channel's window [s]; a channel without an entry has no window. Empty: no such column.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all measured channels.
     time_label : str
@@ -120,7 +120,7 @@ def _percent(share: float) -> str:
 def _set_limits(
     row: np.ndarray, whole: tuple[float, float], window: tuple[float, float] | None, with_window: bool
 ) -> None:
-    """Let the histories fill the axes, and mark the window in those of whole histories."""
+    """Let the histories fill the axes, and mark the window in axes with whole histories."""
     histories = row[:-1] if with_window else row
     for axes in row:
         axes.grid(alpha=0.25)

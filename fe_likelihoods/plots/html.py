@@ -34,7 +34,7 @@ class _Graphic(str):
 def html_history(values: NDArray[np.float64]) -> str:
     """A history (n,) as a graphic, from its smallest to its largest value; NaN where a sample is missing.
 
-    Long histories are reduced to the extremes of equal parts, so that no peak is lost.
+    Long histories are reduced to the extremes in equal parts, so that no peak is lost.
     """
     values = np.asarray(values, dtype=float)
     parts = [part[~np.isnan(part)] for part in np.array_split(values, min(len(values), _POINTS // 2))]

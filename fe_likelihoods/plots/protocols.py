@@ -74,7 +74,7 @@ class ChannelHistories(Protocol):
     description: str
 
     def times(self, name: str) -> np.ndarray:
-        """Times of the samples of one channel, shape (n_steps,) [s]."""
+        """Sample times of one channel, shape (n_steps,) [s]."""
 
     def channel(self, name: str) -> np.ndarray:
         """History of one channel, shape (n_steps,) [SI]; NaN where a sample is missing."""

@@ -1,9 +1,9 @@
-"""Figure of the scores of predictions: calibration, coverage with its error, and sharpness beside it.
+"""Figure of prediction scores: calibration, coverage with its error, and sharpness beside it.
 
 A single share of samples in a band says little. The figure shows where the measured values are in the predicted
 distributions (histogram of the probability integral transform, PIT), whether weak and strong response are covered
 alike, and what the coverage costs: the width of the band, and the interval score, which adds a penalty for every value
-outside of it.
+outside it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LEVELS = ("weak", "moderate", "strong")
 _BAND = 0.9  # probability of the bands of chance
 _BINS = 10
 _MOST_NAMES = 16  # points with names beside the last axes
-_LINE = 0.062  # height of such a name, as a share of that of the axes
+_LINE = 0.062  # height of such a name, as a share of the axes' height
 _SPAN = 0.1  # of coverages below the level that is shown at least
 _FEWEST = 3  # events whose scatter is drawn as standard errors
 
@@ -48,9 +48,9 @@ def plot_scores(
         Three axes. Left: shares of the PIT in equal parts of 0 to 1 (ten for histories), with the band that contains
         90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
         errors of their mean between histories for three events or more. Histories:
-        coverage of weak, moderate and strong response with its standard error (between events for three events or
-        more, else that of a binomial share of independent samples), and the coverage against the width of the band and
-        the interval score, both as multiples of the root mean square of the measured channel. Numbers: median,
+        coverage of weak, moderate and strong response with its standard error (between events for three events or more,
+        else binomial, for the number of independent samples), and the coverage against the width of the band and the
+        interval score, both as multiples of the root mean square of the measured channel. Numbers: median,
         50 % and outer interval divided by the measured value, in the order of the events, and the shares of
         measured values in the intervals, with the mean width and score of the outer ones.
 
@@ -139,7 +139,7 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScoresLike]) -> 
 
 
 def _name_points(axes: Axes, texts: Sequence[str], points: Sequence[tuple[float, float]]) -> None:
-    """Write names at the right of the axes, in the order of the heights of their points, with a line to each point."""
+    """Write names at the right of the axes, ordered like the heights of their points, with a line to each point."""
     low, high = axes.get_ylim()
     heights = np.array([(y - low) / (high - low) for _, y in points])
     order = np.argsort(heights, kind="stable")
@@ -201,7 +201,7 @@ def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScoresLike]) -> 
     labels = [_label(event, each, k) for event, each in events.items() for k in range(len(each.names))]
     measured, pit = joined["measured"], joined["pit"]
     if not measured.all():
-        raise ValueError(f"plot_scores: intervals are divided by the measured values; that of {labels} is zero for one")
+        raise ValueError(f"plot_scores: intervals are divided by the measured values; zero is among those of {labels}")
     n = len(measured)
     bins = min(_BINS, max(2, n // 3))
     _draw_histogram(axes[0], np.histogram(pit, bins, (0.0, 1.0))[0] / n, n)

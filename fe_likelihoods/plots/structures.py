@@ -133,7 +133,7 @@ def _draw_sensor(name: str, axes: Axes, radius: float, height: float) -> tuple[f
 
 
 def _label_heights(heights: list[float], height: float) -> list[float]:
-    """Heights of labels, in order, as close to those of their sensors as an even minimum distance allows."""
+    """Heights of labels, in order, as close to their sensors' heights as an even minimum distance allows."""
     gap = min(height / max(1, len(heights) - 1), 0.05 * height)
     ends: list[float] = []
     for k, z in enumerate(heights):
@@ -143,7 +143,7 @@ def _label_heights(heights: list[float], height: float) -> list[float]:
 
 
 def _rank(place: tuple[float, float, str]) -> tuple[float, float]:
-    """Order of labels from the base up; of those at the same height, the one nearest to the labels is the highest."""
+    """Order of labels from the base up; at the same height, the sensor nearest to the labels comes highest."""
     x, z, _ = place
     return z, x
 

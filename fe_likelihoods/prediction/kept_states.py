@@ -7,8 +7,8 @@ A later prediction with the same theta begins at the latest state that belongs t
 The responses have the bits of one simulation of the whole excitation.
 
 A state is identified by the fingerprint of the model under the excitation up to that sample, and by theta. States are
-not written to the cache on disk: they would have a thousand times the size of its rows, while the simulation that they
-save takes as long as that of any other sample.
+not written to the cache on disk: they would be a thousand times larger than its rows, while each saves only one
+simulation.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class StateMemory:
             return self._of_model[fingerprint][1].get(theta.tobytes())
 
     def add(self, fingerprint: str, n_steps: int, theta: np.ndarray, state: np.ndarray, in_use: tuple = ()) -> None:
-        """Keep a state after `n_steps` samples of the response; those of the models `in_use` are not dropped for it."""
+        """Keep a state after `n_steps` response samples; states of the models `in_use` are not dropped for it."""
         with self._lock:
             if self._make_room(state.nbytes, (fingerprint, *in_use)):
                 states = self._of_model.setdefault(fingerprint, (n_steps, {}))[1]

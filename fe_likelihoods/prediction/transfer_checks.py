@@ -181,7 +181,7 @@ def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, sourc
     if not added:
         return ""
     return (
-        f"the predicted peaks with noise=True are larger than those of the response: {', '.join(added.values())}. The "
+        f"the predicted peaks with noise=True are larger than the response peaks: {', '.join(added.values())}. The "
         "noise is drawn independently at each sample, and the largest of many draws adds to the peak: those of the "
         "noise of the sensors are in measured peaks too, while errors of a model change as slowly as the response. "
         'Predict peaks of the structure with noise="model" (docs/predictions.rst)'
@@ -261,7 +261,7 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     residuals, parameters = likelihood.residuals_of(response, point), point[None, n_structural:]
     if not (np.isfinite(residuals).sum(axis=1) > 1).all() or not np.nanmax(np.abs(residuals), axis=1).all():
         return ()
-    noise = sampled_noise(likelihood.noise)  # under the excitation of the calibration; that of `source` may be another
+    noise = sampled_noise(likelihood.noise)  # for the calibration excitation; `source` may have the noise of another
     simulated = likelihood.measurements.values - residuals
     if hasattr(noise, "whitened"):
         checked, stated = noise.whitened(residuals, simulated, parameters[0]), 1.0

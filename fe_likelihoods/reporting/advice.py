@@ -108,7 +108,7 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = (
             f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "
-            "describe none of them, and the fit below is that of the best sample."
+            "describe none of them, and the fit below is shown for the best sample."
         )
         action = "Look at the corner figure. Data of another kind, or a narrower prior, may tell the regions apart."
         found.append(Advice(CAUTION, "Several modes", text, action))
@@ -217,7 +217,7 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
     if left:
         text = (
             "What the noise model does not predict (the innovations, or the whitened residuals) is still correlated "
-            f"in {_listed(left)}: the errors have another correlation than that of the noise model."
+            f"in {_listed(left)}: the errors have another correlation than the noise model states."
         )
         action = (
             "Compare with GaussianNoise with bands of frequency (in a TOML file: groups = [1.0, 5.0] in [noise]) or "

@@ -107,9 +107,9 @@ def _finding(rows: list[ParameterRow], fits: Fits) -> str:
     if known:
         ratio, best = min(known)
         found = (
-            f"The data inform {best} most: its standard deviation shrank to {100.0 * ratio:.2g} % of that of the prior"
+            f"The data inform {best} most: its standard deviation shrank to {100.0 * ratio:.2g} % of its prior value"
             if ratio < SAME_AS_PRIOR
-            else "No parameter has a standard deviation clearly smaller than that of its prior"
+            else "No parameter has a standard deviation clearly smaller than in its prior"
         )
     errors = [(each.before, each.after) for fit in fits.fits for each in fit.channels]
     if errors and np.isfinite(errors).all():
@@ -148,7 +148,7 @@ def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
         inside = sum(row.low <= row.truth <= row.high for row in known)
         sentences.append(
             f"{inside} of {len(known)} true values are within their 90 % intervals. (Nine in ten are to be expected if "
-            "model and noise are those of the data.)"
+            "model and noise are right for the data.)"
         )
     return sentences
 
@@ -227,7 +227,7 @@ def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:
 
 
 def _count(run: FinishedRun) -> str:
-    """Number of simulations; those of short parts of the record count as fractions."""
+    """Number of simulations; simulations with short parts of the record count as fractions."""
     text = f"{run.sampler.simulations:.0f}"
     likelihoods = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
     parts = sum(part.simulations for likelihood in likelihoods for part in likelihood.shortened)
@@ -263,7 +263,7 @@ def predicted_values(prediction: Prediction) -> list[PredictedValue]:
 
 
 def names_of_values(prediction: Prediction) -> list[str]:
-    """Names of the numbers of a prediction that is no history, such as "peak of top", or "quantity 1"."""
+    """Names of the numbers in a prediction that is no history, such as "peak of top", or "quantity 1"."""
     n = prediction.mean.size
     named = len(prediction.channels) == n  # quantities of channels, such as peak("top")
     given = prediction.quantity if isinstance(prediction.quantity, list | tuple) else [prediction.quantity]

@@ -18,7 +18,7 @@ from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
-KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as those of signals
+KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as signal numbers
 FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
 CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
 UNLIKELY = 0.01  # probability of such a distance by chance
@@ -35,9 +35,9 @@ class Failure(NamedTuple):
     where : str
         The parameter that tells these failures from the successful simulations best, in words.
     ranges : str
-        Smallest and largest values of the parameters of all that are recorded.
+        Parameter ranges over all recorded failures.
     example : str
-        The parameters of one of them, after its reason where `reason` has "#".
+        The parameters of one failure, after its reason where `reason` has "#".
     """
 
     reason: str
@@ -59,11 +59,11 @@ class Failures(NamedTuple):
     remark : str
         What is not known about them; empty if all are known.
     prior_failed, prior_draws : int
-        Number of failures among the draws of the prior that the run began with, and of these draws; 0 of 0 if they are
-        not known.
+        Number of failures among the prior draws with which the run began, and number of these draws; zeros if not
+        known.
     near : NearFailures
-        Failures among the samples of the posterior, and all evaluated points there. Of a tempered sampler, those that
-        its verdict depends on.
+        Failures among the posterior samples, and all evaluated points there. For a tempered sampler, the failures on
+        which its verdict depends.
     """
 
     rows: tuple[Failure, ...]
@@ -190,7 +190,7 @@ def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bo
 
 
 def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
-    """Failures in the region of the samples: those that the sampler has judged, else those known here."""
+    """Failures in the region of the samples: as judged by the sampler, else as known here."""
     judged = None if run.verdict is None else run.verdict.near_failures
     if judged is not None:
         return judged

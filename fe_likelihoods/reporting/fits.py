@@ -31,7 +31,7 @@ class ChannelFit(NamedTuple):
     before, after : float
         Relative root mean square error (RRMSE) [-]; NaN where there is no simulation.
     checks : ResidualChecks or None
-        Of the residuals after the update, one entry; None where they cannot be checked.
+        Checks of the residuals after the update, one entry; None where they cannot be checked.
     """
 
     channel: Channel
@@ -49,7 +49,7 @@ class Fit(NamedTuple):
     title : str
         Name of the data set and of the event; empty if there is one only.
     measurements : Measurements
-        Of this event.
+        Measurements of this event.
     responses : dict of str to (n_channels, n_samples) float
         Responses at the times of the samples [SI], by title: before and after the update.
     residuals : (n_channels, n_samples) float, or None
@@ -96,12 +96,12 @@ def fit_data_sets(run: FinishedRun) -> Fits:
     Parameters
     ----------
     run : FinishedRun
-        Of a posterior with a likelihood of this package.
+        Run of a posterior with a likelihood of this package.
 
     Returns
     -------
     Fits
-        Empty for a posterior without one.
+        Empty for a posterior without such a likelihood.
     """
     if run.likelihood is None:
         return Fits((), "", "", 0, ())
@@ -112,7 +112,7 @@ def fit_data_sets(run: FinishedRun) -> Fits:
     for key, (likelihood, columns) in zip(keys, run.likelihood.parts(), strict=True):
         point = run.centre[columns]
         n = len(likelihood.model.parameter_names)
-        # time shifts of channels are those after the update in both
+        # both use the time shifts after the update
         points = {before: np.concatenate([start[columns][:n], point[n:]]), after: point}
         batch = likelihood.simulate(np.stack([theta[:n] for theta in points.values()]))
         residuals = {}

@@ -65,7 +65,7 @@ def sampler_settings(run: FinishedRun) -> list[tuple[str, str]]:
 
 
 def changed_settings(settings: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Names and values of the fields of a dataclass that differ from their defaults, nested ones with a dot."""
+    """Names and values of dataclass fields that differ from their defaults, nested ones with a dot."""
     found, default = [], type(settings)()
     for field in fields(settings):
         value, usual = getattr(settings, field.name), getattr(default, field.name)

@@ -1,4 +1,4 @@
-"""Predictions of other events than that of the calibration: numbers, scores and sentences about each of them."""
+"""Predictions of events other than the calibration event: numbers, scores and sentences about each of them."""
 
 import warnings
 from collections.abc import Mapping
@@ -67,11 +67,11 @@ class OtherEvent(NamedTuple):
         By quantity; none where all simulations have failed.
     measured : Measurements or None
     numbers : tuple of NumberRow
-        Of all predictions that are not histories.
+        Numbers of all predictions that are not histories.
     histories : tuple of HistoryScores
-        Of all predictions of histories, where there are measurements.
+        Scores of all predicted histories, where there are measurements.
     values : tuple of QuantityScores
-        Of all predictions of numbers, where there are measurements.
+        Scores of all predicted numbers, where there are measurements.
     sentence : str
         How it was predicted, and how the measurements compare with it.
     remarks : tuple of str
@@ -160,7 +160,7 @@ def describe_event(
     if missed:
         remarks.append(
             f"the {_percent(LEVEL)} band contains less than half of the strong part of {', '.join(missed)}: its spread "
-            "is not that of a new event. Calibrate with several events (in Python, predict_new_event has their "
+            "leaves out differences of events. Calibrate with several events (in Python, predict_new_event has their "
             "spread), or with a noise that follows the response; and look for what the model lacks"
         )
     sentence = _sentence(first, measured, histories, numbers)

@@ -198,7 +198,7 @@ def draw_event(event: OtherEvent) -> list[Picture]:
 
 
 def draw_scores_of_events(events: Sequence[OtherEvent]) -> list[Picture]:
-    """Calibration, coverage and sharpness of the predictions of all events with measurements: numbers, histories."""
+    """Calibration, coverage and sharpness of the predictions for all events with measurements: numbers, histories."""
     from ..plots.scores import plot_scores
 
     numbers = {event.name: event.values[0] for event in events if event.values and event.values[0].measured.all()}

@@ -134,12 +134,12 @@ def report(
     measured : Measurements, or mapping of str to Measurements, optional
         Measurements to draw with the predictions, by the title of the prediction or the name of the event.
     events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed, optional
-        Predictions of other events than that of the calibration, by the name of the event: results of
+        Predictions of events other than the calibration event, by the name of the event: results of
         `fe_likelihoods.propagate` with ``record=`` or of `fe_likelihoods.predict_new_event`, of one quantity or of
         several by name, such as ``{"histories": None, "peaks": [peak("top")]}``. They are scored where `measured` has
         the event. The error `SimulationFailed` of an event that could not be predicted names it in the report.
     discard, thin : int
-        Iterations of the chain to leave out at its beginning (burn-in), and of which to keep one in `thin`.
+        Number of iterations to leave out at the beginning of the chain (burn-in); of the others, one in `thin` is kept.
     repeat : str
         Commands that make the run again, for the last section. Default: lines of Python from what the sampler knows.
 

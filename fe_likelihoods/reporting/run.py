@@ -49,11 +49,11 @@ class FinishedRun(NamedTuple):
     truth : (ndim,) float
         True values, NaN where none are known.
     discard, thin : int
-        Iterations that were left out at the beginning of the chain, and of which one in `thin` was kept.
+        Number of iterations left out at the beginning of the chain; of the others, one in `thin` was kept.
     tempered : bool
         Whether the sampler has a ladder, an evidence and a verdict.
     verdict : Verdict or None
-        Of a tempered sampler; None for a chain without one.
+        Verdict of a tempered sampler; None for a chain without one.
     check : EvidenceCheck or None
         The independent estimate of the evidence.
     autocorrelation_time : float

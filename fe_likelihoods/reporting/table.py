@@ -87,7 +87,7 @@ def describe_prior(distribution: Distribution, factor: float = 1.0) -> str:
     ----------
     distribution : Distribution
     factor : float
-        Size of the unit of the text in that of the distribution.
+        Size of the text's unit, in the unit of the distribution.
     """
     if isinstance(distribution, TruncatedNormal):
         text = f"normal, mean {distribution.mean / factor:.4g}, sd {distribution.sd / factor:.4g}"
