@@ -29,7 +29,7 @@ class AutoregressiveNoise:
         The measured channels, in the order of the sums of squared residuals.
     sensor : mapping of channel names to float, or sequence of float, optional
         Known standard deviations of the sensors, as for `GaussianNoise`. They are a lower bound of the standard
-        deviation of the whole error. The lag-one correlation is that of the whole error, not of the model error alone.
+        deviation of the whole error. The lag-one correlation describes the whole error, not the model error alone.
 
     Raises
     ------
@@ -54,8 +54,8 @@ class AutoregressiveNoise:
     bridged exactly. The sums are then formed for each distance g that occurs.
 
     Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
-    likelihood becomes that of the differences. Decimate the measurements (`Measurements.decimate`) to a step at which
-    rho is well below one.
+    likelihood becomes a likelihood of the differences. Decimate the measurements (`Measurements.decimate`) to a step at
+    which rho is well below one.
 
     References
     ----------
@@ -93,11 +93,11 @@ class AutoregressiveNoise:
         ----------
         statistics : (n, 3 n_channels) float
             J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
-            simulation failed. With missing samples, those of `lag_one_sums`.
+            simulation failed. With missing samples, see `lag_one_sums`.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel where samples are missing.
+            Samples per channel; `SampleCounts` where samples are missing.
         parameters : (n, 2 n_channels) float
-            Standard deviations of the errors of all channels [SI], then their lag-one correlations.
+            Standard deviations of all channels [SI], then their lag-one correlations.
 
         Returns
         -------
@@ -142,7 +142,7 @@ class AutoregressiveNoise:
         return np.where(possible, terms, -np.inf).sum(axis=-1)
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors of every channel, sensor noise included.
+        """Standard deviation of the errors per channel, sensor noise included.
 
         Parameters
         ----------
@@ -159,11 +159,11 @@ class AutoregressiveNoise:
             return np.where(sigma >= 0.0, np.hypot(sigma, 0.0 if self.sensor is None else self.sensor), np.nan)
 
     def lag_one_correlations(self, parameters: np.ndarray) -> np.ndarray:
-        """Correlation of successive errors of every channel [-], (n, n_channels), from parameters (n, 2 n_channels)."""
+        """Correlation of successive errors [-], (n, n_channels), from parameters (n, 2 n_channels)."""
         return np.asarray(parameters, dtype=float)[..., len(self.channels) :]
 
     def with_channels(
         self, channels: Sequence[Channel], weights: np.ndarray
     ) -> "tuple[AutoregressiveNoise, np.ndarray]":
-        """Noise of other channels, and the weights of the parameters in its own; see `Noise`."""
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`."""
         return AutoregressiveNoise(channels, sensor=weighted(self.sensor, weights)), np.kron(np.eye(2), weights)

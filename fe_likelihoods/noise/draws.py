@@ -37,7 +37,7 @@ class SampleNoise(NamedTuple):
     errors_of_response: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def over_time(self, levels: np.ndarray, n_steps: int) -> np.ndarray:
-        """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from those of one sample."""
+        """Values at all steps, shape (n_channels, n_steps) or (n_channels, 1), from the levels of one sample."""
         if not self.events:
             return levels[:, None]
         values = np.zeros((levels.shape[1], n_steps))
@@ -71,7 +71,7 @@ class SampleNoise(NamedTuple):
 def sample_noise(
     noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None, at_samples: bool = False
 ) -> SampleNoise:
-    """Noise of samples whose levels hold for the whole measurements, or depend on the response.
+    """Noise of samples, with levels for the whole measurements or levels that depend on the response.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def sample_noise(
         Time step of the responses [s], for a noise whose level depends on the response. Without it, such a noise has
         the level of the measurements.
     at_samples : bool
-        Whether the responses are those at the measured samples, for a noise that knows the times of these.
+        Whether responses are given at the measured samples, for a noise that knows the sample times.
 
     Returns
     -------

@@ -52,18 +52,6 @@ _RESPONSE = 'level="response" without bands'
 _SHARES = 'level="measured" or "response", without bands'
 
 
-def _positive(x: float) -> bool:
-    return 0.0 < x < math.inf
-
-
-def _part(x: float) -> bool:
-    return 0.0 <= x <= 1.0
-
-
-def _finite(x: float) -> bool:
-    return 0.0 <= x < math.inf
-
-
 @dataclass(frozen=True, repr=False)
 class GaussianNoise:
     r"""Gaussian noise with one unknown level per channel, or per event or band of frequency of each channel.
@@ -73,27 +61,24 @@ class GaussianNoise:
     channels : sequence of Channel
         The measured channels, in the order of the model.
     groups : {"channel", "all", "event"} or sequence of float
-        What has a level of its own: each channel; all channels together; each channel in each event of a model whose
-        excitation is `fe_likelihoods.Events`; or each channel in each band of frequency, given by the ascending
-        frequencies between the bands [Hz], the last one below half the sampling frequency: ``(1, 5)`` makes the three
-        bands below 1 Hz, from 1 to 5 Hz, and above.
+        What has a level: each channel; all channels together; each channel in each event of a model whose excitation is
+        `fe_likelihoods.Events`; or each channel in each band of frequency, given by the ascending frequencies between
+        the bands [Hz]: ``(1, 5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
     level : {"si", "measured", "response"}
-        What a level is: a standard deviation in the SI unit of the channel; a share of the root mean square of the
-        measured channel; or a share of the level of the simulated response. "event" has levels in SI units only, and
-        bands have no shares of the measured channel.
+        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root
+        mean square; or a share of the level of the simulated response.
     window : float, optional
         Length of a window [s] in which the root mean square of the response is taken: longer than a period of the
-        response, and shorter than the strong part of the motion. In a test without time [steps]. Needed for
-        ``level="response"`` without bands. With ``level="measured"``, the noise of a prediction follows the response
-        within the window; by default it has one level for the whole motion, as the likelihood always has.
+        response, shorter than the strong part of the motion; in a test without time [steps]. Needed for
+        ``level="response"`` without bands. For ``level="measured"`` it is the window of predictions, by default the
+        whole motion; the likelihood always has one level.
     local : float, optional
         For ``level="response"``: part of the variance that follows the envelope of the response, from 0 to 1 (0.25);
-        the other part follows the whole response. 0 is one level for the whole motion, 1 the envelope alone.
+        the other part follows the whole response.
     deformation : float, optional
         For ``level="response"`` in a test with an imposed deformation: the deformation at which the standard deviation
         is the share of the level [m; - for a strain], such as 1 % of the height of a column. The standard deviation is
-        then proportional to a power of the largest deformation reached. Give specimens of different size each their
-        own.
+        then proportional to a power of the largest deformation reached. Give each specimen its own.
     growth : float, optional
         This power, 0.25 by default. Only with `deformation`.
     sensor : mapping of channel names to float, or sequence of float, optional
@@ -101,13 +86,11 @@ class GaussianNoise:
         out. The parameters are then levels of the model error, and may be zero. Needed, and positive, for
         ``level="response"``: it is the standard deviation of the error where the response is zero.
     effective_samples : mapping of channel names to float, or sequence of float, optional
-        Number of independent samples that each channel is worth, as estimated by `fe_likelihoods.effective_samples`;
-        the number of samples where it is smaller or the name is left out. For "channel" and "all", not for
-        ``level="response"``.
+        Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`); the number of
+        samples where it is smaller or the name is left out.
     scales : mapping of channel names to float, or sequence of float, optional
-        Positive scale of each channel [SI unit of the channel], of which the shared level of ``groups="all"`` and
-        shares of ``level="measured"`` are multiples. By default the root mean squares of the measured channels, set by
-        the likelihood.
+        Positive scales [SI unit of the channel], of which the level of ``groups="all"`` and the shares of
+        ``level="measured"`` are multiples. Default: root mean squares of the measured channels.
     layout, events, measured, excited
         Times of the samples; events, and which (event, channel) are measured; excitation. Set by the likelihood
         (`with_measurements`, `under`) and by predictions.
@@ -115,73 +98,55 @@ class GaussianNoise:
     Raises
     ------
     ValueError
-        For no channel, an unknown channel, an unknown or impossible combination, a missing or impossible option.
+        For no channel, an unknown channel, an impossible combination, or a missing or impossible option.
 
     Notes
     -----
-    ======================================  =====================  ==========================================
-    groups, level                           parameters             for
-    ======================================  =====================  ==========================================
-    ``"channel"``, ``"si"``                 ``sigma_<channel>``    synthetic data, thinned measurements
-    ``"all"``, ``"si"``                     ``sigma``              few or short channels; ratio of noise to
-                                                                   signal
-    ``"event"``, ``"si"``                   ``sigma_<channel>``    sensors, cables and errors that change
-                                            ``_<event>``           from test to test
-    ``"channel"`` or ``"all"``,             ``share_<channel>``,   predictions of weaker or stronger motions
-    ``"measured"``                          ``share``
-    ``"channel"`` or ``"all"``,             ``share_<channel>``,   predictions of other motions and tests
-    ``"response"``                          ``share``
-    bands, ``"si"``                         ``sigma_<channel>``    errors that are correlated in time
-                                            ``_band1``, ...
-    bands, ``"response"``                   ``share_<channel>``    the same, for predictions of other motions
-                                            ``_band1``, ...
-    ======================================  =====================  ==========================================
+    =========== ============== =========================== =======================================================
+    groups      level          parameters                  for
+    =========== ============== =========================== =======================================================
+    "channel"   "si"           ``sigma_<channel>``         synthetic data, thinned measurements
+    "all"       "si"           ``sigma``                   one ratio of noise to signal
+    "event"     "si"           ``sigma_<channel>_<event>`` sensors and errors that change from test to test
+    "channel"   "measured"     ``share_<channel>``         predictions of weaker or stronger motions
+    "channel"   "response"     ``share_<channel>``         the same, and evidences: a normalised density
+    "all"       as "channel"   ``share``                   one share for all channels
+    (1, 5)      "si"           ``sigma_<channel>_band1``   errors that are correlated in time
+    (1, 5)      "response"     ``share_<channel>_band1``   the same, for predictions of other motions
+    =========== ============== =========================== =======================================================
 
-    **White noise** (``"si"`` without bands). With n samples in channel c (missing samples do not count) and the sum of
-    squared residuals J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
+    **Levels in SI units.** With n samples in channel c (missing samples do not count) and the sum of squared residuals
+    J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
 
         log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
 
-    With events, the sum is over events too. With effective samples, the term of channel c is multiplied by n_eff / n.
-    This has the effect of thinning to n_eff samples without discarding any. The result is not a density of the
-    measurements: only evidences of models with the same n_eff can be compared.
+    With effective samples, the term of channel c is multiplied by n_eff / n. This has the effect of thinning to n_eff
+    samples without discarding any. The result is not a density of the measurements: only evidences of models with the
+    same n_eff can be compared.
 
-    **Shares of the measured channel.** The likelihood is that of white noise with other parameters: ``share_top = 0.2``
-    is a standard deviation of 20 % of the root mean square of the measured channel "top". Shares of 1 or more are
-    impossible (the model would explain nothing): their log-likelihood is -inf, and `propagate` refuses them with
-    ``noise=True``. In a prediction the root mean square R of the simulated response is known, and the level is that of
-    response and error together: sigma^2 = (sensor^2 + share^2 R^2) / (1 - share^2). The likelihood is not a normalised
-    density of the measurements, because the level is computed from them: evidences compare these shares with other
-    noises approximately only.
+    **Shares of the measured channel.** The likelihood is white noise with other parameters: ``share_top = 0.2``
+    is a standard deviation of 20 % of the measured root mean square. Shares of 1 or more are
+    impossible, since the model would explain nothing. In a prediction, response and error together have the level:
+    sigma^2 = (sensor^2 + share^2 R^2) / (1 - share^2) with the root mean square R of the simulated response. The level
+    is computed from the measurements, so that evidences compare these shares with other noises approximately only.
 
-    **Shares of the response in time.** The window moves in steps of a third of its length, so that the level is
-    constant within these parts of the time::
+    **Shares of the response.** The window moves in steps of a third of its length::
 
         l^2 = ((1 - local) R^2 + local e^2) (d / deformation)^(2 growth)
 
-    with the mean square e^2 of the response in a part and its two neighbours, the mean square R^2 of the response in
-    the whole motion (each event, and each pause, has its own), and the largest deformation d up to the middle of the
-    part; without `deformation` the last factor is one. The likelihood is a normalised density. A simulation is cached
-    with 1 + 6 T / window numbers per channel, for a duration of T; `local`, `deformation` and `growth` do not change
-    what is cached. A share that was found in a part of a motion, beside a gap or with a long quiet end belongs to
-    another R^2 than the whole motion has: calibrate and predict whole motions, or use ``local=1``. Do not choose
-    `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may prefer a response
-    that is too large, because it permits larger errors. Compare the RRMSE of the fit with that under ``level="si"``
-    (`fit_measures`); predictions warn of it.
+    with the mean square e^2 of the response in such a part and its two neighbours, the mean square R^2 of the response
+    in the whole motion (each event, and each pause, has its own), and the largest deformation d up to the middle of the
+    part; without `deformation` the last factor is one. A share that was found in a part of a motion, beside a gap or
+    with a long quiet end belongs to another R^2 than the whole motion has: calibrate and predict whole motions, or use
+    ``local=1``. Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local`
+    near 1 may prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
+    ``level="si"`` (`fit_measures`). The statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
-    **Bands of frequency.** With the coefficients z_k of the DCT-II, orthonormal, of the residuals::
-
-        log L = sum_k [ -1/2 log(2 pi) - log(sigma_k) - z_k^2 / (2 sigma_k^2) ]
-        sigma_k^2 = sensor^2 + (share_b u_b)^2          "response": u_b^2 is the mean square of the n_b coefficients of
-                                                        the simulated response in the band b of k
-        sigma_k^2 = sensor^2 + sigma_b^2 n / n_b        "si": sigma_b is the root mean square of the errors in b
-
-    This is the multivariate normal density of the samples, in both cases normalised. The errors are stationary in time
-    except near the ends, where they are reflected. Missing samples divide a channel into stretches, which are
-    independent and transformed by themselves; stretches that are shorter than a period of the lowest edge are refused.
-
-    Statistics of ``level="response"`` are not quadratic in the residuals, so samplers cannot use a guide
-    (`fe_likelihoods.ResponseGuide`).
+    **Bands of frequency.** Coefficients of the cosine transform (DCT-II, orthonormal) are independent, with the
+    variance sensor^2 + (share_b u_b)^2 of band b, where u_b is the root mean square of the coefficients of the
+    simulated response in the band, or in SI units sensor^2 + sigma_b^2 n / n_b, where sigma_b is the root mean square
+    of the errors in the band. This is a multivariate normal density of the samples. Missing samples divide a channel
+    into stretches, which are independent; stretches shorter than a period of the lowest edge are refused.
 
     References
     ----------
@@ -245,18 +210,19 @@ class GaussianNoise:
 
     def _check_options(self) -> None:
         """Set options as floats, with their defaults; ValueError for one without a meaning here, or a missing one."""
+        positive, local = lambda x: 0.0 < x < math.inf, "from 0 (one level for the motion) to 1 (the envelope)"
         for name, means, default, where, meaning, possible in (
-            ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", _positive),
+            ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", positive),
+            ("local", self._in_parts, _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
+            ("deformation", self._in_parts, None, _RESPONSE, "positive, such as 1 % of a column height", positive),
             (
-                "local",
-                self._in_parts,
-                _LOCAL,
-                _RESPONSE,
-                "from 0 (one level for the motion) to 1 (the envelope)",
-                _part,
+                "growth",
+                self.deformation is not None,
+                _GROWTH,
+                "deformation=",
+                "zero or more",
+                lambda x: 0 <= x < math.inf,
             ),
-            ("deformation", self._in_parts, None, _RESPONSE, "positive, such as 1 % of a column height", _positive),
-            ("growth", self.deformation is not None, _GROWTH, "deformation=", "an exponent, zero or more", _finite),
         ):
             if (value := self._option(name, means, where, default)) is not None:
                 object.__setattr__(self, name, as_number(self, name, value, meaning, possible))
@@ -348,7 +314,7 @@ class GaussianNoise:
     def parameter_names(self) -> tuple[str, ...]:
         """``sigma_...`` [SI unit of the channel] or ``share_...`` [-], see the table of the class.
 
-        Bands of each channel follow each other from low to high, then come those of the next channel.
+        Bands of each channel follow each other from low to high, channel by channel.
 
         Raises
         ------
@@ -518,7 +484,7 @@ class GaussianNoise:
                 )
 
     def remark_on_gaps(self) -> str:
-        """What to say of channels whose share is that of the mean square of a part of the motion, or of an event.
+        """What to say where samples are missing, so that shares refer to the level of a part of the motion.
 
         Empty for a noise without parts of the time or without measurements, for ``local=1``, and if at most 5 % of the
         samples are missing within the measured motion. An event without any sample of a channel is no gap, since each
@@ -540,13 +506,13 @@ class GaussianNoise:
         if not named:
             return ""
         return (
-            f"{self.title}: samples are missing within the channels {', '.join(named)}. The share is that of the mean "
-            "square of the other samples. If the strong part of the motion is missing, the share is too large and "
-            "predictions of whole motions too wide: use local=1, whose level is that of samples near by"
+            f"{self.title}: samples are missing within the channels {', '.join(named)}. The share refers to the "
+            "mean square of the other samples. If the strong part of the motion is missing, the share is too large and "
+            "predictions of whole motions too wide: use local=1, whose level is taken from samples near by"
         )
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
-        """Noise of other channels, and the weights of the parameters in its own; see `fe_likelihoods.Noise`.
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`.
 
         With events, the level of a channel in an event is the mean of the levels of channels with a weight that were
         measured in this event.
@@ -584,7 +550,7 @@ class GaussianNoise:
             Sums of squared residuals (n, n_channels), or what `statistic` returns [SI unit of the channel, squared];
             NaN where the simulation failed.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or of each channel where samples are missing.
+            Samples per channel; `SampleCounts` where samples are missing.
         parameters : (n, n_noise) float
             Parameters of the noise, in the order of `parameter_names`.
 
@@ -673,7 +639,7 @@ class GaussianNoise:
 
     @only_if(lambda noise: noise._kind != "event")
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors of every channel, sensor noise included.
+        """Standard deviation of the errors per channel, sensor noise included.
 
         Parameters
         ----------
@@ -710,7 +676,7 @@ class GaussianNoise:
     def response_deviations(
         self, parameters: np.ndarray, response: np.ndarray, dt: float | Sequence[float] | None = None
     ) -> np.ndarray:
-        """Standard deviations of the errors of a simulated response at each step.
+        """Standard deviations of the errors at each step, given a simulated response.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Sums of squared residuals in groups of orthonormal coordinates: the sufficient statistics of Gaussian noise.
+"""Squared residuals summed in groups of orthonormal coordinates: sufficient statistics of Gaussian noise.
 
 Errors are independent in the coordinates, with one variance for each group. The coordinates are the samples (groups are
 the samples of an event, or parts of the time) or the coefficients of an orthonormal cosine transform (groups are bands
@@ -118,7 +118,7 @@ class PartSums(GroupSums):
         return self.powers(np.ones(there.shape), there).astype(int)
 
     def in_time(self, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Standard deviations of samples (n_channels, n_steps) from those of groups; NaN where one is missing."""
+        """Standard deviations of samples (n_channels, n_steps) from group deviations; NaN where a sample is missing."""
         found = np.take_along_axis(deviations.T, _places(self, there.shape[1]), axis=1)
         return np.where(there, found, np.nan)
 
@@ -176,7 +176,7 @@ class BandSums(GroupSums):
         return sums.reshape(-1, len(there))
 
     def in_time(self, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Standard deviations of samples (n_channels, n_steps) from those of groups; NaN where one is missing."""
+        """Standard deviations of samples (n_channels, n_steps) from group deviations; NaN where a sample is missing."""
         return self._filled(there, deviations, lambda c, samples, spectrum: np.sqrt(_variances_in_time(spectrum**2)))
 
     def errors(self, normal: np.ndarray, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
@@ -246,9 +246,9 @@ def stretches(there: np.ndarray) -> Iterator[slice]:
 
 
 def split_sums(statistics: np.ndarray, n_channels: int, n_groups: int) -> list[np.ndarray]:
-    """Sums of each kind (n, n_groups, n_channels) from statistics (n, n_numbers): of the residuals, of the response.
+    """Sums (n, n_groups, n_channels) from statistics (n, n_numbers): of the residuals, then of the response.
 
-    The first numbers, the sums of squared residuals over all samples, are left out: those of the groups add up to them.
+    The first numbers, the sums of squared residuals over all samples, are left out: sums of groups add up to them.
     """
     rows = statistics.reshape(len(statistics), statistics.shape[1] // n_channels, n_channels)[:, 1:]
     return [rows[:, first : first + n_groups] for first in range(0, rows.shape[1], n_groups)]

@@ -88,8 +88,8 @@ def squared_levels(
     counts : (n_parts, n_channels) int
         Number of samples.
     local : float
-        Weight w of the envelope, the mean square of a part and its two neighbours; 1 - w is that of the mean square of
-        the event.
+        Weight w of the envelope, the mean square of a part and its two neighbours; 1 - w is the weight of the event's
+        mean square.
     excited : Excited
         Events and deformations of the parts.
     reference : float or None

@@ -37,7 +37,7 @@ _CELLS = 512  # intervals of the distribution function that is inverted for draw
 
 @dataclass(frozen=True)
 class MarginalNoise:
-    """White noise without parameters: those of another noise are integrated out under their priors.
+    """White noise without parameters: the parameters of another noise are integrated out under their priors.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class MarginalNoise:
             Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
             failed.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel where samples are missing.
+            Samples per channel; `SampleCounts` where samples are missing.
         parameters : optional
             Ignored; the noise has no parameters.
 
@@ -129,14 +129,14 @@ class MarginalNoise:
         return total
 
     def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, uniform: np.ndarray) -> np.ndarray:
-        """Draws of the standard deviations from their conditional posterior, given the misfit, one per row.
+        """Draw standard deviations from their conditional posterior, given the misfit, one per row.
 
         Parameters
         ----------
         misfit : (n, n_channels) float
             As for `log_likelihood`; finite and positive.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel where samples are missing.
+            Samples per channel; `SampleCounts` where samples are missing.
         uniform : (n, n_noise) float
             Independent random numbers in [0, 1).
 
@@ -198,7 +198,8 @@ def _find(fit: np.ndarray, count: float, prior: Any) -> _Peak:
     """Peak of the integrand for every row of `fit` (n, 1)."""
     least, most = _logarithms(prior)
     middle, far = np.log(prior.ppf(np.array([0.5, 1.0 - 1e-15])))
-    # the maximum is between those of likelihood and prior; refine until the neighbours on the grid are almost as high
+    # the maximum is between the maxima of likelihood and prior; refine until the neighbours on the grid are almost as
+    # high
     low, high = np.clip(np.minimum(fit, middle - 5.0), least, most), np.clip(np.maximum(fit, far), least, most)
     for _ in range(_MAX_ITERATIONS):
         t = low + (high - low) * _GRID

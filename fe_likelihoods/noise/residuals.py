@@ -55,7 +55,7 @@ class ResidualChecks(NamedTuple):
     white : ndarray
         Probability that white noise has a lag-one correlation at least as far from zero.
     normal : ndarray
-        Probability that normal residuals have a skewness and kurtosis at least as far from those of the normal
+        Probability that normal residuals have a skewness and kurtosis at least as far from a normal
         distribution.
     n_samples : ndarray
         Number of samples that are there.
@@ -106,7 +106,7 @@ def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n
     elif whitened:
         found = [
             f"Not white: correlation {lag_one:.2f} from sample to sample is left. The errors have another correlation "
-            "than that of the noise, and intervals may be wrong: use fewer samples until this check passes, "
+            "than the noise, and intervals may be wrong: use fewer samples until this check passes, "
             "GaussianNoise with bands of frequency (groups = [1.0, 5.0] in TOML), or effective_samples=."
         ]
     else:
@@ -170,7 +170,7 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
     -------
     (n_channels, n_steps) float
         sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero. Where samples are missing, the mean product of the pairs that
-        are there takes the place of that of all pairs; zero at lags without a pair.
+        are there takes the place of the mean over all pairs; zero at lags without a pair.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
 
 
 def _lagged_products(residuals: np.ndarray) -> np.ndarray:
-    """Sums of r_t r_{t+k} divided by that of lag zero, (n_channels, n_steps)."""
+    """Sums of r_t r_{t+k} divided by the sum of lag zero, (n_channels, n_steps)."""
     n = residuals.shape[1]
     size = 2 ** (2 * n - 1).bit_length()  # zero padding, so that no lag wraps around
     spectrum = np.fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
@@ -320,7 +320,7 @@ def residual_checks(
         Measured minus simulated response at parameters that fit [SI unit of the channel]. NaN where a sample is
         missing.
     channels : sequence of Channel, optional
-        The channels, one per row: their names and display units are those of the printed table.
+        The channels, one per row: their names and display units are printed in the table.
     whitened : bool
         True if the rows are what a noise with correlation does not predict: `innovations` of `AutoregressiveNoise`, or
         the result of ``GaussianNoise.whitened``. The numbers are the same, the sentences advise otherwise.

@@ -72,11 +72,11 @@ class ShiftedNoise:
         return (*self.noise.parameter_names, *(f"time_shift_{name}" for name, _ in self.shifts))
 
     def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
-        """Standard deviation of the errors of every channel (n, n_channels), from parameters (n, n_noise)."""
+        """Standard deviations of the errors (n, n_channels), from parameters (n, n_noise)."""
         return self.noise.standard_deviations(np.asarray(parameters, dtype=float)[..., : self._n_noise])
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple[Noise, np.ndarray]:
-        """Noise of other channels, and the weights of the parameters in its own; see `fe_likelihoods.Noise`.
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`.
 
         A measured channel keeps its unknown shift, another one has none.
         """
@@ -94,18 +94,18 @@ class ShiftedNoise:
         Parameters
         ----------
         statistics : (n, n_numbers) float
-            Sums of squared residuals of all channels at a shift of zero, then those of
+            Sums of squared residuals at a shift of zero (n_channels), then
             `fe_likelihoods.signals.comparison.Lags.sums` [SI unit of the channel, squared]; NaN where the simulation
             failed.
         n_samples : int or SampleCounts
-            Number of samples of every channel, or those of each channel.
+            Samples per channel.
         parameters : (n, n_noise) float
             Parameters of the noise, then the shifts [s].
 
         Returns
         -------
         (n,) float
-            As that of the noise; -inf also where a shift is larger than the largest one.
+            As the noise; -inf also where a shift is larger than the largest one.
         """
         parameters = np.asarray(parameters, dtype=float)
         largest = np.array([shift for _, shift in self.shifts])
@@ -116,7 +116,7 @@ class ShiftedNoise:
         return np.where(possible, values, -np.inf)
 
     def misfit(self, statistics: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels) at the shifts of `parameters`, both as for `log_likelihood`."""
+        """Squared residuals summed (n, n_channels) at the shifts of `parameters`, both as for `log_likelihood`."""
         statistics, parameters = np.asarray(statistics, dtype=float), np.asarray(parameters, dtype=float)
         n_channels = len(self.channels)
         misfit = statistics[:, :n_channels].copy()

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import Channel, FELikelihood, GaussianNoise, LinearOscillator, Measurements, Record
+from fe_likelihoods import (
+    AutoregressiveNoise,
+    Channel,
+    FELikelihood,
+    GaussianNoise,
+    LinearOscillator,
+    Measurements,
+    Record,
+)
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
 
@@ -91,12 +99,6 @@ def test_scales_of_a_shared_sigma_are_the_root_mean_squares(rng):
     assert repr(shared) != repr(GaussianNoise(CHANNELS, groups="all", scales=[1.0, 1.0]))
 
 
-@pytest.mark.parametrize("scales", [[1.0], [1.0, 0.0], [1.0, -2.0], [math.nan, 1.0]])
-def test_invalid_scales_are_refused(scales):
-    with pytest.raises(ValueError, match="scale"):
-        GaussianNoise(CHANNELS, groups="all", scales=scales)
-
-
 @pytest.mark.parametrize(
     ("level", "options"), [("measured", {"window": 0.5}), ("response", {"window": 0.6, "sensor": (0.1, 0.001)})]
 )
@@ -120,20 +122,57 @@ def test_one_share_for_all_channels_is_equal_shares_per_channel(level, options, 
     assert other.parameter_names == ("share",) and weights.tolist() == [[1.0]]
 
 
+RESPONSE = {"level": "response", "window": 1.0, "sensor": (1.0, 1.0)}
+NUMBER = "must be a number, .*; got .*to_si"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        # combinations
         ({"groups": "each"}, 'groups must be "channel", "all", "event", or the frequencies'),
         ({"level": "SI"}, 'level must be "si", "measured" or "response"'),
         ({"groups": "event", "level": "measured"}, "possible are levels in SI units with all groups"),
         ({"groups": (1.0,), "level": "measured"}, "possible are levels in SI units with all groups"),
         ({"window": 1.0}, 'window= is for level="measured" or "response", without bands; got window=1.0'),
         ({"local": 0.5, "level": "measured"}, 'local= is for level="response"'),
+        (RESPONSE | {"growth": 2.0}, "growth= is for deformation=.*got growth=2.0 .*leave it out"),
         ({"scales": (1.0, 1.0)}, 'scales= is for groups="all" in SI units'),
         ({"effective_samples": (1.0, 1.0), "groups": (1.0,)}, 'effective_samples= is for groups="channel"'),
-        ({"level": "response", "sensor": (1.0, 1.0)}, 'level="response" needs window='),
+        (RESPONSE | {"window": None}, 'level="response" needs window='),
+        (RESPONSE | {"sensor": {"top": 0.1}}, "needs the noise of the sensor.*quiet part.*levels in SI units"),
+        ({"level": "response", "groups": (1.0,)}, "needs the noise of the sensor"),
+        # values
+        *(({"groups": edges}, "ascending positive") for edges in ((), (2.0, 1.0), (0.0, 1.0), (math.inf,))),
+        *(
+            ({"groups": "all", "scales": scales}, "scales must be")
+            for scales in ([1.0], [1.0, 0.0], [1.0, -2.0], [math.nan, 1.0])
+        ),
+        ({"sensor": {"bottom": 1.0}}, "unknown channels .*bottom.*the channels are top, drift"),
+        ({"sensor": [1.0]}, "one number for each of top, drift; got 1"),
+        *(({"sensor": [1.0, level]}, "zero or more") for level in (-1.0, math.nan)),
+        *(
+            ({"effective_samples": number}, "positive numbers of samples")
+            for number in ([1.0, 0.0], [1.0, math.nan], {"drift": -3.0})
+        ),
+        *((RESPONSE | {"local": local}, "local must be from 0") for local in (-0.1, 1.1)),
+        *(({"level": "measured", "window": window}, "window must be a positive") for window in (0.0, math.inf)),
+        (RESPONSE | {"deformation": 0.0}, "deformation must be positive"),
+        (RESPONSE | {"deformation": 1.0, "growth": -1.0}, "growth must be zero or more"),
+        # no numbers
+        *(({"sensor": sensor}, f"sensor {NUMBER}") for sensor in ("0.02 g", {"top": "0.02 g"}, {"top": None})),
+        ({"effective_samples": "few"}, f"effective_samples {NUMBER}"),
+        ({"groups": "all", "scales": ["1 g", "2 mm"]}, f"scales {NUMBER}"),
+        *(({"groups": groups}, f"groups {NUMBER}") for groups in (("1 Hz",), None)),
+        *(
+            (RESPONSE | {name: value}, f"{name} {NUMBER}")
+            for name, value in {"window": "1 s", "sensor": "0.02 g", "local": "half", "deformation": "1 %"}.items()
+        ),
     ],
 )
-def test_combinations_without_a_meaning_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
+def test_what_has_no_meaning_is_refused_in_words(options, message):
+    with pytest.raises(ValueError, match=f"^GaussianNoise.*{message}"):
         GaussianNoise(CHANNELS, **options)
+    if list(options) == ["sensor"]:
+        with pytest.raises(ValueError, match=f"^AutoregressiveNoise.*{message}"):
+            AutoregressiveNoise(CHANNELS, **options)

@@ -133,21 +133,6 @@ def test_effective_samples_weigh_the_channels(rng):
         )
 
 
-@pytest.mark.parametrize("kind", [GaussianNoise, AutoregressiveNoise])
-def test_invalid_sensor_noise_is_refused(kind):
-    for sensor, message in (
-        ({"bottom": 1.0}, "unknown channels .*bottom.*the channels are top, drift"),
-        ([1.0], "one number for each of top, drift; got 1"),
-        ([1.0, -1.0], "zero or more"),
-        ([1.0, math.nan], "zero or more"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            kind(CHANNELS, sensor=sensor)
-    for effective in ([1.0, 0.0], [1.0, math.nan], {"drift": -3.0}):
-        with pytest.raises(ValueError, match="positive numbers of samples"):
-            GaussianNoise(CHANNELS, effective_samples=effective)
-
-
 # in a likelihood ------------------------------------------------------------------------------------------------------
 
 

@@ -239,6 +239,7 @@ def test_shifts_that_do_not_fit_are_refused(rng):
         ((white, {"base": 0.1}), "some of the channels top, drift"),
         ((white, {}), "some of the channels top, drift"),
         ((white, {"top": 0.0}), "positive largest shifts"),
+        ((white, {"top": "0.1 s"}), "time_shifts must be a number, in s; got .*to_si"),
     ):
         with pytest.raises(ValueError, match=message):
             FELikelihood(MODEL, shifted_data(rng), noise, time_shifts=shifts)
