@@ -123,7 +123,7 @@ def _all_channels(job: Job, record: Record | None) -> tuple[Channel, ...]:
 def reduce_data(
     job: Job, record: Record | None, measured: Measurements | None
 ) -> tuple[Record | None, Measurements | None]:
-    """The first part of the data, and one sample in so many."""
+    """The first part of the data, reduced to every n-th sample."""
     duration, every = job.record.get("duration"), job.record.get("every", 1)
 
     def reduce() -> tuple[Record | None, Measurements | None]:

@@ -56,7 +56,7 @@ class Outcome(NamedTuple):
     files : tuple of str
         Names of the result files.
     cautions : tuple of str
-        What speaks against the predictions.
+        Doubts about the predictions.
     usable : bool
         Whether the samples can be used at all.
     """
@@ -199,7 +199,7 @@ def _stored_sampler(job: Job, problem: Problem, folder: Path) -> Any:
 
 @contextlib.contextmanager
 def _without_messages(name: str) -> Iterator[None]:
-    """Without the warnings of a logger: that a run continues, and that it is complete, is no news in a report."""
+    """Silence a logger's warnings: a report need not say that a run continues or is complete."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -221,7 +221,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("skip", "whole number >= 0", "lines above the table of a CSV file, if they are not found"),
         Key("scale", "number", "factor by which the record is multiplied"),
         Key("duration", "time", "length of the first part that is used"),
-        Key("every", "whole number >= 1", "keep one sample in so many: a faster simulation with a longer step"),
+        Key("every", "whole number >= 1", "keep every n-th sample: a faster simulation with a longer step"),
     ),
     "measurements": (
         Key("file", "text", "measured response: CSV, Excel, or a data set (.h5)"),

@@ -128,7 +128,7 @@ class Damage(NamedTuple):
     from_state : str
         State of the structure at the beginning, "virgin" or "end".
     uncertainty : str
-        What the probabilities contain.
+        Which uncertainties the probabilities contain.
     """
 
     events: tuple[str, ...]
@@ -405,7 +405,7 @@ def _extent(
 def _contents(
     states: Sequence[LimitState], errors: Mapping[str, EventRatios | LevelRatios], of_population: bool
 ) -> str:
-    """What the probabilities contain, in words."""
+    """Which uncertainties the probabilities contain, in words."""
     said = "the uncertainty of the parameters" + (", their spread between events" if of_population else "")
     measures = list(dict.fromkeys(state.measure for state in states))
     with_error = [name for name in measures if name in errors]

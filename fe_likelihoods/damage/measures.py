@@ -239,7 +239,7 @@ def damage_measures(
     measures : sequence of str, optional
         Names of measures: "peak drift", "residual drift", "dissipated energy", "Park-Ang index", "period", "damping",
         "stiffness ratio", "damping change", "bar tension" and "cover compression" (``docs/damage.rst``). Default: all
-        for a column; for another model all those whose channels are named.
+        for a column; for another model, all measures whose channels are named.
     displacement, force, acceleration : str
         Channels of a model that is not a column: relative displacement [m], the restoring force that does work on it
         [N], absolute acceleration of the same place [m/s²].

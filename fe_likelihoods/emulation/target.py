@@ -170,7 +170,7 @@ class ResponseTarget:
     Attributes
     ----------
     ndim, n_structural, n_noise : int
-        Numbers of coordinates: all, structural (the first ones), of the noise.
+        Numbers of coordinates: all, structural (which come first), and noise.
     n_steps : int
         Steps of the measurements.
     n_samples : int or SampleCounts
@@ -361,7 +361,7 @@ class ResponseTarget:
         statistics : (n_numbers,) float
             Of the residuals.
         start : (n_noise,) float, optional
-            Coordinates near the result, such as those for a neighbouring point. By default a grid is searched.
+            Coordinates near the result, such as the best ones at a neighbouring point. By default a grid is searched.
         """
         if not self.n_noise:
             return NoiseFit(np.zeros(0), float(self._noise_density(statistics, np.zeros((1, 0)))[0]))

@@ -44,7 +44,7 @@ _LARGEST_VARIANCE_RATIO = 0.5  # of posterior to prior: above it, a test says to
 _PRIOR_DRAWS = 5000
 _AT_BOUND = 0.02  # probability of the prior next to a bound
 _POWER = 0.8
-_SMALLEST_P = 1e-12  # below it, a probability depends on tails of which the samples say nothing
+_SMALLEST_P = 1e-12  # smaller probabilities depend on tails without samples
 
 
 class PairAgreement(NamedTuple):

@@ -144,8 +144,8 @@ class HierarchicalPosterior:
     -----
     The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), ``median_NAME`` and ``sd_logit_NAME``
     (scale "logit"), or ``mean_NAME`` and ``sd_NAME`` (scale "linear"), then ``correlation_A_B``, then the names of the
-    common parameters. With three varying parameters or more, the correlations after those with the first parameter are
-    partial: ``partial_correlation_B_C`` correlates B and C given the parameters before B.
+    common parameters. With three varying parameters or more, correlations without the first parameter are partial:
+    ``partial_correlation_B_C`` correlates B and C given the parameters before B.
 
     The likelihood is taken as zero outside the prior bounds of a test.
 
@@ -407,7 +407,7 @@ def _correlation_factor(partial: np.ndarray, n: int) -> np.ndarray:
     factor = np.tile(np.eye(n), (len(partial), 1, 1))
     if not partial.shape[1]:
         return factor
-    left = np.ones((len(partial), n))  # 1 minus the sum of the squares of a row so far
+    left = np.ones((len(partial), n))  # 1 minus the sum of squares in a row so far
     column = 0
     for j in range(n - 1):
         for i in range(j + 1, n):

@@ -160,7 +160,7 @@ class Hierarchy:
         return dict(zip(names, self.posterior.from_scale(center.mean(axis=0)).tolist(), strict=True))
 
     def population_weights(self, draws: Mapping[str, np.ndarray], n: int = 200) -> np.ndarray:
-        """Weights by which draws of a new test are draws from single populations.
+        """Weights with which draws of a new test represent single populations.
 
         The draws of `new_test` come from many populations, one per hyper-sample. With these weights they represent each
         population alone, without further simulations: differences between populations show the uncertainty of the

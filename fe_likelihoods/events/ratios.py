@@ -29,7 +29,7 @@ from ..text_tables import number, text_table
 __all__ = ["EventRatios", "LevelRatios", "RatioPopulations", "standardised"]
 
 FORMS = ("constant", "linear", "smooth")
-_LEAST_EVENTS = {"constant": 1, "linear": 4, "smooth": 10}  # for a form to be among those that are averaged
+_LEAST_EVENTS = {"constant": 1, "linear": 4, "smooth": 10}  # fewest events for a form to be averaged
 _AMPLITUDES = (0.25, 1.0, 4.0, 16.0)  # of f over its range, as multiples of s
 _LENGTHS = (0.7, 1.5, 3.0)  # of a smooth f, as multiples of the standard deviation of the log levels
 _GRID = 48  # levels at which a drawn function is known
@@ -299,8 +299,8 @@ class LevelRatios:
     Raises
     ------
     ValueError
-        As `EventRatios`; if the levels are not positive, there is not one for each ratio, or they are all equal where a
-        form is asked for that needs different ones.
+        As `EventRatios`; if the levels are not positive, there is not one for each ratio, or they are all equal
+        although `form` needs different levels.
 
     Notes
     -----

@@ -267,8 +267,8 @@ def describe(
 def resampled_description(described: DescribedPosterior, rng: np.random.Generator) -> DescribedPosterior:
     """A description of samples drawn with replacement from the described ones, to estimate statistical errors.
 
-    As many samples are drawn as there are effective ones. The points stay the same; their weights are the counts of
-    the draws, and the mixtures are fitted to the draws, starting from the given ones.
+    The number of draws is the effective sample size. The points stay the same; their weights are the counts of the
+    draws, and the mixtures are fitted to the draws, starting from the given ones.
     """
     size = max(round(described.effective_sample_size), 1)
     counts = rng.multinomial(size, np.exp(described.log_weights) / np.exp(described.log_weights).sum())

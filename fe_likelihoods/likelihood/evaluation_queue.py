@@ -186,7 +186,7 @@ class EvaluationQueue:
     def ended(self) -> list[tuple[int, float]]:
         """Tickets and log-probabilities of points that have ended, including the last collected ones, without waiting.
 
-        For the end of a run by Ctrl-C, before `close`: what is known shall be kept. Errors are left to `collect`.
+        For a run that Ctrl-C ends, before `close`, so that finished points are kept. Errors are raised by `collect`.
         """
         self._require_open()
         for part in self._parts:

@@ -143,7 +143,7 @@ class FailureLog:
 
 
 def _counted_under(reason: str, known: set[str]) -> str:
-    """The text under which a reason is counted, which is added to those known; empty if these are too many."""
+    """The text under which a reason is counted, added to `known`; empty if there are too many texts."""
     for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
         if text in known or len(known) < most:
             known.add(text)

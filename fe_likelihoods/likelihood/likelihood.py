@@ -176,7 +176,7 @@ class FELikelihood:
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of everything that is known of what the statistics depend on, see `Simulator.fingerprint`."""
+        """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""
         return self.simulator.fingerprint
 
     def __call__(self, x: Any) -> np.ndarray | float:

@@ -165,7 +165,7 @@ def _records_of(model: object) -> list[tuple[str, Record]]:
 def _with_noise_parameters(
     likelihood: FELikelihood, rows: np.ndarray, rng: np.random.Generator
 ) -> tuple["Noise", np.ndarray]:
-    """The noise whose parameters are in the returned rows: those that were integrated out are drawn."""
+    """The noise, and rows with its parameters: integrated-out parameters are drawn."""
     if not isinstance(likelihood.noise, MarginalNoise):
         return likelihood.noise, rows
     return likelihood.noise.noise, np.stack(list(likelihood.draw_noise(rows, rng).values()), axis=1)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_scores"]
 
 _LEVELS = ("weak", "moderate", "strong")
-_BAND = 0.9  # probability of the bands of chance
+_BAND = 0.9  # probability of the bands for calibrated predictions
 _BINS = 10
 _MOST_NAMES = 16  # points with names beside the last axes
 _LINE = 0.062  # height of such a name, as a share of the axes' height

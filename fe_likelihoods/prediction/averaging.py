@@ -45,7 +45,7 @@ class AveragedPrediction(NamedTuple):
     dt : float or None
         Time step of histories [s], None for other quantities.
     remarks : tuple of str
-        What speaks against the predictions, each remark once.
+        Doubts about the predictions, each remark once.
     """
 
     mean: np.ndarray

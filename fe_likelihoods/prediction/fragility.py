@@ -72,7 +72,7 @@ class Fragility(NamedTuple):
         Probabilities for posterior draws of the ratio distribution and the event population, from which intervals and
         bands are made. None if there are neither ratios nor a population.
     uncertainty : str
-        What the probabilities contain.
+        Which uncertainties the probabilities contain.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     intensity_unit : str

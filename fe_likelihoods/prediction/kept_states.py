@@ -47,8 +47,8 @@ class _Start(NamedTuple):
 class StateMemory:
     """States by the fingerprint of the model and theta, within a limit of memory.
 
-    Where the limit is reached, the states of the models that were not used for longest are dropped. States of the model
-    in use and those that it started from are never dropped for further ones: these are then not kept.
+    At the limit, the states of the least recently used models are dropped. States of the model in use, and the states
+    it started from, are never dropped: new states are then not kept.
 
     Parameters
     ----------
@@ -120,13 +120,13 @@ KEPT_STATES = StateMemory()
 def simulate_last_part(
     model: Model, first: int, thetas: np.ndarray, pool: Any = None, memory: StateMemory = KEPT_STATES
 ) -> SimulationBatch:
-    """Responses from sample `first` on, where possible without the part that an earlier call has simulated.
+    """Responses from sample `first` on; parts that earlier calls have simulated are not run again where possible.
 
     Parameters
     ----------
     model : Model
-        Under the whole excitation. States are used if its class itself defines ``simulate_from``. A method that is
-        inherited is not used, because the class may have changed what it computes. Other models run the whole.
+        Under the whole excitation. States are used if its class itself defines ``simulate_from``. An inherited method
+        is not used, because the class may have changed what it computes. Other models run the whole excitation.
     first : int
         First sample of the response that is wanted, 1 or more.
     thetas : (n, n_parameters) float
@@ -176,7 +176,7 @@ def _model_before(model: Model, first: int) -> Model | None:
 
 
 def _identity(model: Model) -> str:
-    """Fingerprint of the model, with a digest of its code if the class is one of the user."""
+    """Fingerprint of the model, with a digest of its code for a user's class."""
     cls = type(model)
     if cls.__module__.split(".")[0] == LIBRARY:
         return model.fingerprint
@@ -184,7 +184,7 @@ def _identity(model: Model) -> str:
 
 
 def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> list[_Start]:
-    """For every theta, the state after the longest first part of the excitation for which one is kept."""
+    """For every theta, the latest kept state within the excitation."""
     starts = [_Start(0, None)] * len(thetas)
     for n_steps in memory.lengths() if len(thetas) else []:
         if 2 <= n_steps < model.n_steps and any(start.state is None for start in starts):
@@ -200,7 +200,7 @@ def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> lis
 def _run(
     model: Model, thetas: np.ndarray, starts: list[_Start], pool: Any, responses: bool
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
-    """Response (if `responses` are wanted), state at the end and reason of the failure of each simulation."""
+    """For each simulation: response (if `responses` are wanted), state at the end, and reason if it failed."""
     items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
     before = items_of({"class": type(model)})
     if pool is not None:

@@ -21,7 +21,7 @@ __all__ = ["predict_channels_of"]
 def predict_channels_of(
     model: Model, source: PredictionSource, samples: Any, noise: bool | str
 ) -> tuple[PredictionSource, Any, str]:
-    """Return what predicts the channels of another model with the samples of a posterior.
+    """Return source and samples with which a posterior predicts the channels of another model.
 
     Parameters
     ----------

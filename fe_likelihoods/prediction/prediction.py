@@ -81,7 +81,7 @@ class Prediction:
         Uncertainty of ratios and event population, for the intervals of `fe_likelihoods.exceedance`; None unless a new
         event is predicted (`fe_likelihoods.predict_new_event`).
     remarks : tuple of str
-        What speaks against the prediction, as `fe_likelihoods.propagate` has warned.
+        Doubts about the prediction: the warnings of `fe_likelihoods.propagate`.
     """
 
     mean: np.ndarray

@@ -70,7 +70,7 @@ class Exceedance(NamedTuple):
     effective_sample_size : float
         Effective number of independent samples.
     uncertainty : str
-        What the probability contains.
+        Which uncertainties the probability contains.
     upper_by_events : ndarray or None
         With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
         averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
@@ -308,7 +308,7 @@ def interval_of_draws(
 
 
 def contents(has_noise: bool, spread: EventSpread) -> str:
-    """What a probability contains, in words."""
+    """Which uncertainties a probability contains, in words."""
     found = ["the uncertainty of the parameters"]
     if spread.weights is not None:
         found.append("their spread between events")

@@ -52,7 +52,7 @@ _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the re
 _WORSE = 1.1  # RRMSE of the response divided by the RRMSE of its best multiple, beyond which this is said
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
-# what the residuals of likelihoods say, and the likelihoods of which a warning has said it
+# remarks on the residuals of each likelihood, and the likelihoods for which a warning was given
 _FOUND: weakref.WeakKeyDictionary[Any, tuple[str, ...]] = weakref.WeakKeyDictionary()
 _WARNED: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -99,7 +99,7 @@ def _names(measured: Measurements) -> list[str]:
 
 
 def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calibrated, alone: bool) -> str:
-    """What to say where a channel's median peak is beyond its calibration peaks by a factor of two.
+    """Remark if a channel's median peak is beyond its calibration peaks by a factor of two.
 
     An empty text otherwise. `alone` is whether the parameters belong to one likelihood, not to a population.
     """
@@ -127,10 +127,10 @@ def remark_on_peaks(peaks: Peaks, channels: Sequence[Channel], calibrated: Calib
 
 
 def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: PredictionSource) -> str:
-    """What to say if noise in SI units was calibrated with a much stronger or weaker response than the predicted one.
+    """Remark if noise in SI units was calibrated with a much stronger or weaker response than predicted.
 
-    An empty text otherwise. Compared are the root mean squares of histories; where only numbers are predicted, the
-    peaks of their channels, without noise.
+    An empty text otherwise. It compares root mean squares of histories or, where only numbers are predicted, channel
+    peaks without noise.
     """
     if follows_response(source.noise):
         return ""
@@ -161,7 +161,7 @@ def remark_on_level(predictions: Iterable[Prediction], peaks: Peaks, source: Pre
 
 
 def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, source: PredictionSource) -> str:
-    """What to say where peaks with white model errors are much larger than the response peaks.
+    """Remark if peaks with white model errors are much larger than the response peaks.
 
     An empty text otherwise, and for a noise with a spectrum, or in SI units, which may be sensor noise.
     """
@@ -182,8 +182,8 @@ def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, sourc
         return ""
     return (
         f"the predicted peaks with noise=True are larger than the response peaks: {', '.join(added.values())}. The "
-        "noise is drawn independently at each sample, and the largest of many draws adds to the peak: those of the "
-        "noise of the sensors are in measured peaks too, while errors of a model change as slowly as the response. "
+        "noise is drawn independently at each sample, and the largest of many draws adds to the peak. Sensor noise "
+        "adds to measured peaks as well, but model errors change as slowly as the response. "
         'Predict peaks of the structure with noise="model" (docs/predictions.rst)'
     )
 
@@ -230,7 +230,7 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
 
 
 def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> tuple[str, ...]:
-    """What to say if the residuals of a likelihood contradict the noise with which it was sampled.
+    """Remarks if the residuals of a likelihood contradict the noise with which it was sampled.
 
     Samples that do not fit, such as draws of the prior, are not judged. The latest result for a likelihood is kept, so
     that predictions under other excitations need no simulation for it.
@@ -248,7 +248,7 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     Returns
     -------
     tuple of str
-        Empty if there is nothing to say.
+        Remarks; empty if there are none.
     """
     likelihood = source.likelihood
     n_structural = len(source.model.parameter_names)
@@ -287,7 +287,7 @@ def is_first_warning(likelihood: Any) -> bool:
 
 
 def _too_large(noise: Any, channels: Sequence[Channel], residuals: np.ndarray, simulated: np.ndarray) -> str:
-    """What to say where a fraction of the simulated response (n_channels, n_steps) fits much better; empty if not.
+    """Remark if a fraction of the simulated response (n_channels, n_steps) fits much better; empty if not.
 
     Only for a noise in shares of the simulated response: with other noises the response that fits best is also the most
     probable one.

@@ -175,7 +175,7 @@ class Prior:
         return x
 
     def from_normal(self, z: np.ndarray) -> np.ndarray:
-        """Map from independent standard normal variables to the parameters, by which the prior is standard normal.
+        """Map independent standard normal variables to parameters that have this prior.
 
         Parameters
         ----------
@@ -305,5 +305,5 @@ def _scores(u: np.ndarray) -> np.ndarray:
 
     if not ((u >= 0.0) & (u <= 1.0)).all():
         raise ValueError(f"quantiles are defined for probabilities in [0, 1]; got values from {u.min()} to {u.max()}")
-    # a score of infinity has no place in a sum of correlated ones
+    # infinite scores would give NaN in a sum of correlated scores
     return ndtri(np.clip(u, 1e-300, 1.0 - 1e-16))

@@ -184,7 +184,7 @@ def _are_among(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _was_here(run: FinishedRun, likelihood: FELikelihood, source: _Source) -> bool:
-    """Whether the samples of the run were simulated in this process: half of them are enough, a cache forgets."""
+    """Whether this process simulated the samples: half of them suffice, since a cache drops old simulations."""
     distinct = np.unique(run.samples[:, source.columns], axis=0)
     return likelihood.simulations >= len(distinct) or _are_among(distinct, source.succeeded).mean() >= 0.5
 

@@ -127,7 +127,7 @@ def fit_data_sets(run: FinishedRun) -> Fits:
 
 
 def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
-    """The point that stands for the state of knowledge before the update (ndim,), and what it is."""
+    """The point (ndim,) that represents the knowledge before the update, and its name."""
     fast = set(run.posterior.fast_parameters)
     nominal = np.array([parameter.nominal for parameter in run.parameters])
     structural = [i for i in range(len(nominal)) if i not in fast]

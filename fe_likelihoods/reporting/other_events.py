@@ -75,7 +75,7 @@ class OtherEvent(NamedTuple):
     sentence : str
         How it was predicted, and how the measurements compare with it.
     remarks : tuple of str
-        What speaks against it: warnings, failed samples, scores that could not be computed.
+        Doubts about the prediction: warnings, failed samples, scores that could not be computed.
     """
 
     name: str
@@ -170,7 +170,7 @@ def describe_event(
 
 
 def _scores(prediction: Prediction, measured: Measurements) -> tuple[HistoryScores | QuantityScores | None, list[str]]:
-    """Scores, None where they cannot be computed, and what is to be said about them."""
+    """Scores (None where they cannot be computed), and remarks on them."""
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
