@@ -2,9 +2,9 @@ from . import problems
 from .adapters import nautilus_prior, serve, to_bilby, to_pints, to_pymc
 from .cache.simulation_cache import SimulationCache
 from .cache.verification import StaleCache
-from .damage.damage import Damage, LimitState, damage, limit_states
-from .damage.measures import DamageMeasures, damage_measures, damage_outputs
-from .damage.park_ang import ParkAng, park_ang_constants
+from .column_damage.damage import Damage, LimitState, damage, limit_states
+from .column_damage.measures import DamageMeasures, damage_measures, damage_outputs
+from .column_damage.park_ang import ParkAng, park_ang_constants
 from .data.make_isolated_bridge import table_motion
 from .emulation.emulator import ResponseEmulator
 from .emulation.guide import ResponseGuide

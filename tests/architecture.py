@@ -42,7 +42,7 @@ ORDER = {
         ("reporting",),
         ("problems",),
         ("adapters",),
-        ("damage",),
+        ("column_damage",),
         ("prediction",),
         ("events", "models"),
         ("likelihood",),

@@ -1,6 +1,7 @@
 """An import brings no more along than it needs, and every name is there as if it did."""
 
 import ast
+import inspect
 import json
 import os
 import subprocess
@@ -80,3 +81,12 @@ def test_what_a_module_misses_itself_is_named(name):
         f"try:\n    samplers.{name}\nexcept ModuleNotFoundError as error:\n    print(error.name)"
     )
     assert fresh(code).strip() == "emcee"
+
+
+def test_no_folder_or_module_has_the_name_of_a_public_function():
+    """Such a name would be the function or the module, whichever was imported last."""
+    for package in (fe_likelihoods, samplers):
+        folder = Path(package.__file__).parent
+        names = {path.stem for path in folder.iterdir() if path.suffix == ".py" or path.is_dir()}
+        shared = names & set(package.__all__)
+        assert all(inspect.ismodule(getattr(package, name)) for name in shared), shared
