@@ -1,10 +1,10 @@
 """Simulations of a run: how many there were, and whether more fit into a limit.
 
 An evaluation needs a simulation unless only fast parameters differ from an evaluated point. The points are in the
-record of the run (`samplers.record`), and the simulations that a guide made by itself are added.
+record of the run (`samplers.record`); simulations that a guide makes by itself are counted in addition.
 
-A limit never changes what a run does: the limit only ends the run. So a run that is continued with a larger limit
-repeats the same steps from the record, which costs no simulation, and goes on.
+A limit only ends a run, and changes nothing before its end. So a run that is continued with a larger limit repeats the
+same steps from the record, which costs no simulation, and goes on.
 """
 
 from numbers import Real
@@ -95,7 +95,7 @@ class Budget:
         self._running.clear()
 
     def note(self) -> None:
-        """Note in the record how many simulations guides have made, with the batch that was allowed last."""
+        """Note in the record how many simulations guides have made, including the last allowed batch."""
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))
 
     def begin(self, guide: CountsSimulations) -> None:
@@ -120,9 +120,9 @@ class Budget:
         return np.inf if self.limit is None else max(self.limit - self.simulations, 0.0)
 
     def fits(self, simulations: float) -> bool:
-        """Whether that many more simulations of the guide fit; `refused` notes a refusal.
+        """Whether this number of further simulations by the guide fits; `refused` notes a refusal.
 
-        Simulations that the guide makes again from the record cost nothing, and always fit.
+        Simulations that the guide repeats from the record cost nothing, and always fit.
         """
         fit = self.of_guides + simulations <= self._of_record + ROUNDING or simulations <= self.remaining + ROUNDING
         self.refused = self.refused or not fit
@@ -136,11 +136,11 @@ class Budget:
         self._running.update(self._record.keys(coords))
 
     def closed(self) -> None:
-        """Points that were running, and are not in the record, have been given up."""
+        """Points that were running and are not in the record have been given up."""
         self._running.clear()
 
     def fitting(self, coords: np.ndarray) -> int:
-        """How many of the first points (n, ndim) fit."""
+        """Number of leading points among (n, ndim) that fit."""
         if self.limit is None:
             return len(coords)
         remaining, new = self.remaining, set()

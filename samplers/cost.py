@@ -1,13 +1,13 @@
 r"""Estimate of the evaluations and the wall time of a run, from a few timed evaluations.
 
-The number of evaluations is a range from a model of the tempering stages. From a stage to the next, beta grows by a
-factor g. A Gaussian posterior in d dimensions keeps a share :math:`(\sqrt{2 g - 1} / g)^d` of the effective sample
-size. Annealing by moves keeps a stated share of the walkers, which gives g. The growth of recycling was measured on
-Gaussian posteriors: :math:`\ln g = \min(1.7, 2.9 d^{-0.55})`. The number of stages is the logarithm of one over the
-first beta divided by the logarithm of g; the first beta is inversely proportional to the spread of the log-likelihood
-over the prior. The constants are means over ``python -m benchmarks expected``.
+A model of the tempering stages gives a range for the number of evaluations. From one stage to the next, beta grows by a
+factor g. For a Gaussian posterior in d dimensions, the share :math:`(\sqrt{2 g - 1} / g)^d` of the effective sample
+size is kept. Annealing by moves keeps a given share of the walkers, which determines g. The growth of recycling was
+measured on Gaussian posteriors: :math:`\ln g = \min(1.7, 2.9 d^{-0.55})`. The number of stages is
+:math:`-\ln \beta_1 / \ln g`; the first exponent :math:`\beta_1` is inversely proportional to the spread of the
+log-likelihood over the prior. The constants are means over ``python -m benchmarks expected``.
 
-The wall time is the number of evaluations times their mean duration, divided by the number of workers.
+The wall time is the number of evaluations times the mean duration, divided by the number of workers.
 """
 
 import time
@@ -32,7 +32,7 @@ MORE_SWEEPS = 2.2
 
 
 class Expected(NamedTuple):
-    """A range and a likely value, of numbers of evaluations or of times [s]."""
+    """A range and a likely value, for numbers of evaluations or times [s]."""
 
     low: float
     likely: float
@@ -71,7 +71,7 @@ class CostEstimate(NamedTuple):
     wall_time: Expected
 
     def time_of(self, evaluations: int) -> str:
-        """Wall time of a number of evaluations, as text."""
+        """Wall time for a number of evaluations, as text."""
         seconds = evaluations * float(self.seconds.mean()) / self.workers
         return as_duration(seconds, seconds)
 
@@ -96,7 +96,7 @@ class CostEstimate(NamedTuple):
 
 
 def as_duration(low: float, high: float) -> str:
-    """Two durations [s] as text, in a unit that suits the larger one: "about 2.1 to 3.4 h"."""
+    """Two durations [s] as text, in a unit that suits the larger duration: "about 2.1 to 3.4 h"."""
     size, unit = next(
         ((s, u) for s, u in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")) if high >= 2.0 * s), (1.0, "s")
     )
@@ -123,7 +123,7 @@ def estimate_cost(
     Parameters
     ----------
     posterior : callable
-        Log-posterior of a point (ndim,), with ``ndim``, ``log_prior`` and ``sample_prior``. Where it has a method
+        Log-posterior of a point (ndim,), with ``ndim``, ``log_prior`` and ``sample_prior``. If it has a method
         ``evaluation_queue``, the points are sent to its pool.
     nwalkers : int
         Number of walkers.
@@ -132,7 +132,7 @@ def estimate_cost(
     workers : int, optional
         Number of simultaneous evaluations in the run. Default: the workers of the posterior's pool, or 1.
     runs : int
-        Number of timed evaluations, at least 2. They are made in groups of the size of the posterior's pool.
+        Number of timed evaluations, at least 2. They are made in groups as large as the posterior's pool.
     seed : int, optional
         Seed of the run. By default the draws differ from call to call.
     **settings
@@ -141,7 +141,7 @@ def estimate_cost(
     Raises
     ------
     ValueError
-        For impossible arguments, or where fewer than two of the evaluations have a finite log-probability.
+        For impossible arguments, or if fewer than two evaluations have a finite log-probability.
 
     Examples
     --------

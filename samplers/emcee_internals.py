@@ -1,4 +1,4 @@
-"""The parts of emcee that are not its public interface: private attributes of a sampler, and the HDF5 schema.
+"""Parts of emcee outside its public interface: private attributes of a sampler, and the HDF5 schema.
 
 They are used in this module only, and pinned by `tests.contract.test_emcee_contract`, which says what to change if a
 later version of emcee (``emcee>=3.1.4,<4``) differs.
@@ -64,7 +64,7 @@ def cut_chain(backend: Backend, steps: int) -> None:
 
 
 def trim_chain(backend: Backend) -> None:
-    """Drop the room for steps that were not made, which emcee's backend in memory cannot grow from."""
+    """Drop the space allocated for steps that were not made, from which emcee's backend in memory cannot grow."""
     if not isinstance(backend, HDFBackend):
         for name in ("chain", "log_prob", "blobs"):
             values = vars(backend)[name]
@@ -73,7 +73,7 @@ def trim_chain(backend: Backend) -> None:
 
 
 def restore_counts(backend: Backend, steps: int, accepted: np.ndarray) -> None:
-    """Set the number of steps of a chain and the counts of accepted proposals (nwalkers,), if they differ."""
+    """Set a chain's number of steps and its counts of accepted proposals (nwalkers,), if they differ."""
     if backend.iteration == steps and np.array_equal(backend.accepted, accepted):
         return
     if isinstance(backend, HDFBackend):

@@ -10,7 +10,7 @@ __all__ = ["deferred_interrupts"]
 
 @contextlib.contextmanager
 def deferred_interrupts() -> Iterator[None]:
-    """Context in which Ctrl-C waits for the end, so that a file and the memory of this process agree."""
+    """Context in which Ctrl-C takes effect at the end, so that a file and the memory of this process agree."""
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
         yield

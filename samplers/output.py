@@ -1,8 +1,8 @@
-"""What is stored with a chain: the run that it belongs to, the ladder, the check of the evidence, the verdict.
+"""Data stored with a chain: the run that it belongs to, the ladder, the check of the evidence, the verdict.
 
 The chain itself is written by emcee's own backend. In an HDF5 file, the group of the chain has the attribute ``run``,
-the dataset ``tempering`` (JSON), and the group ``restart``, the state from which a chain goes on that was reset. In
-memory, these are attributes of the backend.
+the dataset ``tempering`` (JSON), and the group ``restart``, the state from which a reset chain goes on. In memory,
+these are attributes of the backend.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
 class Output:
-    """What is stored with the chain of a backend.
+    """Data stored with the chain of a backend.
 
     Parameters
     ----------
@@ -63,31 +63,31 @@ class Output:
         stored = _read(backend)
         self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
-        # a kill may have come when the provisional step was removed, and the note of it was not
+        # the process may have been killed after the provisional step was removed, and before its note was
         self.provisional = stored.get("provisional", False) and int(backend.iteration) > self.first_step
 
     def begin(self, run: str) -> None:
-        """A new annealing begins: nothing is known of it."""
+        """A new annealing begins, without results."""
         self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
         self._write(run)
         self.step_stored()
 
     def step_stored(self) -> None:
-        """Note in the record what the chain ends with, since a process that is killed may store half of a step."""
+        """Note in the record how the chain ends, since a killed process may have stored half a step."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
         if isinstance(self._backend, HDFBackend):
             *self._summed, rest = _checksums(self._backend, *self._summed)
             self._record.note(STORED, np.array([self._summed[1], rest]))
 
     def undo_half_a_step(self) -> None:
-        """Leave no step that was not stored as a whole, after an error or Ctrl-C in the middle of it."""
+        """Remove a step that an error or Ctrl-C has left incomplete."""
         try:
             restore_counts(self._backend, *self._counts)
         except Exception as error:  # the error that has ended the step is raised
             logger.warning("the chain may end with half of a step (%s)", error)
 
     def write(self, result: AnnealingResult, verdict: Verdict | None) -> None:
-        """Store a result. Where the file cannot be written, the log says so, and the next call stores it."""
+        """Store a result. If the file cannot be written, a warning is logged, and the next call stores the result."""
         self.result, self.verdict = result, verdict
         try:
             self._write()
@@ -180,7 +180,7 @@ def stored_result(backend: Backend) -> tuple[AnnealingResult, Verdict | None]:
     Returns
     -------
     AnnealingResult
-        Empty if the annealing has not ended, or the chain is of another sampler.
+        Empty if the annealing has not ended, or the chain belongs to another kind of sampler.
     Verdict or None
     """
     return _parsed(_read(backend))
@@ -205,9 +205,9 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
 
 
 def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:
-    """Number of steps of a chain, CRC-32 of all of them, and CRC-32 of counts, state to go on from and random state.
+    """Number of steps in a chain, CRC-32 of all steps, and CRC-32 of counts, restart state and random state.
 
-    The second one is computed from the `checksum` of the first `known` steps.
+    The checksum of all steps is computed from the `checksum` of the first `known` steps.
     """
     with backend.open() as file:
         group = file[backend.name]
@@ -232,7 +232,7 @@ def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[
 
 
 def is_whole(backend: HDFBackend, record: Record) -> bool:
-    """Whether a chain has the steps that were stored, each as a whole, or is empty and has never had a step."""
+    """Whether a chain has all stored steps, each complete, or is empty and has never had a step."""
     try:
         with backend.open() as file:
             group = file[backend.name]
@@ -252,8 +252,8 @@ def run_of_file(backend: HDFBackend) -> str | None:
     Returns
     -------
     str or None
-        "damaged" for a chain that cannot be read as a whole, the empty string for a chain without a run, None if there
-        is no file or an empty one, or no chain of this name in it.
+        "damaged" for a chain that cannot be read completely, the empty string for a chain without a run, None if there
+        is no file, the file is empty, or it has no chain with this name.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
@@ -274,7 +274,7 @@ def run_of_file(backend: HDFBackend) -> str | None:
 
 
 def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
-    """Copy what can be read of a group and is not in a new one, but nothing of the group `ours`."""
+    """Copy the readable objects of a group that a new group lacks, except the group `ours`."""
     if present.name.strip("/") == ours.strip("/"):
         return
     for name, value in present.attrs.items():
@@ -288,14 +288,14 @@ def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
 
 
 def _read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
-    """Read an object of a file as a whole."""
+    """Read a complete object of a file."""
     dict(node.attrs)
     if isinstance(node, h5py.Dataset):
         node[...]
 
 
 def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
-    """Make the file of a backend, with an empty chain of a run, in one piece; other groups that can be read stay."""
+    """Make the file of a backend, with an empty chain, in one step; other readable groups are kept."""
     path = Path(backend.filename).resolve()
     new = path.with_name(f"{path.name}.new")
     new.unlink(missing_ok=True)

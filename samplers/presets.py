@@ -12,10 +12,10 @@ literal
 The scale of their random walk is not given; 2.38 / sqrt(ndim) is used.
 
 `CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1, multinomial leaders, one Metropolis step per point,
-covariance 0.04 times the weighted one (Ching & Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can collapse
-on sharp posteriors; the default of `TMCMCSampler` does not.
+covariance 0.04 times the weighted covariance (Ching & Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can
+collapse on sharp posteriors; the default of `TMCMCSampler` does not.
 
-None of them makes sweeps over fast parameters, which are not in the papers.
+None of these settings makes sweeps over fast parameters, which are not in the papers.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
-"""The record of a run: what the user's function returned, in one file that is only appended to.
+"""The record of a run: all values of the user's function, in one file that is only appended to.
 
-A run is a deterministic function of its start, its settings and these values. A run that was killed is therefore made
-again from its start: every point that the record contains is looked up, and nothing is evaluated twice. Counts,
-failures and the limit of simulations are computed from the record.
+A run is a deterministic function of its start, its settings and these values. A killed run is therefore repeated from
+its start: every point in the record is looked up, and nothing is evaluated twice. Counts, failures and the limit of
+simulations are computed from the record.
 
 The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's format. There are three kinds:
 
@@ -11,7 +11,7 @@ The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's fo
 ``EVAL``
     Points that were evaluated, with their log-probabilities, blobs and reasons of failure.
 ``MEMO``
-    Arrays under a key: what a guide computed, or in which order points of an asynchronous run arrived.
+    Arrays under a key: results of a guide, or the order in which points of an asynchronous run arrived.
 
 A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, the record is kept
 in memory only.
@@ -48,7 +48,7 @@ __all__ = ["EvaluatedBatch", "Record", "RunStart", "free_name", "merge_batches"]
 logger = logging.getLogger(__name__)
 
 MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, checksums of the content and of both
-# a record in memory keeps the latest points of a long chain only: those that a repeated step or the verdict need
+# a record in memory keeps only the latest points of a long chain, which a repeated step or the verdict needs
 KEPT_IN_MEMORY = 20_000
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
 
@@ -94,7 +94,7 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
 
 
 class RunStart(NamedTuple):
-    """What an annealing begins with.
+    """Start of an annealing.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class RunStart(NamedTuple):
 
 
 class Record:
-    """What a run has evaluated and remembered.
+    """Evaluations and remembered arrays of a run.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Record:
     count : int
         Number of evaluated points.
     failed : list of (point, reason)
-        Failed evaluations, the first ones first.
+        Failed evaluations, in the order of evaluation.
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):
@@ -157,7 +157,7 @@ class Record:
     # ------------------------------------------------------------------ evaluations
 
     def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
-        """Consecutive parts of points (n, ndim), each with its evaluations, or None where they are not known."""
+        """Consecutive parts of points (n, ndim), each with its evaluations, or None if they are not known."""
         found = [self._place.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
         batch = [None if number is None else bisect_right(self._first, number) - 1 for number in found]
         parts = []
@@ -170,7 +170,7 @@ class Record:
         return parts
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
-        """Enter evaluated points; they are in the file when this returns. ValueError for blobs that it cannot hold."""
+        """Enter evaluated points; they are in the file on return. ValueError for blobs that a file cannot hold."""
         if self.path is not None and batch.blobs is not None:
             _check_blobs(batch.blobs.dtype)
         blobs = [] if batch.blobs is None else [batch.blobs]
@@ -208,7 +208,7 @@ class Record:
         return merge_batches(self._batches[first:]) if self._batches else None
 
     def best_and_first(self) -> EvaluatedBatch | None:
-        """One or two evaluated points that did not fail, by which the function is compared; None without any."""
+        """One or two evaluated points that did not fail, to compare the function at; None without any."""
         points = merge_batches(self._batches) if self._batches else None
         finite = np.flatnonzero(np.isfinite(points.log_prob)) if points is not None else ()
         if len(finite) == 0:
@@ -217,7 +217,7 @@ class Record:
         return points.rows(sorted({int(finite[0]), best}))
 
     def drop_old_points(self) -> None:
-        """Forget old points of a record in memory, which no repeated step can ask for."""
+        """Forget old points of a record in memory that no repeated step can need."""
         while self._file is None and self.count - self._dropped > 2 * KEPT_IN_MEMORY and len(self._batches) > 1:
             batch = self._batches.pop(0)
             self._dropped = self._first.pop(0) + len(batch.coords)
@@ -227,7 +227,7 @@ class Record:
     # ------------------------------------------------------------------ arrays under a key
 
     def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Arrays that ``compute()`` returns, or those that it returned when the run was made before.
+        """Arrays that ``compute()`` returns, or the arrays that it returned when the run was made before.
 
         For equal keys, the arrays that were stored first are returned first.
         """
@@ -241,7 +241,7 @@ class Record:
         return known[self.used[key] - 1]
 
     def note(self, key: str, array: np.ndarray) -> None:
-        """Store an array of which only the last one of a key counts (`noted`)."""
+        """Store an array under a key; only the last array counts (`noted`)."""
         with deferred_interrupts():
             self._write(b"MEMO", [_text(key), array])
             self._arrays[key] = [[array]]
@@ -251,13 +251,13 @@ class Record:
         return self._arrays[key][-1][0] if key in self._arrays else None
 
     def rewind(self) -> None:
-        """The run is made again from its start: `remember` returns the stored arrays from the first one on."""
+        """The run is repeated from its start: `remember` returns the stored arrays, beginning with the first."""
         self.used.clear()
 
     # ------------------------------------------------------------------ the file
 
     def begin(self, start: RunStart) -> None:
-        """Enter the start of an annealing, with which the record of a new run begins."""
+        """Enter the start of an annealing, which begins the record of a new run."""
         start = start._replace(header=json.loads(json.dumps(start.header)))
         kind, keys, *rest = start.random_state
         arrays = [_text([start.header, kind, *rest]), start.coords, keys]
@@ -289,7 +289,7 @@ class Record:
                     self._whole = len(MAGIC)
                 file.truncate(self._whole)
                 file.seek(self._whole)
-            except BaseException:  # a file that is open is one whose state is known
+            except BaseException:  # the state of an open file is known
                 file.close()
                 raise
             self._file, _open_records[self.path] = file, self
@@ -327,7 +327,7 @@ class Record:
             written = 0
             while written < len(data):
                 written += self._file.write(data[written:])
-        except OSError as error:  # a block that is not whole would hide those after it
+        except OSError as error:  # an incomplete block would hide the blocks after it
             self._file.truncate(start)
             self._file.seek(start)
             raise OSError(
@@ -405,7 +405,7 @@ def _check_blobs(dtype: np.dtype) -> None:
 
 
 def _close_in_child() -> None:
-    """Close the files of a process in one that was forked from it, which would keep their locks after its end."""
+    """Close the parent's files in a forked process, which would otherwise keep their locks after the parent's end."""
     for record in list(_open_records.values()):
         record.close()
 

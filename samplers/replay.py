@@ -1,8 +1,8 @@
-"""How a run is made again from its record: the files of a run, and whether they belong to the sampler.
+"""Repeating a run from its record: the files of a run, and whether they belong to the sampler.
 
-Durable are the record of evaluations (`samplers.record`) and emcee's own HDF5 file. Where a sampler is made for the
-file of a run, the annealing is made again from the record without an evaluation, and the chain goes on from its last
-stored step, as in emcee. A chain that is damaged or missing is made again as well.
+The record of evaluations (`samplers.record`) and emcee's HDF5 file are kept on disk. If a sampler is made with the file
+of a run, the annealing is repeated from the record without an evaluation, and the chain goes on from its last stored
+step, as in emcee. A damaged or missing chain is repeated as well.
 """
 
 import logging
@@ -34,7 +34,7 @@ NOT_COMPARED = ("run", "seed", "of_earlier_guides", "log_prior")
 
 
 def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
-    """The record of the run in the file of a backend, and its HDF5 file where that is missing or damaged.
+    """The record of the run in a backend's file; the HDF5 file is made if it is missing or damaged.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         if stored == DAMAGED:
             raise ValueError(f"{backend.filename} is damaged, and has no record {record.path}: move it away")
         if stored is None:
-            make_group(backend, nwalkers, ndim, "")  # in one piece, which emcee does not
+            make_group(backend, nwalkers, ndim, "")  # in one step, unlike emcee
         return record
     run, shape = record.start.header["run"], record.start.coords.shape
     if stored in (run, None, DAMAGED) and shape != (nwalkers, ndim):
@@ -98,7 +98,7 @@ def describe_run(
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """What a run is started with, as plain data.
+    """The start of a run, as plain data.
 
     Parameters
     ----------
@@ -132,15 +132,15 @@ def _plain(value: Any) -> Any:
 
 
 def differences(stored: dict, ours: dict) -> list[str]:
-    """What differs between the headers of two runs, as text."""
-    if stored["sampler"] != ours["sampler"]:  # most of their settings differ as well
+    """Differences between the headers of two runs, as text."""
+    if stored["sampler"] != ours["sampler"]:  # most settings then differ as well
         return [f"it was written by {stored['sampler']}, and this is a {ours['sampler']}"]
     names = [name for name in ours if name not in NOT_COMPARED and stored.get(name) != ours[name]]
     return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in names]
 
 
 def points_to_compare(record: Record, last: State | None) -> EvaluatedBatch | None:
-    """One or two points by which a log-density without a fingerprint is compared with a stored run; None without any.
+    """One or two points at which a log-density without a fingerprint is compared with a stored run; None without any.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def points_to_compare(record: Record, last: State | None) -> EvaluatedBatch | No
 
 
 def compare(known: EvaluatedBatch, compute: Callable[[np.ndarray], EvaluatedBatch]) -> list[str]:
-    """How a log-density differs from what it was at known points, as text; empty if it does not."""
+    """Difference between a log-density and its earlier values at known points, as text; empty if there is none."""
     found = compute(known.coords)
     if (known.blobs is None) != (found.blobs is None):
         return [

@@ -1,4 +1,4 @@
-"""What an annealing reports while it runs, and the result that its reports add up to.
+"""Reports of an annealing while it runs, and the result that they add up to.
 
 `samplers.tempering.anneal.anneal` yields reports. `samplers.tempering.recording.Recording` collects them in an
 `AnnealingResult`, and `samplers.judgement` judges this result.
@@ -68,15 +68,15 @@ class Stage(NamedTuple):
     effective_sample_size : float
         Effective sample size of the incremental weights that led to this stage.
     acceptance : float
-        Share of the proposals of this stage that were accepted.
+        Share of accepted proposals in this stage.
     moves : int
         Sweeps of the whole ensemble made at this beta, without sweeps over fast parameters; 0 for recycling.
     distinct_ancestors : int
-        Number of different points that survived the resampling.
+        Number of distinct points that survived the resampling.
     log_evidence_increment : float
         Logarithm of the mean incremental weight.
     log_evidence_error : float
-        Standard error of the sum of the increments so far.
+        Standard error of the summed increments so far.
     evaluations : int
         Points for which ``log_prob_fn`` was called in this stage (the first stage includes the draws of the prior).
         Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
@@ -101,7 +101,7 @@ class Sweep(NamedTuple):
     Attributes
     ----------
     acceptance : float
-        Share of the proposals that were accepted; with recycling, the efficiency of the latest draws.
+        Share of accepted proposals; with recycling, the efficiency of the latest draws.
     """
 
     acceptance: float
@@ -113,7 +113,7 @@ class Restart(NamedTuple):
     Attributes
     ----------
     reason : str
-        Why their result is not reliable.
+        Why the result of these stages is not reliable.
     """
 
     reason: str
@@ -125,13 +125,13 @@ class GuideTick(NamedTuple):
     Attributes
     ----------
     phase : str
-        What the guide does: "search", "round 3", or "after round 3" while it learns.
+        Activity of the guide: "search", "round 3", or "after round 3" while it learns.
     simulations : float
         Simulations so far.
     target : int
-        Effective sample size wanted of all rounds; the population has the present one.
+        Wanted effective sample size of all rounds; the population has the present effective sample size.
     finished : bool
-        Whether a batch is finished; False where a phase begins.
+        Whether a batch is finished; False when a phase begins.
     """
 
     phase: str
@@ -141,16 +141,16 @@ class GuideTick(NamedTuple):
 
 
 class GuidedRound(NamedTuple):
-    """A round of draws of a guide.
+    """A round of draws from a guide.
 
     Attributes
     ----------
     draws : int
         Number of draws.
     effective_share : float
-        Effective sample size of their weights divided by their number.
+        Effective sample size of the draws divided by their number.
     pareto_shape : float
-        Pareto shape of their largest weights; inf for too few weights.
+        Pareto shape of the largest weights; inf for too few weights.
     log_evidence, log_evidence_error : float
         Log-evidence of all rounds so far, and its standard error.
     effective_sample_size : float
@@ -166,15 +166,15 @@ class GuidedRound(NamedTuple):
 
 
 class GuidedStart(NamedTuple):
-    """Result of the rounds of a guide.
+    """Result of a guide's rounds.
 
     Attributes
     ----------
     reason : str
-        Why the draws of the guide are not used as draws of the posterior; empty if they are.
+        Why the guide's draws are not used as posterior draws; empty if they are.
     shortfall : str
-        What the rounds did not reach although their draws are used, or that the tails of the guide are too light; empty
-        for neither.
+        What the rounds did not reach although their draws are used, or that the guide's tails are too light; else
+        empty.
     pareto_shape : float
         Pareto shape of the largest weights of all rounds.
     """
@@ -185,7 +185,7 @@ class GuidedStart(NamedTuple):
 
     @property
     def used(self) -> bool:
-        """Whether the population consists of draws of the guide."""
+        """Whether the population consists of the guide's draws."""
         return not self.reason
 
 
@@ -199,7 +199,7 @@ class EarlyStop(NamedTuple):
     points : int
         Number of these points.
     effective_sample_size, pareto_shape : float
-        Effective sample size of their weights at beta = 1, and the Pareto shape of the largest weights.
+        Effective sample size of the weights at beta = 1, and Pareto shape of the largest weights.
     complete : bool
         Whether the annealing was complete; only moves or a check at beta = 1 are then missing.
     from_guide : bool
@@ -218,7 +218,7 @@ Report = Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | Gui
 
 
 class AnnealingResult(NamedTuple):
-    """What annealing has found so far.
+    """Result of an annealing so far.
 
     Attributes
     ----------
@@ -227,13 +227,13 @@ class AnnealingResult(NamedTuple):
     check : EvidenceCheck, optional
         The independent estimate of the evidence.
     founders : (nwalkers,) int, optional
-        Founder of each walker (`samplers.estimates.genealogy`); None where it is not known.
+        Founder of each walker (`samplers.estimates.genealogy`); None if unknown.
     rounds : tuple of GuidedRound
         Rounds of the guide.
     start : GuidedStart, optional
         Result of these rounds; None without a guide.
     early_stop : EarlyStop, optional
-        Where the limit of simulations ended the annealing; None if it did not.
+        How the limit of simulations ended the annealing; None if it did not.
     concerns : tuple of str
         Reasons of the guide why parts of the posterior may be missing.
     basis : str
@@ -269,7 +269,7 @@ class AnnealingResult(NamedTuple):
 
     @property
     def log_evidence_ladder(self) -> float:
-        """Log-evidence by tempering: the sum of the increments of all stages."""
+        """Log-evidence by tempering: the sum of the increments over all stages."""
         return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
 
     @property

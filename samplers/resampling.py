@@ -1,9 +1,9 @@
-"""Resampling: from weighted points to equally weighted ones.
+"""Resampling: from weighted points to equally weighted points.
 
 All schemes are unbiased: point i is copied n w_i times on average. They differ in the noise that they add. Multinomial
 resampling draws independently. Residual resampling keeps the integer part of n w_i and draws the rest. Stratified and
 systematic resampling divide the cumulative weights into n equal parts and place one uniform number in each part;
-systematic resampling uses the same number in all parts and adds least noise.
+systematic resampling uses the same number in all parts and adds the least noise.
 
 Reference: Douc, Cappé & Moulines (2005), Comparison of resampling schemes for particle filtering, ISPA,
 doi:10.1109/ISPA.2005.195385.

@@ -22,7 +22,7 @@ KEPT_FAILURES = 1000
 
 
 class RunResults:
-    """Base class of `samplers.tempered.TemperedSampler`: what a user reads after a run, and the limit to go on with."""
+    """Base class of `samplers.tempered.TemperedSampler`: results after a run, and the limit to go on with."""
 
     nwalkers: int
     iteration: int
@@ -40,20 +40,20 @@ class RunResults:
 
     @property
     def evaluations(self) -> int:
-        """Points for which `log_prob_fn` was called, by this object and by the interrupted run that it continues.
+        """Points for which `log_prob_fn` was called, by this object and by an interrupted run that it continues.
 
         Sweeps over fast parameters are included.
         """
         return self._record.count
 
     def report(self) -> dict[str, float]:
-        """Counts of this object, and of the run in all, which may have been continued from a file.
+        """Counts of this object, and total counts of the run, which may have been continued from a file.
 
         Returns
         -------
         dict
-            ``new_evaluations``, made by this object; ``evaluations``, ``simulations``, ``failures`` and ``steps`` of
-            the run in all.
+            ``new_evaluations``, made by this object; ``evaluations``, ``simulations``, ``failures`` and ``steps``,
+            totals of the run.
         """
         return {
             "new_evaluations": self._evaluator.new_evaluations,
@@ -90,7 +90,7 @@ class RunResults:
 
     @property
     def log_evidence(self) -> float:
-        """Log-evidence: of `log_evidence_ladder` and `log_evidence_check` the one with the smaller error."""
+        """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, whichever has the smaller error."""
         return self._result.evidence[0]
 
     @property
@@ -103,7 +103,7 @@ class RunResults:
 
     @property
     def log_evidence_ladder(self) -> float:
-        """Log-evidence by tempering: the sum of the increments of all stages."""
+        """Log-evidence by tempering: the sum of the increments over all stages."""
         return self._result.log_evidence_ladder
 
     @property
@@ -116,8 +116,8 @@ class RunResults:
     def founders(self) -> np.ndarray:
         """Founder (nwalkers,) of each walker: walkers with the same number are copies that have been moved since.
 
-        See `samplers.estimates.genealogy`. The file of a run stores them with the chain; where they are not known, each
-        walker has its own.
+        See `samplers.estimates.genealogy`. The file of a run stores founders with the chain; if they are not known,
+        each walker has a different founder.
         """
         founders = self._result.founders
         return np.arange(self.nwalkers) if founders is None else founders
@@ -126,21 +126,20 @@ class RunResults:
     def prior_draws(self) -> np.ndarray | None:
         """Draws of the prior (nwalkers, ndim) from which this object annealed; None if they are not known.
 
-        They are not known in a run that was read from a file, and where the annealing began with a `start_density`.
+        They are not known for a run that was read from a file, or if the annealing began with a `start_density`.
         """
         return self._prior_draws
 
     def mean_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
-        """Monte Carlo standard errors (ndim,) of the means of ``get_chain(discard, thin)``, from this run alone.
+        """Monte Carlo standard errors (ndim,) of the mean over ``get_chain(discard, thin)``, from this run alone.
 
         Copies made by the latest resamplings and the autocorrelation of the chain are accounted for
         (`samplers.estimates.genealogy`). The variance of a mean is estimated from as many groups of walkers as there
-        are `founders`. With few founders, it is itself uncertain, so the errors are multiplied by a quantile of
-        Student's t: two errors then contain the true mean with 95 % probability. Groups of unequal size count as
-        1 / sum(share^2) groups. Where `founders` are not known, each
-        walker counts as independent. The dependence between walkers that some moves introduce, such as emcee's stretch
-        move, is not accounted for. A single run cannot detect a mode that it lost, or moves that did not move: after a
-        `SamplingWarning` the errors are too small.
+        are `founders`. With few founders, this estimate is uncertain, so the errors are multiplied by a quantile of
+        Student's t: two errors then contain the true mean with 95 % probability. Groups of unequal size count as 1 /
+        sum(share^2) groups. If `founders` are not known, each walker counts as independent. The dependence between
+        walkers that some moves introduce, such as emcee's stretch move, is not accounted for. A single run cannot
+        detect a mode that it lost, or moves that did not move: after a `SamplingWarning` the errors are too small.
         """
         shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
         groups = 1.0 / np.sum(shares**2)
@@ -148,14 +147,14 @@ class RunResults:
         return errors if len(shares) == 1 else errors * stdtrit(groups - 1.0, 0.975) / ndtri(0.975)
 
     def _repr_html_(self) -> str:
-        """In notebooks: what the run has done and found, or how to start it."""
+        """In notebooks: summary of the run, or how to start it."""
         from .reporting.summary import describe_sampler
 
         return describe_sampler(self)
 
     @property
     def guide(self) -> Guide | None:
-        """The guide in use, a copy of the given one that has learned from this run; None before it or without one."""
+        """The guide in use: a copy of the given guide, which learns from this run; None before the run."""
         return None if self._guide is None else self._guide.guide
 
     @property
@@ -167,7 +166,7 @@ class RunResults:
     def max_simulations(self) -> float | None:
         """Largest number of simulations; None for no limit.
 
-        A limit below the number of simulations already made acts as this number.
+        A limit below the number of simulations already made has no effect on these simulations.
         """
         return self._budget.limit
 
@@ -177,10 +176,10 @@ class RunResults:
 
     @property
     def simulations(self) -> float:
-        """Simulations of this run: distinct evaluated points in the slow parameters, and those made by the guide.
+        """Simulations of this run: distinct evaluated points in the slow parameters, plus simulations by the guide.
 
-        Points that differ only in ``log_prob_fn.fast_parameters`` count once. Includes the interrupted run that is
-        continued. A cache of `log_prob_fn` can make some of them unnecessary.
+        Points that differ only in ``log_prob_fn.fast_parameters`` count once. An interrupted run that is continued is
+        included. A cache of `log_prob_fn` can make some simulations unnecessary.
         """
         return self._budget.simulations
 
@@ -191,10 +190,10 @@ class RunResults:
 
     @property
     def verdict(self) -> Verdict:
-        """What the result is worth, and why; ``print(sampler.verdict)`` gives sentences.
+        """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences.
 
         Its attributes `modes`, `evidences`, `worst_effective_sample_size` and `unknown` are computed on first use, from
-        the chain as it is then.
+        the present chain.
         """
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")

@@ -1,8 +1,8 @@
 """Settings of the annealing from the prior to the posterior, checked when they are made.
 
-Every default is written here, once. Each sampler has the settings that can act on its way to beta = 1: `MOVES` are the
-settings of annealing by moves, which both have. Constants that no user changes are beside their use, with the reason
-for their value (`samplers.tempering.recycling`, `samplers.tempering.guided`).
+Every default is defined only here. Each sampler has the settings that can affect its annealing: `MOVES` are the
+settings of annealing by moves, which both samplers have. Constants that no user changes are beside their use, with the
+reason for their value (`samplers.tempering.recycling`, `samplers.tempering.guided`).
 """
 
 from collections.abc import Callable, Collection
@@ -36,35 +36,35 @@ class Settings:
     Attributes
     ----------
     ess_ratio : float
-        Effective sample size wanted of each stage, as a share of the number of walkers (`ess_rule` "constant") or of
-        the previous stage's target ("declining"); between 0 and 1.
+        Wanted effective sample size of each stage, relative to the number of walkers (`ess_rule` "constant") or to the
+        previous stage's target ("declining"); between 0 and 1.
     ess_rule : {"constant", "declining"}
         What `ess_ratio` refers to.
     ess_floor : float
         Lower limit of the declining target.
     coefficient_of_variation : float, optional
-        Coefficient of variation wanted of the incremental weights of each stage. It takes the place of `ess_ratio`: n
-        weights with this coefficient have an effective sample size of n / (1 + coefficient²).
+        Wanted coefficient of variation of the incremental weights in each stage. It replaces `ess_ratio`: n weights
+        with this coefficient have an effective sample size of n / (1 + coefficient²).
     resampling : str or callable
         Name of a scheme in `samplers.resampling`, or a function of (weights, random) that returns indices.
     min_moves, max_moves : int
-        Smallest and largest number of sweeps of the ensemble per stage; equal for a fixed number.
+        Smallest and largest number of ensemble sweeps per stage; equal for a fixed number.
     max_correlation : float
-        Between `min_moves` and `max_moves`, moving stops once the correlation of every parameter and of the
-        log-likelihood with their values after the resampling is below this value, or decreases no further.
+        Between `min_moves` and `max_moves`, moving stops once the correlations of all parameters and the log-likelihood
+        with their values after the resampling are below this value, or decrease no further.
     chains : {"equal", "leaders"}
         With "equal", every resampled point is moved equally often. With "leaders", a chain grows from each distinct
-        resampled point, one step per copy of it, and sweeps follow where the points are still correlated.
+        resampled point, one step per copy of it, and sweeps follow if the points are still correlated.
     burn_in : int
         With "leaders", steps of a chain before its points count; 0 for the published algorithm, without sweeps.
     fast_sweeps : int
-        Sweeps over the fast parameters after every move, where `log_prob_fn` has an attribute ``fast_parameters``
+        Sweeps over the fast parameters after every move, if `log_prob_fn` has an attribute ``fast_parameters``
         (`samplers.moves.fast_parameters`); 0 for none.
     recycle : bool, optional
-        Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and
-        by moves only where its result cannot be trusted. None leaves the choice to the sampler.
+        Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and by moves
+        only if the result cannot be trusted. None leaves the choice to the sampler.
     runs : int
-        Number of runs of recycling from the same draws of the prior, whose points are used together at the end. A
+        Number of recycling runs from the same draws of the prior, whose points are used together at the end. A
         difference between the runs means that one run has lost a part of the posterior, and is reported.
     check_draws : int, optional
         Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
@@ -74,9 +74,9 @@ class Settings:
         (a returned -inf is not a failure); 0 stops at the first failure.
     asynchronous : bool
         Whether points are evaluated without waiting for the slowest of each batch, for long runs of unequal length on
-        many workers. Recycling, or a guide, then proposes the next points while the last ones run. The result depends
-        on the order of arrival, in the choice of the proposals; every estimate is made of complete batches. Moves wait
-        as before.
+        many workers. Recycling, or a guide, then proposes the next points while the last ones run. The choice of the
+        proposals, and thus the result, depends on the order of arrival; every estimate is made from complete batches.
+        Moves wait for all points.
     """
 
     ess_ratio: float = 0.5
@@ -139,14 +139,14 @@ class Settings:
         return self.resampling if callable(self.resampling) else RESAMPLING[self.resampling]
 
     def target(self, last_target: float, n_walkers: int) -> float:
-        """Effective sample size wanted of a stage, from the previous stage's target (n_walkers before the first)."""
+        """Wanted effective sample size of a stage, from the previous target (n_walkers before the first stage)."""
         variation = self.coefficient_of_variation
         ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
         return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
 
 
 def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:
-    """Raise TypeError for a keyword that is neither a setting, of the `names`, nor one of the other `arguments`."""
+    """Raise TypeError for a keyword that is neither a setting (one of `names`) nor one of the other `arguments`."""
     if unknown := set(given) - set(names):
         name = min(unknown)
         near = get_close_matches(name, [*names, *arguments], n=1, cutoff=0.6)
@@ -157,7 +157,7 @@ def check_names(sampler: str, names: Collection[str], given: Collection[str], ar
 
 
 def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
-    """Raise ValueError for arguments that emcee or NumPy would refuse with another error, or later."""
+    """Raise ValueError for arguments that emcee or NumPy would refuse later or with an unclear error."""
     if pool is not None and not (hasattr(pool, "map") or hasattr(pool, "submit")):
         raise ValueError(f"pool must be an object with a method map, such as multiprocessing.Pool(4); got {pool!r}")
     if backend is not None and not isinstance(backend, Backend):
@@ -167,7 +167,7 @@ def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
 
 
 def refuse_unused(settings: Settings, guided: bool) -> None:
-    """Raise ValueError for `runs` or `asynchronous` where the annealing, with a guide or without, cannot use them."""
+    """Raise ValueError for `runs` or `asynchronous` if the annealing, with a guide or without, cannot use them."""
     if settings.runs > 1 and guided:
         raise ValueError(
             f"runs={settings.runs} cannot act here: they begin with draws of the prior, not of a guide: pass "

@@ -1,13 +1,12 @@
 """Sequential Monte Carlo behind emcee's interface.
 
-Del Moral, Doucet & Jasra (2006), doi:10.1111/j.1467-9868.2006.00553.x, with the adaptation that has become usual: the
-next exponent by the effective sample size, resampling at every stage, proposals fitted to the weighted population, and
-moves until the population is nearly uncorrelated with its resampled start. The settings of papers are in
-`samplers.presets`.
+Del Moral, Doucet & Jasra (2006), doi:10.1111/j.1467-9868.2006.00553.x, with the usual adaptation: the next exponent by
+the effective sample size, resampling at every stage, proposals fitted to the weighted population, and moves until the
+population is nearly uncorrelated with its resampled start. The settings of papers are in `samplers.presets`.
 
-Tempering has a limit that no setting removes: of several modes of similar mass, one that is much narrower than the
+Tempering has a limit that no setting removes: among modes with similar masses, a mode that is much narrower than the
 others has little mass at small beta, and is lost unless draws of the prior happen to lie in it (Woodard, Schmidler &
-Huber 2009, doi:10.1214/EJP.v14-638). Where such modes are possible, use more walkers, or ``runs=2``.
+Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walkers, or ``runs=2``.
 """
 
 from collections.abc import Collection
@@ -33,10 +32,9 @@ class SMCSampler(TemperedSampler):
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
         `samplers.moves.kernels.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional
-        Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves where its result cannot
-        be trusted. By default yes with 150 walkers or more, unless `moves` or a setting of annealing by moves is
-        given (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often
-        fails.
+        Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves if the result cannot be
+        trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given
+        (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often fails.
     runs, asynchronous
         As in `samplers.settings.Settings`; they need recycling. Two runs cost up to twice the evaluations of the
         annealing, and lose a mode only if both do. `asynchronous` acts with a guide too.

@@ -1,7 +1,7 @@
 """An emcee sampler that anneals draws of the prior to the posterior before it samples.
 
-`TemperedSampler` is an `emcee.EnsembleSampler`. Its ``sample`` first carries a population of draws of the prior to
-beta = 1 (`samplers.tempering.anneal`). Then emcee's own loop continues at beta = 1. So the chain contains states of the
+`TemperedSampler` is an `emcee.EnsembleSampler`. Its ``sample`` first carries a population of prior draws to beta = 1
+(`samplers.tempering.anneal`). Then emcee's own loop continues at beta = 1. So the chain contains states of the
 posterior only, and everything that emcee does with a chain works unchanged.
 
 Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density.
@@ -68,11 +68,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         As in `emcee.EnsembleSampler`, in the same order. `moves` are the mutation kernels, which are copied; a random
-        walk by default. Where `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
+        walk by default. If `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
         support of the prior are not evaluated. With an emcee `HDFBackend`, a record of all evaluations is kept beside
-        the file, and a run that was killed goes on without repeating one (`run_mcmc`).
+        the file, and a killed run goes on without repeating an evaluation (`run_mcmc`).
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -81,20 +81,20 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
         blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
     start_density : callable, optional
-        Normalised log-density that the initial state is drawn from, if that is not the prior, called like
-        `log_prior_fn`; finite wherever the log-prior is. The annealing then leads from it to the posterior.
+        Normalised log-density that the initial state is drawn from, instead of the prior, called like `log_prior_fn`;
+        finite wherever the log-prior is. The annealing then leads from this density to the posterior.
     guide : Guide, optional
         An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
-        annealing, and the sweeps at beta = 1 are proposals of the guide. Where the draws cannot be trusted, recycling
+        annealing, and the sweeps at beta = 1 are proposals of the guide. If the draws cannot be trusted, recycling
         starts from them, with a `SamplingWarning`.
     max_simulations : float, optional
-        Largest number of simulations (`simulations`). Where it is reached, the posterior is estimated from the points
-        that are known, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so;
-        see `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the
-        same file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
+        Largest number of simulations (`simulations`). When it is reached, the posterior is estimated from the known
+        points, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so; see
+        `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
+        file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
-        the run, and two samplers never share a stream. A file that contains a run keeps its seed: another one has no
+        the run, and two samplers never share a stream. A file that contains a run keeps its seed: another seed has no
         effect, with a warning in the log.
     **settings
         Settings of the annealing by name; `samplers.settings.Settings` has their names, meanings and defaults.
@@ -158,7 +158,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         slow = self._optional.slow_parameters(ndim)
         self._record = open_record(backend, nwalkers, ndim, slow)
         self._budget = Budget(self._record, as_limit(max_simulations))
-        # whether the annealing of the record must be made again, and whether another sampler wrote the record
+        # whether the annealing of the record must be repeated, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
         self.seconds = 0.0
         set_previous_state(self, None)
@@ -221,7 +221,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     @classmethod
     def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:
-        """The settings that were given, with those that this sampler chooses itself."""
+        """The given settings, with the settings that this sampler chooses."""
         return settings
 
     @classmethod
@@ -257,18 +257,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Anneal to beta = 1 if that has not been done, then make `nsteps` steps at beta = 1.
 
         With an emcee `HDFBackend`, a new sampler with the file of a run goes on with it, as in emcee: the annealing is
-        made again from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
-        stored one. The results equal a run that was never interrupted, to the last bit. So a script that is
-        started again after a kill makes ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
+        repeated from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last stored
+        step. The results equal a run that was never interrupted, to the last bit. So a script that is restarted after a
+        kill calls ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
 
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
             Draws of the prior, or of `start_density`. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
-            of its last one) is continued, and so is a run that began with the same draws. Other coordinates start a
+            of its last State) is continued, and so is a run that began with the same draws. Other coordinates start a
             new annealing, whose steps are added to the chain: call `reset` before, or use a new sampler. Points that
-            cannot be such draws, as a ball near the posterior, are refused with a ValueError
+            cannot be such draws, such as a ball near the posterior, are refused with a ValueError
             (`samplers.evaluation.starts`).
         nsteps : int
             Number of steps stored in the chain; 0 for the annealing only.
@@ -300,7 +300,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         progress=False,
         progress_kwargs=None,
     ) -> Iterator[State]:
-        """Advance the chain as a generator: emcee's ``sample``, preceded by the annealing where it is needed.
+        """Advance the chain as a generator: emcee's ``sample``, preceded by the annealing if it is needed.
 
         The arguments are as in emcee, with `initial_state` as in `run_mcmc`.
         """
@@ -376,13 +376,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
 
     def _undo(self, random_state: tuple) -> None:
-        """Leave nothing half-made: no part of a step, and no draws of a run that has not begun."""
+        """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""
         self._output.undo_half_a_step()
         if self._record.start is None:  # the next call makes the same draws
             get_random(self).set_state(random_state)
 
     def _end_early(self, advanced: State | None, stored: State, new: int, missing: int, store: bool) -> Iterator[State]:
-        """End a call that the limit of simulations has ended, after `new` steps, of which `stored` is the last."""
+        """Finish a call that the limit of simulations has ended after `new` steps; `stored` is the last step."""
         if advanced is not None:  # the move that exceeded the limit may have changed some of its walkers
             for name in State.__slots__:
                 setattr(advanced, name, getattr(stored, name))
@@ -394,7 +394,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             yield stored
 
     def _judge(self, missing: int, coords: np.ndarray) -> None:
-        """Store the verdict on an annealing of this object, or keep the verdict of the backend."""
+        """Store the verdict on an annealing by this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
             optional, latest, self._near = self._optional, self._record.latest(), None
@@ -499,7 +499,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
 
     def _header(self) -> dict:
-        """What this run is started with, in the form in which JSON returns it."""
+        """The start of this run, in the form that JSON returns."""
         described = {"sampler": type(self).__name__, **self._functions.described()}
         header = describe_run(self._functions.function, described, self.settings, *self._first_moves, self._given_guide)
         return json.loads(json.dumps(header))
@@ -512,7 +512,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         )
 
     def _repeated(self, start: RunStart) -> RunStart:
-        """The start of the record, from which the annealing is made again."""
+        """The start in the record, from which the annealing is repeated."""
         if self._record.path is not None:
             logger.warning(  # a user who waits sees that the time spent is not lost
                 "Going on with %s: %d evaluations and %d steps are stored",

@@ -1,14 +1,14 @@
 """Transitional Markov chain Monte Carlo behind emcee's interface.
 
-Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): the next exponent is the one at which the coefficient
-of variation of the weights is 1, and a chain grows from each resampled point, its leader, with one step per copy. As
-published, with steps of a fixed scale, it is biased, and can collapse on a sharp posterior; these settings are
+Ching & Chen (2007), doi:10.1061/(ASCE)0733-9399(2007)133:7(816): at the next exponent, the coefficient of variation of
+the weights is 1, and a chain grows from each resampled point, its leader, with one step per copy. The published
+algorithm, with steps of a fixed scale, is biased, and can collapse on a sharp posterior; its settings are
 `samplers.presets.CHING_CHEN_2007`. By default every chain has a burn-in and scales are adapted to the acceptance, after
 Betz, Papaioannou & Straub (2016), doi:10.1061/(ASCE)EM.1943-7889.0001066, and points that are still correlated with the
-leaders are moved on together (`samplers.tempering.leaders`). The moves are `MixtureMove`, since a
-random walk alone gives separate modes wrong shares. With ``chains="equal"``, all chains have the same length, so that
-all processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koumoutsakos 2012,
-doi:10.1063/1.4757266; Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
+leaders are moved further together (`samplers.tempering.leaders`). The moves are `MixtureMove`, since a random walk
+alone gives separate modes wrong shares. With ``chains="equal"``, all chains have the same length, so that all
+processors of a pool are busy, as in BASIS (Angelikopoulos, Papadimitriou & Koumoutsakos 2012, doi:10.1063/1.4757266;
+Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
 """
 
 from collections.abc import Collection
@@ -36,7 +36,7 @@ class TMCMCSampler(TemperedSampler):
         `samplers.moves.kernels.MixtureMove`.
     coefficient_of_variation : float, optional
         Coefficient of variation of the incremental weights, which determines the next exponent. By default 1, which is
-        an effective sample size of half the number of walkers.
+        an effective sample size of half the walkers.
     chains : {"leaders", "equal"}
         With "leaders", the default, a chain grows from each distinct resampled point, one step per copy of it. With
         "equal", every resampled point is moved equally often, in one batch, which keeps a pool busy. It is the default
@@ -44,8 +44,8 @@ class TMCMCSampler(TemperedSampler):
     burn_in : int, default 4
         Steps of a chain before its points count; with "leaders" only. With 0, the algorithm is as published.
     min_moves : int, default 2
-        Smallest number of sweeps of the ensemble per stage. With "leaders", sweeps are made only where the chains have
-        left the points correlated with the resampled points.
+        Smallest number of ensemble sweeps per stage. With "leaders", sweeps are made only if the chains have left the
+        points correlated with the resampled points.
     max_moves : int, default 7
         Largest number of these sweeps; equal to `min_moves` for a fixed number.
     max_correlation : float, default 0.15

@@ -48,7 +48,7 @@ def trace_founders(
     Returns
     -------
     tuple of (n,) int
-        Founder of each point, per generation, the oldest generation first. The last one, the points before this
+        Founder of each point, per generation, the oldest generation first. The last generation, the points before this
         resampling, is always kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
@@ -59,7 +59,7 @@ def trace_founders(
 
 
 def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
-    """Standard error of the mean of a chain whose walkers have common founders.
+    """Standard error of the chain mean when walkers have common founders.
 
     Parameters
     ----------
@@ -92,11 +92,11 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
 
 
 def worst_effective_sample_size(chain: np.ndarray, founders: np.ndarray) -> float:
-    r"""Effective sample size of a chain for the linear combination of the parameters where it is smallest.
+    r"""Smallest effective sample size of a chain over all linear combinations of the parameters.
 
     The effective sample size of a direction is the posterior variance along it divided by the squared standard error of
-    its mean. Errors per parameter do not show a bad direction of correlated parameters. The smallest estimate over all
-    directions tends to be too small, by a factor of at least :math:`(1 + \sqrt{d / K})^{-2}` for K groups
+    the mean. Errors per parameter do not reveal a bad direction of correlated parameters. The smallest estimate over
+    all directions tends to be too small, by a factor of at least :math:`(1 + \sqrt{d / K})^{-2}` for K groups
     (Marchenko & Pastur 1967, doi:10.1070/SM1967v001n04ABEH001994).
 
     Parameters
@@ -130,7 +130,7 @@ def worst_effective_sample_size(chain: np.ndarray, founders: np.ndarray) -> floa
 
 
 def _sums_of_groups(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
-    """Sum (groups, ndim) of the deviations of the walkers' means from the mean, for each group with one founder."""
+    """Sum (groups, ndim) over each group with one founder: deviations of the walkers' means from the mean."""
     _, group = np.unique(founders, return_inverse=True)
     deviations = chain.mean(axis=0)
     deviations -= deviations.mean(axis=0)

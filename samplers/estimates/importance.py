@@ -4,15 +4,15 @@ One proposal
 ------------
 A mixture fitted to a population is a proposal for independent points inside the support of the prior. The mean of
 posterior / proposal over the draws estimates the evidence without tempering, and without bias as long as the proposal
-was not fitted to the draws. The largest weights have a generalised Pareto distribution. Where its shape exceeds 0.7,
+was not fitted to the draws. The largest weights follow a generalised Pareto distribution. If its shape exceeds 0.7,
 points that were not drawn dominate the mean.
 
 Rounds
 ------
-Where the proposal changes from round to round, round r has :math:`n_r` independent draws of a density :math:`q_r` that
-was fixed before they were made. Each draw has the weight :math:`w_i = \pi(\theta_i) / q_r(\theta_i)` with the
-unnormalised posterior density :math:`\pi`. The mean of these weights, :math:`\hat Z_r`, is an unbiased estimate of the
-evidence whatever the earlier rounds were like. The rounds are combined as
+If the proposal changes from round to round, round r has :math:`n_r` independent draws of a density :math:`q_r` that was
+fixed before they were made. Each draw has the weight :math:`w_i = \pi(\theta_i) / q_r(\theta_i)` with the unnormalised
+posterior density :math:`\pi`. The mean weight :math:`\hat Z_r` is an unbiased estimate of the evidence, whatever the
+earlier rounds were like. The rounds are combined as
 :math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
 
 The shares :math:`\alpha_r` must not depend on the weights of the same round: a round with one very large weight has a
@@ -65,7 +65,7 @@ __all__ = [
 
 # Levels of a normal distribution one and two standard deviations above its median.
 ONE_AND_TWO_SD = (0.8413, 0.9772)
-# Weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024).
+# Weights with a larger Pareto shape have no useful mean (Vehtari et al. 2024).
 LARGEST_SHAPE = 0.7
 # Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
 LARGEST_ERROR = 0.35
@@ -93,7 +93,7 @@ class EvidenceCheck(NamedTuple):
     effective_sample_size : float
         Effective sample size of the weights.
     pareto_shape : float
-        Shape of the distribution of the largest weights; below 0.7 the error of the mean is finite in practice.
+        Pareto shape of the largest weights; below 0.7 the error of the mean is finite in practice.
     evaluations : int
         Points for which ``log_prob_fn`` was called.
     """
@@ -111,12 +111,12 @@ class EvidenceCheck(NamedTuple):
 
 
 def fewest_points(ndim: int) -> float:
-    """Smallest effective sample size of weighted points from which a population is usable."""
+    """Smallest effective sample size for which weighted points are a usable population."""
     return max(FEWEST_POINTS, POINTS_PER_DIMENSION * (ndim + 1.0))
 
 
 def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim: int) -> bool:
-    """Whether weighted points give means and an evidence with errors that can be stated."""
+    """Whether the means and the evidence from weighted points have errors that can be stated."""
     enough = effective_sample_size >= fewest_points(ndim)
     return enough and pareto_shape < LARGEST_SHAPE and error <= LARGEST_ERROR
 
@@ -129,7 +129,7 @@ def draw_inside(
     Parameters
     ----------
     mixture : Mixture
-        What to draw from.
+        Mixture to draw from.
     n : int
         Number of draws wanted.
     random : RandomState
@@ -159,10 +159,10 @@ def draw_inside(
 def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
     """Evidence from the log-weights (n,) of the draws inside the support, out of `made` draws.
 
-    The sample variance of n weights is too small where n draws rarely contain the largest ones. Rough likelihoods have
+    The sample variance of n weights is too small if n draws rarely contain the largest weights. Rough likelihoods have
     nearly log-normal weights, whose variance follows from the spread s of their logarithms, exp(s²) - 1 in units of the
-    squared mean. The error follows from the larger variance. The spread is the distance between the quantiles one and
-    two standard deviations above the median of a normal distribution, so small weights of draws in the tails of the
+    squared mean. The error follows from the larger variance. The spread is the distance between the quantiles that lie
+    one and two standard deviations above the median in a normal distribution, so small weights in the tails of the
     proposal do not count.
     """
     full = np.full(made, -np.inf)
@@ -210,18 +210,18 @@ def pareto_shape(log_weights: np.ndarray) -> float:
 
 
 def expected_efficiency(ndim: int, dof: float, components: int, points: float) -> float:
-    r"""Effective sample size per draw of a mixture that is fitted to draws of a mixture of as many Gaussians.
+    r"""Expected effective sample size per draw of a mixture fitted to draws from as many Gaussians.
 
-    Without the noise of the fit it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the Student t q with the same
-    degrees of freedom as the mixture that maximises the likelihood. With K components of d dimensions and n points,
-    each fitted number costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
+    Without fitting noise it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the maximum-likelihood Student t q
+    with the same degrees of freedom as the mixture. With K components of d dimensions and n points, each fitted number
+    costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
 
     Parameters
     ----------
     ndim : int
         Number of parameters.
     dof : float
-        Degrees of freedom of the mixture.
+        Degrees of freedom.
     components : int
         Number of components.
     points : float
@@ -263,21 +263,21 @@ def _efficiency_without_noise(ndim: int, dof: float) -> float:
 
 # ---------------------------------------------------------------- rounds
 
-# Draws of the first round of a guide, as a share of the number of walkers: few, since the guide may still be poor.
+# Draws in the first round of a guide, as a share of the number of walkers: few, since the guide may still be poor.
 FIRST_ROUND_SHARE = 0.3
-# After the last round of a guide, the draws are used in spite of rounds that were not reliable if the last one has at
-# least this effective share, all rounds together have an effective sample size of the number of walkers, and the Pareto
-# shape of their weights is below 0.7 (Vehtari et al. 2024).
+# After the last round of a guide, the draws are used even if no round was reliable, provided that the last round has at
+# least this effective share, all rounds together have an effective sample size equal to the number of walkers, and the
+# Pareto shape of their weights is below 0.7 (Vehtari et al. 2024).
 USABLE_SHARE = 0.1
 # Pareto shape that is assumed for fewer weights than an estimate needs
 SHAPE_OF_FEW = 0.7
 FEWEST_EFFECTIVE = 5.0
-# part of the sum of all weights by which the largest must exceed the others for their shape to matter
+# share of the sum of weights by which the largest weights must exceed the others for their shape to matter
 SMALLEST_EXCESS = 0.05
-# Growth of the weights towards the tails from which on the tails of a proposal are too light, for each part of the
-# draws with the lowest posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom)
-# have 0.11 to 0.5, 0.3 to 0.7 and 0.6 to 0.85; with 3 degrees the weights first fall, and grow among the outermost
-# draws only. Harmless proposals have less: with 6 degrees on 4, 0.03, 0.08 and 0.12.
+# Growth of the weights above which the tails of a proposal are too light, for each part of the draws with the lowest
+# posterior. Normal proposals with half the variance of a Student t (3 to 5 degrees of freedom) have 0.11 to 0.5, 0.3 to
+# 0.7 and 0.6 to 0.85; with 3 degrees the weights first fall, and grow among the outermost draws only. Harmless
+# proposals have less: with 6 degrees on 4, 0.03, 0.08 and 0.12.
 LARGE_GROWTH = {0.5: 0.1, 0.25: 0.3, 0.125: 0.3}
 SIGNIFICANT = 4.0  # in errors
 FEWEST_FOR_GROWTH = 8
@@ -346,21 +346,21 @@ def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.
     sizes : sequence of int
         Number of draws per round.
     effective_shares : sequence of float
-        Effective sample size of each round divided by its number of draws. The last one has no effect unless it is the
-        only one.
+        Effective sample size of each round divided by its number of draws. The last one is used only if it is the only
+        one.
     """
     lagged = [effective_shares[0], *effective_shares[:-1]]
-    # a round after one without a single effective draw still counts as one point
+    # a round after a round without a single effective draw still counts as one point
     shares = np.maximum(np.asarray(sizes) * np.asarray(lagged), 1.0)
     return shares / shares.sum()
 
 
 def tail_shape(log_weights: np.ndarray) -> float:
-    """Pareto shape of the largest weights where these have a part in the mean; 0 where they have none.
+    """Pareto shape of the largest weights if they contribute to the mean; 0 if they do not.
 
-    The weights of a guide that describes the posterior nearly exactly are equal except for small errors, whose shape
-    says nothing about the mean. The shape is used only if the largest weights exceed the next one by at least 5 % of
-    the sum of all weights together.
+    If a guide describes the posterior nearly exactly, its weights are equal except for small errors, whose shape says
+    nothing about the mean. The shape is used only if the largest weights exceed the next weight, in total, by at least
+    5 % of the sum over all weights.
 
     Parameters
     ----------
@@ -380,23 +380,24 @@ def tail_shape(log_weights: np.ndarray) -> float:
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
     r"""Slope of the log-weights over minus the log-posterior, among the draws with the lowest posterior.
 
-    Where the posterior :math:`\pi` is proportional to a power :math:`q^c` of the proposal density, the slope is
-    :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the posterior. Draws of light tails do
-    not reach the places where weights are large, so the weights themselves may all be small. Errors of a proposal, and
-    jumps of a likelihood, do not make the slope positive on average.
+    If the posterior :math:`\pi` is proportional to a power :math:`q^c` of the proposal density, the slope is
+    :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the posterior. Draws from light tails
+    do not reach the places with large weights, so all weights may be small. Errors of a proposal, and jumps of a
+    likelihood, do not make the slope positive on average.
 
     Parameters
     ----------
     rounds : sequence of Round
-        Draws of proposals that were fixed before them.
+        Draws of proposals that were fixed before the draws were made.
     part : float
-        The part of the draws that is used, those with the lowest posterior.
+        Share of the draws that is used: the draws with the lowest posterior.
 
     Returns
     -------
     slope, error : float
         The slope and its error, by least squares; (0, inf) for fewer than 8 draws in the part. The error is the
-        standard error times a factor above 1 for few draws: 4 errors have the same probability for any number of them.
+        standard error times a factor above 1 for few draws: 4 errors are exceeded with the same probability for any
+        number.
     """
     log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
     log_weights = np.concatenate([r.log_weights for r in rounds])
@@ -417,17 +418,17 @@ def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, floa
 
 
 def tails_are_light(rounds: Sequence[Round]) -> bool:
-    """Whether the weights of rounds grow significantly towards the tails (`tail_growth`), in one of the outer parts."""
+    """Whether the weights of rounds grow significantly towards the tails (`tail_growth`), in any outer part."""
     found = [(*tail_growth(rounds, part), large) for part, large in LARGE_GROWTH.items()]
     return any(slope > max(large, SIGNIFICANT * error) for slope, error, large in found)
 
 
 def tail_variance(log_weights: np.ndarray) -> float:
-    r"""Variance of the log-evidence due to weights larger than all that were drawn.
+    r"""Variance of the log-evidence due to weights larger than all drawn weights.
 
     If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
     :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
-    :math:`k \ge 1`. Where there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
+    :math:`k \ge 1`. If there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
     points that were not drawn may have any weight, and the variance is infinite.
 
     Parameters
@@ -446,17 +447,17 @@ def tail_variance(log_weights: np.ndarray) -> float:
 def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
     r"""Combine rounds.
 
-    The variance of the log-evidence is the sum of three parts: the variance of the mean weights of the rounds,
+    The variance of the log-evidence is the sum of three parts: the variance of the mean weights per round,
     :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights, or the
-    variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, where that is larger;
-    `tail_variance`; and the squared error of the normalising constant of the proposal density.
+    variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, if it is larger; `tail_variance`;
+    and the squared error of the proposal's log normalising constant.
 
     Parameters
     ----------
     rounds : sequence of Round
         At least one, in order.
     log_density_error : float
-        Standard error of the logarithm of the normalising constant of the proposal density.
+        Standard error of the proposal density's log normalising constant.
 
     Returns
     -------

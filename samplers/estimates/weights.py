@@ -6,7 +6,7 @@ Between the prior (beta = 0) and the posterior (beta = 1) lies the family
                        = log prior(theta) + beta log likelihood(theta) + constant.
 
 A population at beta is carried to beta' by the incremental weights w_i = likelihood(theta_i) ^ (beta' - beta), whose
-effective sample size is (sum w)^2 / sum w^2. The product of the mean weights of all stages estimates the evidence.
+effective sample size is (sum w)^2 / sum w^2. The product of the mean weights over all stages estimates the evidence.
 Weights are kept as logarithms until their maximum has been subtracted: log-likelihoods of finite-element models have
 magnitudes of thousands, and a constant added to them must not change anything.
 
@@ -71,15 +71,15 @@ def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
 def coarse_weights(log_weights: np.ndarray) -> np.ndarray:
     """Normalised weights from log-weights rounded to 1/4096, for fitting proposals.
 
-    A proposal may be fitted to slightly different weights without harm. Rounded weights stay the same to the last bit
-    when a constant is added to the log-likelihood, and so do all draws from the fitted proposal.
+    Rounded weights, and thus all draws from the fitted proposal, stay the same to the last bit when a constant is added
+    to the log-likelihood. Slightly different weights do no harm to a fit.
     """
     top = np.max(log_weights)
     return normalised_weights(np.round((log_weights - top) * WEIGHT_GRID) / WEIGHT_GRID)
 
 
 def effective_sample_size(log_weights: np.ndarray) -> float:
-    """(sum w)^2 / sum w^2 of weights given by their logarithms (n,); 0 if all weights are zero."""
+    """(sum w)^2 / sum w^2 from log-weights (n,); 0 if all weights are zero."""
     weights, top = _scaled(log_weights)
     if top == -np.inf:
         return 0.0
@@ -87,7 +87,7 @@ def effective_sample_size(log_weights: np.ndarray) -> float:
 
 
 def log_mean_weight(log_weights: np.ndarray) -> float:
-    """Logarithm of the mean of weights given by their logarithms (n,); -inf if all weights are zero."""
+    """Logarithm of the mean weight from log-weights (n,); -inf if all weights are zero."""
     weights, top = _scaled(log_weights)
     return top if top == -np.inf else top + float(np.log(weights.mean()))
 
@@ -158,11 +158,11 @@ class EvidenceError:
     Points are grouped by their founder. With :math:`W_{ij}` the normalised weight of point i at stage j, group k
     contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)` to the log-evidence, without the noise of
     resampling. Groups are independent, thus :math:`\mathrm{Var}(\log Z) \approx \sum_k A_k^2` (Chan & Lai 2013). If
-    moves mix well, it tends to the sum over the stages of the variances of the mean weights. If points never move, it
-    is the error of plain importance sampling: poor mixing is not hidden.
+    moves mix well, it tends to the variance of the mean weight, summed over the stages. If points never move, it is the
+    error of plain importance sampling: poor mixing is not hidden.
 
     The sum is unreliable with few groups. Once fewer founders than `min_founder_share` times the number of points are
-    left, the sums are closed and every point becomes a founder. Closed sums are treated as independent of later ones.
+    left, the sums are closed and every point becomes a founder. Closed sums are treated as independent of later sums.
 
     Parameters
     ----------

@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 class EvaluationQueue(Protocol):
     """Where points are evaluated: ``posterior.evaluation_queue()``, or `samplers.evaluation.pool_queue.PoolQueue`.
 
-    A queue may also have a method ``ended()``, which returns numbers and values of the points that have ended, without
-    waiting, also of those that the last `collect` has returned. It is called before `close`.
+    A queue may also have a method ``ended()``, which returns numbers and values of all points that have ended, without
+    waiting, including the points that the last `collect` has returned. It is called before `close`.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class EvaluationQueue(Protocol):
         """Begin to evaluate points (n, ndim) without waiting; returns a number for each, which is never used again."""
 
     def collect(self) -> list[tuple[int, Any]]:
-        """Wait until a point is finished; returns numbers and values of all that are, in the order of completion."""
+        """Wait for a finished point; returns numbers and values of all finished points, in the order of completion."""
 
     def close(self) -> None:
         """Cancel the points that have not been started."""
@@ -89,7 +89,7 @@ class AsynchronousEvaluator(Evaluator):
         return self._opened().workers or 1
 
     def submit(self, coords: np.ndarray) -> PendingPoints:
-        """Begin to evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
+        """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
         log_base = self.log_base(coords)
@@ -139,7 +139,7 @@ class AsynchronousEvaluator(Evaluator):
             new.append(self._gather(most))
             return new
 
-        # by the points, since a search that goes on under a larger limit leads to others
+        # by the points, since a search that goes on under a larger limit leads to other points
         points = np.array([pending.coords[row] for pending, row in self._running.values()])
         key = f"arrived of {hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()}"
         arrived = self.record.remember(key, gather)[0]
@@ -164,7 +164,7 @@ class AsynchronousEvaluator(Evaluator):
         pending.arrive(rows, self._pack(log_base, np.ones(len(rows), dtype=bool), batch))
 
     def _gather(self, most: int) -> np.ndarray:
-        """Numbers (m,) of the points that have arrived by the time when `most` others are running."""
+        """Numbers (m,) of the points that have arrived when `most` other points are running."""
         while len(self._running) - len(self._known) > most:
             self._take(self._opened().collect())
             if self._check is None or self._finite() >= POINTS_OF_TERMS:
@@ -177,7 +177,7 @@ class AsynchronousEvaluator(Evaluator):
         return sum(bool(np.isfinite(batch.log_prob[row])) for batch, row in self._known.values())
 
     def _take(self, collected: list[tuple[int, Any]]) -> None:
-        """Take values of the queue that are not known yet."""
+        """Take values that are not known yet from the queue."""
         new = [(ticket, self._tickets[ticket], value) for ticket, value in collected if ticket in self._tickets]
         if not new:
             return
@@ -211,7 +211,7 @@ class AsynchronousEvaluator(Evaluator):
             self._held = []
 
     def close(self) -> None:
-        """End the evaluation of points that are running; those that have ended are entered in the record.
+        """End the evaluation of running points; points that have ended are entered in the record.
 
         The first values are entered without a check, which may take evaluations; the next run makes it.
         """

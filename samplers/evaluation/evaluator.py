@@ -4,8 +4,8 @@
 outside the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN
 counts as -inf, and its reason is recorded.
 
-A batch is entered in the record of the run (`samplers.record`) when it is finished. Where a function takes one point at
-a time, finished points are entered every 0.05 s, so that a process that is killed loses the points of that time.
+A batch is entered in the record of the run (`samplers.record`) when it is finished. If a function takes one point at a
+time, finished points are entered every 0.05 s, so that a killed process loses only the points of this time.
 """
 
 import time
@@ -54,8 +54,8 @@ class FailureLimit(NamedTuple):
     ) -> None:
         """Raise RuntimeError if the limit is exceeded by a batch that comes after the given numbers.
 
-        Failures may be quicker or slower than successes. So points that are running count as successes, and a batch
-        may fail as a whole if it is not `whole`.
+        Failures may be quicker or slower than successes. So running points count as successes, and a batch that is not
+        `whole` may fail completely.
         """
         n, count = len(batch.coords), failures + len(batch.reasons)
         total = evaluations + n + running
@@ -89,7 +89,7 @@ class CallingConvention(NamedTuple):
 
     @property
     def argument(self) -> str:
-        """What functions are called with, in words."""
+        """The argument of functions, in words."""
         points = "an array (n, ndim) of points" if self.vectorize else "an array (ndim,), one point"
         if self.parameter_names is None:
             return f"{points} (vectorize={self.vectorize})"
@@ -108,9 +108,9 @@ class CallingConvention(NamedTuple):
         note: Callable[[list], None] | None = None,
         observer: "Observer | None" = None,
     ) -> Any:
-        """Results of a function for points (n, ndim); `note` is called with the first of them every 0.05 s.
+        """Results of a function for points (n, ndim); `note` is called with the first results every 0.05 s.
 
-        The observer hears of every result. A function of a batch has no first results, and neither has a pool whose
+        The observer is told of every result. There are no first results for a function of a batch, or for a pool whose
         ``map`` returns a list.
         """
         points = self.as_points(coords)
@@ -133,7 +133,7 @@ class CallingConvention(NamedTuple):
 
 
 class Observer(Protocol):
-    """What is told of points while they are evaluated, such as `samplers.reporting.progress.Progress`."""
+    """Object that is told of points while they are evaluated, such as `samplers.reporting.progress.Progress`."""
 
     def repeated(self, points: int) -> None:
         """Points were found in the record of the run."""
@@ -185,13 +185,13 @@ class Evaluator:
     evaluations : int
         Number of points that were asked for, evaluated by this object or found in the record.
     new_evaluations : int
-        Number of points that this object has evaluated itself.
+        Number of points that this object has evaluated.
     pool : object with a method map, optional
         Where functions of one point are called; set by the sampler.
     observer : Observer, optional
         Told of points while they are evaluated.
     on_unknown : callable, optional
-        Called once, before a point is evaluated that the record does not have.
+        Called once, before the first evaluation of a point that is not in the record.
     asynchronous : bool
         Whether `submit` returns without waiting.
     """
@@ -239,7 +239,7 @@ class Evaluator:
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
     def log_base(self, coords: np.ndarray) -> np.ndarray:
-        """Log-density (n,) at beta = 0 of points (n, ndim): of the prior, unless a `start_density` is given."""
+        """Log-density (n,) at beta = 0 of points (n, ndim): the log-prior, unless a `start_density` is given."""
         return self._with_start_density(coords, self.log_prior(coords))
 
     def _with_start_density(self, coords: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
@@ -285,7 +285,7 @@ class Evaluator:
         return 0
 
     def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:
-        """Evaluate points (n, ndim), of which the limit of simulations may allow the first few only."""
+        """Evaluate points (n, ndim); the limit of simulations may allow only the first points."""
         try:
             return PendingPoints.known(coords, self.evaluate(coords, observe))
         except BudgetExhausted as stop:
@@ -306,7 +306,7 @@ class Evaluator:
         coords : (n, ndim) float
             The points.
         observe : callable, optional
-            Called with points directly before they are evaluated, and with points of the record in the same parts as
+            Called with points directly before they are evaluated. Points of the record are passed in the same parts as
             when they were evaluated.
 
         Raises
@@ -314,7 +314,7 @@ class Evaluator:
         ValueError
             If a coordinate is not finite.
         BudgetExhausted
-            If the points do not fit into the limit of simulations. With `evaluates_parts`, the first of them that fit
+            If the points do not fit into the limit of simulations. With `evaluates_parts`, the first points that fit
             are evaluated.
         """
         if not np.all(np.isfinite(coords)):
@@ -345,7 +345,7 @@ class Evaluator:
         return self._pack(log_base, inside, merge_batches(batches))
 
     def _fitting(self, coords: np.ndarray) -> np.ndarray:
-        """The points (n, ndim), or the first of them that the limit of simulations allows."""
+        """The points (n, ndim), or the first points that the limit of simulations allows."""
         fitting = self.budget.fitting(coords)
         return coords if fitting == len(coords) else coords[: fitting if self.evaluates_parts else 0]
 
@@ -383,7 +383,7 @@ class Evaluator:
         return batch
 
     def _check_failures(self, batch: EvaluatedBatch, whole: bool) -> None:
-        """Raise RuntimeError if too many evaluations have failed; what has not failed is kept."""
+        """Raise RuntimeError if too many evaluations have failed; successful evaluations are kept."""
         if self._limit is None:
             return
         try:
@@ -398,7 +398,7 @@ class Evaluator:
             self.new_evaluations += len(batch.coords)
 
     def _pack(self, log_base: np.ndarray, inside: np.ndarray, batch: EvaluatedBatch | None) -> np.ndarray:
-        """Records of points with log-density (n,) at beta = 0, of which those `inside` (n,) are evaluated."""
+        """Records of points with log-density (n,) at beta = 0; only the points `inside` (n,) are evaluated."""
         if batch is not None and batch.blobs is not None and len(self._fields) == 2:
             self._fields.append(("blobs", batch.blobs.dtype, batch.blobs.shape[1:]))
         records = np.zeros(len(log_base), dtype=self._fields)
@@ -410,7 +410,7 @@ class Evaluator:
         return records
 
     def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
-        """Records of the points before the first one that was not evaluated."""
+        """Records of the points before the first point that was not evaluated."""
         done = sum(len(batch.coords) for batch in batches)
         first = slice(0, int(np.flatnonzero(inside)[done]))
         batch = merge_batches(batches) if batches else None

@@ -1,9 +1,9 @@
 """Checks of the first values of a user's function for mistakes that give a wrong result without an error.
 
 A function may return an array in place of a sum, which emcee reads as a number and blobs; or a log-likelihood may be
-passed as log-posterior, or the reverse. An error is raised only where the values prove the mistake. Suspicious arrays
-with one number per parameter cost two more evaluations. The second check costs two values of the method
-``log_likelihood`` of an object that has one.
+passed as log-posterior, or the reverse. An error is raised only if the values prove the mistake. Suspicious arrays with
+one number per parameter cost two more evaluations. The second check costs two calls of the method ``log_likelihood``,
+if the object has it.
 """
 
 from typing import Any, NamedTuple
@@ -39,7 +39,7 @@ class FirstEvaluations(NamedTuple):
     any_blobs: bool
 
     def __call__(self, evaluator: Any, batch: EvaluatedBatch) -> None:
-        """Raise ValueError where the values of an `Evaluator` prove a mistake."""
+        """Raise ValueError if the values of an `Evaluator` prove a mistake."""
         rows = np.flatnonzero(np.isfinite(batch.log_prob))
         if len(rows) < POINTS:
             return
@@ -111,12 +111,12 @@ class FirstEvaluations(NamedTuple):
 
 
 def _equal(first: np.ndarray, second: np.ndarray | float, scale: np.ndarray | float) -> np.ndarray:
-    """Whether values are equal up to rounding errors of numbers of a scale."""
+    """Whether values are equal up to rounding errors at a given scale."""
     return np.abs(first - second) <= ROUNDING * (1.0 + np.abs(scale))
 
 
 def _is_outer_sum(values: np.ndarray) -> bool:
-    """Whether values (n, n) are ``a[:, None] + b`` of two arrays, neither of them constant."""
+    """Whether values (n, n) are ``a[:, None] + b`` for two arrays, neither of them constant."""
     column, row, scale = values[:, :1], values[:1], np.max(np.abs(values))
     constant = any(np.all(_equal(part, values[0, 0], scale)) for part in (column, row))
     return not constant and bool(np.all(_equal(values, column + row - values[0, 0], scale)))

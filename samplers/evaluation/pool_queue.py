@@ -1,4 +1,4 @@
-"""A queue of evaluations in a pool: points go out one by one, and their values come back as they are finished."""
+"""A queue of evaluations in a pool: points are sent one by one, and their values return as they are finished."""
 
 import logging
 import threading
@@ -24,7 +24,7 @@ def _has_queue(function: Callable, pool: Any) -> bool:
 
 
 def check_asynchronous(function: Callable, pool: Any, vectorize: bool) -> None:
-    """Raise ValueError where points cannot be submitted one by one."""
+    """Raise ValueError if points cannot be submitted one by one."""
     can_submit = callable(getattr(pool, "submit", None))
     if (_has_queue(function, pool) and vectorize) or (can_submit and not vectorize):
         return
@@ -39,7 +39,7 @@ def check_asynchronous(function: Callable, pool: Any, vectorize: bool) -> None:
 def open_queue(
     function: Callable, captured: Callable, as_items: Callable, queue: Callable[[], Any] | None, pool: Any
 ) -> Any:
-    """The queue of a posterior, or one of a pool (`samplers.evaluation.asynchronous.EvaluationQueue`).
+    """The queue of a posterior or of a pool (`samplers.evaluation.asynchronous.EvaluationQueue`).
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def open_queue(
     captured : callable
         The same function, which returns `Failed` instead of raising.
     as_items : callable
-        Turns points (n, ndim) into a sequence of what the function takes.
+        Converts points (n, ndim) to a sequence of arguments for the function.
     queue : callable, optional
         Opens the queue of a posterior in place of its method ``evaluation_queue``.
     pool : object, optional
@@ -62,7 +62,7 @@ def open_queue(
 
 
 def pool_size(pool: Any) -> int | None:
-    """Number of workers of a pool, if it says so."""
+    """Number of workers in a pool, if the pool states it."""
     threads = getattr(pool, "nthreads", None)  # of a dask client
     if callable(threads):
         return sum(threads().values()) or None
@@ -71,7 +71,7 @@ def pool_size(pool: Any) -> int | None:
 
 
 def advise_on_pool(pool: Any) -> None:
-    """Warn in the log of a dask client whose workers are jobs of a queueing system: nobody replaces them."""
+    """Warn in the log about a dask client whose workers are jobs of a queueing system: ended jobs are not replaced."""
     if hasattr(pool, "gather") and hasattr(getattr(pool, "cluster", None), "job_script"):
         logger.warning(
             "nobody may replace the jobs of this dask client when they end, as by their walltime, and the run would "
@@ -96,9 +96,9 @@ class PoolQueue:
     function : callable
         Function of a point, which can be sent to the workers and returns `Failed` instead of raising.
     pool : concurrent.futures.Executor or dask.distributed.Client
-        The pool; executors of mpi4py and loky are of the first kind.
+        The pool; the executors of mpi4py and loky are `concurrent.futures.Executor` objects.
     as_items : callable
-        Turns points (n, ndim) into a sequence of what the function takes.
+        Converts points (n, ndim) to a sequence of arguments for the function.
     """
 
     def __init__(self, function: Callable, pool: Any, as_items: Callable[[Any], Sequence]):
@@ -111,7 +111,7 @@ class PoolQueue:
 
     @property
     def workers(self) -> int | None:
-        """Number of points that are evaluated at once, if the pool says so."""
+        """Number of points that are evaluated at once, if the pool states it."""
         return pool_size(self._pool)
 
     def submit(self, coords: Any) -> list[int]:
@@ -133,12 +133,12 @@ class PoolQueue:
         self._arrived.set()
 
     def collect(self) -> list[tuple[int, Any]]:
-        """Wait until a point is finished; returns numbers and values of all that are, in the order of completion.
+        """Wait for a finished point; returns numbers and values of all finished points, in the order of completion.
 
         Raises
         ------
         RuntimeError
-            If no point is running, or the pool cannot go on. Points that were finished before are returned first.
+            If no point is running, or the pool cannot go on. Points that finished before are returned first.
         """
         for ticket in self._handed:
             self._ended.pop(ticket, None)  # first: `ended` may be called if Ctrl-C comes between the two
@@ -159,11 +159,11 @@ class PoolQueue:
         return collected
 
     def ended(self) -> list[tuple[int, Any]]:
-        """Numbers and values of the points that have ended, without waiting, also of those last collected."""
+        """Numbers and values of all points that have ended, without waiting, including the last collected points."""
         return self._fetch(SECONDS_TO_FETCH)[0]
 
     def _fetch(self, seconds: float | None = None) -> tuple[list[tuple[int, Any]], BaseException | None]:
-        """Numbers and values of the points that have ended, and an error for which no point can be blamed, if any."""
+        """Numbers and values of the points that have ended, and an error that no point has caused, if any."""
         fetched, fault = [], None
         for ticket in list(self._ended):
             future, value = self._futures[ticket], None

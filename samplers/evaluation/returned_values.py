@@ -127,7 +127,7 @@ def log_densities(results: Any, n: int, name: str) -> np.ndarray:
 
 
 class Failed:
-    """Takes the place of a result where a function raised an exception, or reports a fault.
+    """Takes the place of a result if a function raised an exception or reports a fault.
 
     Parameters
     ----------
@@ -152,9 +152,9 @@ def _lost_in_pool(result: Any) -> bool:
 class ErrorCapturing:
     """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can.
 
-    A function of one point, or the object of a method, may have a method ``fault(point)``, which returns the reason why
-    the point could not be evaluated by a fault of the infrastructure (a process that was killed, a full disk), or an
-    empty string. Such a point has `Failed` as well, because the records of a function in a worker are not seen in this
+    A function of one point, or the object of a method, may have a method ``fault(point)``. It returns a reason if a
+    fault of the infrastructure (a killed process, a full disk) prevented the evaluation of the point, else an empty
+    string. Such a point also gives `Failed`, because the records of a function in a worker are not seen in this
     process.
 
     An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
@@ -205,8 +205,8 @@ def outcomes(
 ) -> tuple[np.ndarray, np.ndarray | None, dict[int, str]]:
     """Log-probabilities and blobs as in `log_probabilities`, and the reasons of failures by row.
 
-    A point fails by an exception or a fault (`ErrorCapturing`), by NaN, or where a pool lost every process that
-    evaluated it. Its log-probability is NaN; its blobs are zero or empty.
+    A point fails by an exception or a fault (`ErrorCapturing`), by NaN, or if a pool lost every process that evaluated
+    it. Its log-probability is NaN; its blobs are zero or empty.
     """
     reasons = {}
     if isinstance(results, list):

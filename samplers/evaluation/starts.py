@@ -1,13 +1,13 @@
 """Tests of whether initial points can be draws of the density at beta = 0, by default the prior.
 
-Annealing must start from draws of this density: a ball of points, as is usual in emcee, gives a wrong evidence, and
-wrong weights of modes. Where there are draws to compare with, three kinds of two-sample Kolmogorov-Smirnov tests are
-made: of each parameter, of its distance from the median of the draws, which tests the scale, and of the distance of
-each point from the centre, which tests all parameters together. They are valid for any prior, also with ties.
+Annealing must start from draws of this density: a ball of points, as is usual in emcee, gives a wrong evidence and
+wrong weights of modes. If there are draws to compare with, two-sample Kolmogorov-Smirnov tests compare each parameter,
+its distance from the median of the draws (which tests the scale), and the distance of the points from the centre (which
+tests all parameters together). The tests are valid for any prior, also with ties.
 
-Where only the density is known, the points make Metropolis steps that keep it. If x is a draw, then (x, x') and (x', x)
-have the same distribution, so any function of x' minus the same function of x is symmetric about zero (Besag & Clifford
-1989, Generalized Monte Carlo significance tests, doi:10.1093/biomet/76.4.633). A ball spreads instead.
+If only the density is known, the points make Metropolis steps that leave it invariant. If x is a draw, then (x, x') and
+(x', x) have the same distribution, so any function of x' minus the same function of x is symmetric about zero (Besag &
+Clifford 1989, Generalized Monte Carlo significance tests, doi:10.1093/biomet/76.4.633). A ball spreads instead.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,8 +86,8 @@ def spread_by_metropolis(coords: np.ndarray, log_density: Callable[[np.ndarray],
     """Why points (n, ndim) cannot be draws of a density; empty if they can.
 
     `log_density` maps points (m, ndim) to values (m,), normalised or not. Each half of the points makes steps that are
-    differences of points of the other half. Signed ranks compare the distances from the mean of the other half before
-    and after.
+    differences between points in the other half. Signed ranks compare the distances from the mean of the other half
+    before and after the steps.
     """
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
     if n < FEWEST_FOR_METROPOLIS:

@@ -1,4 +1,4 @@
-"""The functions of a user: the posterior as one function or as prior and likelihood, and what belongs to it."""
+"""The user's functions: the posterior as one function or as prior and likelihood, and optional attributes."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 class OptionalAttributes(NamedTuple):
-    """What a user's log-posterior or log-likelihood may offer besides being callable.
+    """Optional attributes of a user's log-posterior or log-likelihood.
 
     Attributes
     ----------
@@ -26,8 +26,8 @@ class OptionalAttributes(NamedTuple):
     report : callable, optional
         Function that returns a dictionary, such as ``{"simulations": 120}``.
     possible : callable, optional
-        Function of points (n, ndim), always an array, that returns whether each of them (n,) may have a positive
-        density, as far as is known without a simulation. A value of -inf elsewhere is no failed simulation.
+        Function of points (n, ndim), always an array, that returns whether each point may have a positive density (n,),
+        as far as is known without a simulation. A value of -inf at other points is not a failed simulation.
     fast_parameters : sequence of int
         Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
     ndim : int, optional
@@ -56,7 +56,7 @@ class OptionalAttributes(NamedTuple):
         )
 
     def slow_parameters(self, ndim: int) -> list[int]:
-        """Indices of the parameters that a simulation depends on; all where none is slow."""
+        """Indices of the parameters that a simulation depends on; all parameters if none is slow."""
         fast = set(self.fast_parameters)
         return [j for j in range(ndim) if j not in fast] or list(range(ndim))
 
@@ -105,13 +105,13 @@ class UserFunctions(NamedTuple):
     Attributes
     ----------
     name : str
-        "log_prob_fn" or "log_likelihood_fn": which of them was given.
+        "log_prob_fn" or "log_likelihood_fn", whichever was given.
     function : callable
         That function.
     log_prior : callable
         Log-density of the prior.
     optional : OptionalAttributes
-        What `function` offers besides being callable.
+        Optional attributes of `function`.
     start_density : callable, optional
         Log-density that the initial state is drawn from; the log-prior by default.
     """
@@ -164,14 +164,14 @@ class UserFunctions(NamedTuple):
         return self.name == "log_likelihood_fn"
 
     def described(self) -> dict:
-        """Entries in the header of a run besides fingerprints; None for functions that are not used."""
+        """Entries in the header of a run besides fingerprints; None for unused functions."""
         return {
             "log_likelihood_fn": "used" if self.is_likelihood else None,
             "start_density": None if self.start_density is None else "used",
         }
 
     def draw_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
-        """Draws (n, ndim) of the prior; ValueError without `sample_prior`, or where there is a `start_density`."""
+        """Draws (n, ndim) of the prior; ValueError without `sample_prior`, or with a `start_density`."""
         if self.start_density is not None:
             raise ValueError(f"initial_state is None, but start_density is given: pass {n} draws of it")
         if self.optional.sample_prior is None:

@@ -40,9 +40,9 @@ HIGH_CORRELATION = 0.9
 SEPARATE_MODES, ANY_MODES = 0.25, 0.5
 LARGE_ERROR = 0.35
 LARGE_SHARE = 0.8
-# Difference of two log-evidences that is reported even where the error of the second one is not known.
+# Difference of two log-evidences that is reported even if the error of the second log-evidence is not known.
 LARGE_DIFFERENCE = 1.0
-# Log-evidence of recycling minus log-evidence of the moves after it, from which on a mode may be lost: a mode with a
+# Log-evidence of recycling minus log-evidence of the moves after it, above which a mode may be lost: a mode with a
 # quarter of the mass.
 LOST_EVIDENCE = 0.3
 # Correlation of log-weights with the log-weights of the nearest points, below which jumps of the likelihood explain a
@@ -54,7 +54,7 @@ SMOOTH_WEIGHTS = 0.6
 # in 10 dimensions, where the nearest points are far away.
 ROUGH_WEIGHTS = 0.25
 NEIGHBOURS = 3
-# Difference of two shares of a component, from which on it is reported if it is also significant.
+# Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
 # Differences of evidences and shares, and of means in many parameters, are reported beyond this many standard errors.
 FAR, FAR_MEANS = 3.0, 4.0
@@ -78,10 +78,10 @@ def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
 
 
 def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Concern]:
-    """Concerns if the last stage is the first one that is collapsed or stuck.
+    """Concerns if the last stage is collapsed or stuck, and no earlier stage was.
 
-    Collapsed: fewer distinct points survived the resampling than 2 % of the walkers, or than span the parameters.
-    Stuck: less than 1 % of the proposals were accepted.
+    Collapsed: the distinct points that survived the resampling are fewer than 2 % of the walkers, or too few to span
+    the parameters. Stuck: less than 1 % of the proposals were accepted.
     """
     stage, number, concerns = stages[-1], len(stages), []
     collapsed = [_collapsed(s, nwalkers, ndim) for s in stages]
@@ -105,11 +105,11 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
     """Concerns if annealing by moves ended with points that had not moved enough, or if one stage dominates the error.
 
     Not moved enough: the largest correlation of the final population with its resampled start, `correlation`, is above
-    0.9. Not reported where `check_stages` found the moves stuck.
+    0.9. Not reported if `check_stages` found the moves stuck.
 
     One dominant stage: its weights alone give the log-evidence a standard error of 0.35 or more, and at least 0.8 of
-    the variance of all stages. This happens where beta could not be chosen freely, for example if most draws of the
-    prior have zero likelihood. Not reported for a collapsed stage.
+    the total variance. This happens if beta could not be chosen freely, for example because most draws of the prior
+    have zero likelihood. Not reported for a collapsed stage.
     """
     concerns = []
     if correlation > HIGH_CORRELATION and not any(s.acceptance < LOW_ACCEPTANCE for s in stages):
@@ -140,7 +140,7 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
 
 
 def check_mode_shares(coords: np.ndarray, founders: np.ndarray, correlation: float) -> list[Concern]:
-    """A concern if the moves hardly connect the modes that there are or may be, so that their shares are uncertain.
+    """A concern if the moves hardly connect modes that exist or may exist, so that the shares of modes are uncertain.
 
     All resamplings since the modes separated have changed the shares; the founders show only the latest resamplings.
 
@@ -151,8 +151,8 @@ def check_mode_shares(coords: np.ndarray, founders: np.ndarray, correlation: flo
     founders : (n,) int
         Their founders.
     correlation : float
-        Largest correlation of the final points with their resampled start. Reported between 0.5 and 0.9; where there
-        are several modes, between 0.25 and 0.9.
+        Largest correlation of the final points with their resampled start. Reported between 0.5 and 0.9, or between
+        0.25 and 0.9 with several modes.
     """
     if not SEPARATE_MODES < correlation <= HIGH_CORRELATION:
         return []
@@ -209,8 +209,8 @@ def check_fallback(
 ) -> list[Concern]:
     """A concern if annealing by moves lost a part of the posterior that recycling before it had found.
 
-    Recycling may have found more modes although its result was not reliable. Both of its estimates of the evidence must
-    exceed the evidence of the moves, which is estimated by their check if it is reliable, else by their stages.
+    Recycling may have found more modes although its result was not reliable. Both evidence estimates of recycling must
+    exceed the evidence of the moves: the estimate of their check if it is reliable, else of their stages.
 
     Parameters
     ----------
@@ -242,11 +242,11 @@ def check_fit(
 ) -> list[Concern]:
     """A concern if the proposal of recycling at beta = 1 describes the posterior poorly.
 
-    Where a bent posterior ends in a narrow tail, neither the points nor the draws of a fitted proposal reach the end of
+    If a bent posterior ends in a narrow tail, neither the points nor the draws of a fitted proposal reach the end of
     the tail, and their weights are even. The effective sample size is then still smaller than expected for Gaussian
     modes (`samplers.estimates.importance.expected_efficiency`), and neighbouring draws have similar weights. Large
-    jumps of a likelihood make the weights of neighbours differ. In between, the cause may be either, and the concern is
-    not grave.
+    jumps of a likelihood, in contrast, make the weights of neighbours differ. Between these cases the cause is
+    uncertain, and the concern is not grave.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def check_fit(
     points : int
         Effective number of points that it was fitted to.
     coords, log_weights : (n, ndim) float, (n,) float
-        Draws at beta = 1 and their log-weights; the draws of the check are the last ones.
+        Draws at beta = 1 and their log-weights; the draws of the check come last.
     """
     if not fits_poorly(check, mixture, points):
         return []
@@ -298,7 +298,7 @@ def _neighbour_correlation(coords: np.ndarray, log_weights: np.ndarray) -> float
 def check_shares(
     mixture: Mixture, points: np.ndarray, founders: np.ndarray, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Concern]:
-    """A concern if a part of the posterior has another share among the final points than among weighted draws.
+    """A concern if a part of the posterior has different shares among the final points and among weighted draws.
 
     The parts are the components of the mixture that the draws come from. Each draw and each point counts for the
     components by its responsibilities. A difference is reported if it exceeds 0.1 and three standard errors.
@@ -338,7 +338,7 @@ def check_shares(
 
 
 def check_agreement(runs: Sequence[WeightedRun], mixture: Mixture, inherited: float) -> list[Concern]:
-    """A concern if runs differ in the evidence, the share of a part of the posterior, or a mean.
+    """A concern if runs differ in the evidence, in the share of a posterior part, or in a mean.
 
     Parameters
     ----------
@@ -388,7 +388,7 @@ def check_agreement(runs: Sequence[WeightedRun], mixture: Mixture, inherited: fl
 def check_guide_against_recycling(
     of_guide: float, error_of_guide: float, log_evidence: float, error: float
 ) -> list[Concern]:
-    """A concern if the rounds of a guide and recycling after them differ in the evidence: one has lost a part."""
+    """A concern if the rounds of a guide and the recycling after them differ in the evidence: one has lost a part."""
     if abs(of_guide - log_evidence) <= FAR * float(np.hypot(error_of_guide, error)):
         return []
     message = (
@@ -400,7 +400,7 @@ def check_guide_against_recycling(
 
 
 def describe_unused_guide(reason: str, impossible: bool) -> str:
-    """The warning where the draws of a guide are not used; `impossible`: none has a finite log-probability."""
+    """The warning when the draws of a guide are not used; `impossible`: none has a finite log-probability."""
     if impossible:
         return (
             f"the draws of the guide are impossible ({reason}), so the run goes on without them, by annealing from the "

@@ -1,8 +1,8 @@
-"""Whether failed evaluations border on the posterior, so that they may end it instead of the data.
+"""Whether failed evaluations border on the posterior, so that they, not the data, may end it.
 
 A failed simulation counts as impossible. Far from the posterior this changes nothing. Next to the final points it cuts
-off a part of the posterior, and no weight, evidence or move shows it. Failures that are scattered among successful
-points thin the posterior out evenly, which changes its mean and standard deviation little.
+off a part of the posterior, which no weight, evidence or move reveals. Failures that are scattered among successful
+points thin the posterior out evenly, which hardly changes its mean and standard deviation.
 
 The share of failures among the 20 evaluated points nearest to each final point does not tell these cases apart. It was
 0.002 to 0.014 in three runs cut off at 1.6 standard deviations, 0.004 to 0.007 in three runs that end at an edge, and
@@ -30,7 +30,7 @@ LEAST_ADJOINING = 0.08  # of the failures in the ellipsoid, relative to the shar
 LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
 UNLIKELY = 1e-4  # probability that so many of them fail by chance
-INSIDE = 0.99  # share of the samples that are closer to their mean than the region that counts as theirs
+INSIDE = 0.99  # share of the samples inside the ellipsoid that counts as their region
 # The latest points are those near the posterior.
 KEPT_POINTS = 20_000
 
@@ -45,14 +45,14 @@ class NearFailures(NamedTuple):
     evaluated : int
         Number of all distinct points there.
     known : bool
-        Whether they are known to be failures; otherwise a log-probability of -inf may have another cause.
+        Whether these points are known to be failures; otherwise a log-probability of -inf may have another cause.
     adjoining : int
         Number of failures, in the ellipsoid or not, among the 20 (more after a long chain) evaluated points that are
         nearest to a sample.
     scattered : bool
         Whether the points about these failures fail no more often than other points among the samples.
     nearest : int
-        Number of all distinct points among those nearest to the samples.
+        Number of distinct points, failed or not, among the points nearest to the samples.
     """
 
     failed: int
@@ -66,9 +66,9 @@ class NearFailures(NamedTuple):
     def place(self) -> Literal["away", "scattered", "edge", "border"]:
         """Where the failures are.
 
-        "away" from the samples: fewer than 5 adjoin them, or 2 % or fewer of the points in the ellipsoid are scattered
-        failures. "scattered": more than 2 %, among successful points. "border": more than 2 %, of which enough adjoin
-        the samples to end the posterior. "edge": others that adjoin the samples.
+        "away" from the samples: fewer than 5 failures adjoin the samples, or failures are scattered among successful
+        points and at most 2 % of the points in the ellipsoid. "scattered": the same with more than 2 %. "border": more
+        than 2 % failed, and enough failures adjoin the samples to end the posterior. "edge": other adjoining failures.
         """
         if self.adjoining < FEWEST_ADJOINING:
             return "away"
@@ -86,19 +86,19 @@ class NearFailures(NamedTuple):
 
 
 def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray) -> NearFailures:
-    """Failures in the region of samples of the posterior, and all distinct points there.
+    """Failures in the region of posterior samples, and all distinct points there.
 
     Parameters
     ----------
     samples : (n, k) float
         Samples of the posterior.
     failed, succeeded : (m, k) float, (l, k) float
-        Points that failed and that did not.
+        Points that failed, and points that did not.
 
     Returns
     -------
     NearFailures
-        Without points if fewer than k + 1 samples are different, since they have no region.
+        Without points if fewer than k + 1 samples are different, since such samples have no region.
     """
     distinct = np.unique(samples, axis=0)
     if len(distinct) <= samples.shape[1]:
@@ -143,7 +143,7 @@ def judged_failures(
     counts_failures: bool,
     possible: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> NearFailures:
-    """Failures of a run in the region of its final points, which its verdict depends on.
+    """Failures in the region of a run's final points, on which the verdict depends.
 
     Parameters
     ----------
@@ -155,11 +155,11 @@ def judged_failures(
     columns : (k,) int
         The parameters that a simulation depends on.
     counts_failures : bool
-        Whether the log-density counts failures by itself. All values of -inf are failures then; otherwise they may
-        have another cause.
+        Whether the log-density counts failures by itself. All values of -inf are then failures; otherwise they may have
+        another cause.
     possible : callable, optional
-        Function of points (n, ndim) that returns whether each of them (n,) may have a positive density, as far as is
-        known without a simulation. Points that are not possible lie outside the support and do not count.
+        Function of points (n, ndim) that returns whether each point may have a positive density (n,), as far as is
+        known without a simulation. Impossible points lie outside the support and do not count.
     """
     latest = slice(-KEPT_POINTS, None)
     coords, log_prob, failed = coords[latest], log_prob[latest], failed[latest]

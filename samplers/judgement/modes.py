@@ -1,10 +1,10 @@
 r"""Modes of a finished run: clusters of its final points, with shares and their errors.
 
 A mixture of Student t is fitted to the final points (`samplers.proposals.mixture`). Two components belong to the same
-mode if the density of the mixture along the straight line between their means does not fall below a fifth of the lower
-of the two ends; components in between connect others. For two equal Gaussian components, this is a distance of about 4
-standard deviations. The share of a mode is the mean, over the chain, of the probability that a point belongs to one of
-its components.
+mode if the mixture density along the straight line between their means does not fall below a fifth of its lower end
+value; components in between connect other components. For two equal Gaussian components, this is a distance of about 4
+standard deviations. The share of a mode is the probability that a point belongs to one of its components, averaged over
+the chain.
 
 The mixture describes the points of the run, so a mode that holds no points is not found.
 """
@@ -34,7 +34,7 @@ class Mode(NamedTuple):
     share_error : float
         Standard error of `share`, from the founders of the walkers (`samplers.estimates.genealogy`).
     mean, sd : (ndim,) float
-        Mean and standard deviation of the points of the mode, in the units of the parameters.
+        Mean and standard deviation of the points in the mode, in the units of the parameters.
     """
 
     share: float
@@ -78,7 +78,7 @@ def find_modes(chain: np.ndarray, founders: np.ndarray) -> tuple[Mode, ...]:
 
 
 def _groups(mixture: Mixture) -> np.ndarray:
-    """Number of the mode of each component (K,)."""
+    """Mode number of each component (K,)."""
     # the components are defined after the shears, so lines are straight there
     straight = mixture._replace(shears=(), bounds=None)
     count = len(mixture.means)

@@ -1,13 +1,13 @@
-"""What the result of a run is worth, in words: converged, usable or not usable, with reasons.
+"""Verdict on the result of a run: converged, usable or not usable, with reasons.
 
 ``converged``
     Nothing that the run can observe speaks against the result.
 ``usable``
-    Means and evidence have the errors that are stated, but something was not reached or could not be checked.
+    Means and evidence have the stated errors, but something was not reached or could not be checked.
 ``not usable``
     The numbers may be far from the posterior, by more than their stated errors.
 
-No run can see a part of the posterior in which it has no points. The reasons say what the verdict rests on.
+No run can see a part of the posterior in which it has no points. The reasons state the basis of the verdict.
 """
 
 from collections.abc import Callable
@@ -48,7 +48,7 @@ STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 
 
 class EvidenceEstimate(NamedTuple):
-    """One of the estimates of the evidence in a run.
+    """One estimate of the evidence in a run.
 
     Attributes
     ----------
@@ -95,22 +95,22 @@ class _Stored(NamedTuple):
 
 
 class Verdict(_Stored):
-    """What the result of a run is worth. ``str`` gives the reasons in sentences, `summary` the results in one sentence.
+    """Verdict on the result of a run. ``str`` gives the reasons in sentences, `summary` the results in one sentence.
 
-    The attributes listed here are the judgement, which is stored, compared and pickled. The others are computed on
-    first use from the run of the sampler that returned the verdict. A verdict without a sampler raises a ValueError for
-    them; so do `modes`, `worst_effective_sample_size` and `summary` for an empty chain.
+    The attributes listed here are the judgement, which is stored, compared and pickled. Other attributes are computed
+    on first use from the sampler that returned the verdict, and raise ValueError for a verdict without a sampler;
+    `modes`, `worst_effective_sample_size` and `summary` also do for an empty chain.
 
     Attributes
     ----------
     status : {"converged", "usable", "not usable"}
         The judgement.
     reasons : tuple of str
-        The reasons for it.
+        The reasons for the judgement.
     simulations : float
         Simulations made (`samplers.budget`).
     more_simulations : float, optional
-        About how many more simulations a converged result takes; 0 if it is converged, None if that is not known.
+        About how many more simulations a converged result takes; 0 if the result is converged, None if unknown.
     effective_sample_size : float
         Effective sample size of the points that `sample` names, when beta = 1 was reached.
     sample : str
@@ -121,7 +121,7 @@ class Verdict(_Stored):
     _run: RunParts | None = None
 
     def of(self, run: RunParts) -> "Verdict":
-        """This verdict with the run that its other attributes are computed from."""
+        """This verdict with the run from which its other attributes are computed."""
         verdict = Verdict(*self)
         verdict._run = run
         return verdict
@@ -145,7 +145,7 @@ class Verdict(_Stored):
 
     @property
     def _founders(self) -> np.ndarray:
-        """Founder of each walker; each walker has its own where the record of the resampling is lost."""
+        """Founder of each walker; a different founder for each walker if the record of the resampling is lost."""
         founders = self._parts.result.founders
         return np.arange(self._parts.nwalkers) if founders is None else founders
 
@@ -161,9 +161,9 @@ class Verdict(_Stored):
 
     @property
     def pareto_shape(self) -> float | None:
-        """Largest Pareto shape of the weights of the check and of the draws of a guide; None without either.
+        """Largest Pareto shape of the weights from the check and from the draws of a guide; None without either.
 
-        Weights of a shape above 0.7 have no useful mean.
+        Weights with a shape above 0.7 have no useful mean.
         """
         result = self._parts.result
         shapes = [] if result.check is None else [result.check.pareto_shape]
@@ -173,10 +173,10 @@ class Verdict(_Stored):
 
     @property
     def near_failures(self) -> NearFailures | None:
-        """Failures in the region of the last walkers, which the verdict depends on; None for a chain of a file.
+        """Failures in the region of the last walkers, on which the verdict depends; None for a chain read from a file.
 
         Values of -inf inside the support of the prior are failures if ``log_prob_fn.report()`` has a "failure_count",
-        except where ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
+        except if ``log_prob_fn.possible(points)`` is False: parameters that need no simulation are impossible there.
         """
         return self._parts.near
 
@@ -250,7 +250,7 @@ def judge(
     failures : str
         How many evaluations failed, for the reasons; empty if none did.
     near : NearFailures, optional
-        Failures in the region of the final points; None where they are not known.
+        Failures in the region of the final points; None if they are not known.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]
@@ -319,7 +319,7 @@ def independent_points(result: AnnealingResult, coords: np.ndarray) -> float:
     """Effective sample size of the walkers (n, ndim) when beta = 1 was reached.
 
     For walkers resampled from weighted draws and not moved, the effective sample size of the weights. Otherwise the
-    smallest squared ratio, over the parameters, of standard deviation and standard error of the mean, at most n.
+    squared ratio of standard deviation to standard error of the mean, for the worst parameter, at most n.
     """
     if result.early_stop is not None and not result.early_stop.complete:
         return result.early_stop.effective_sample_size
@@ -360,7 +360,7 @@ def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Concern]:
 
 
 def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | None:
-    """Draws that the guide still needs if its later rounds are like the last one; None if that one says nothing."""
+    """Draws that the guide still needs if later rounds are like the last round; None if the last round says nothing."""
     last = rounds[-1]
     if last.effective_share < USABLE_SHARE:
         return None
@@ -381,7 +381,7 @@ def _evidences(result: AnnealingResult) -> list[EvidenceEstimate]:
 
 
 def _unknown(run: RunParts) -> list[str]:
-    """What a run cannot know."""
+    """Questions that a run cannot answer."""
     result = run.result
     missing = [
         f"modes that none of the points came near, above all modes much narrower than those found and modes in a part "

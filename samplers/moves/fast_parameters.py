@@ -1,7 +1,7 @@
 """Extra sweeps over fast parameters, made after each move that needs a simulation.
 
-In many posteriors some parameters change the density without a new simulation: the standard deviations of the noise,
-for example, when the sums of squared residuals are cached. The cosmology codes CosmoMC and Cobaya call them *fast
+In many posteriors some parameters change the density without a new simulation: the noise standard deviations, for
+example, when the sums of squared residuals are cached. The cosmology codes CosmoMC and Cobaya call them *fast
 parameters*. A posterior declares them by an attribute ``fast_parameters``, the indices of these parameters. After each
 expensive move the ensemble makes a few random-walk steps in the fast parameters alone, with all other parameters fixed.
 This is Metropolis within Gibbs, so the target distribution is unchanged, and the fast parameters decorrelate without
@@ -26,8 +26,8 @@ from .kernels import Inside, MixtureMove, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
-# Optimal for a random walk in two dimensions; it is 0.44 in one dimension and 0.23 in many. Gelman, Roberts & Gilks
-# (1996), Efficient Metropolis jumping rules, Bayesian Statistics 5, 599-608.
+# Optimal acceptance of a random walk in two dimensions; it is 0.44 in one dimension and 0.23 in many. Gelman, Roberts &
+# Gilks (1996), Efficient Metropolis jumping rules, Bayesian Statistics 5, 599-608.
 TARGET_ACCEPTANCE = 0.35
 
 
@@ -75,9 +75,9 @@ class WithFastSweeps(Move):
     indices : sequence of int
         Indices of the fast parameters.
     sweeps : int
-        Number of random-walk steps of the whole ensemble in the fast parameters after each move. The initial scale of
-        the walk is 2.38 / sqrt(number of fast parameters) times a root of the conditional covariance; ``tune`` adapts
-        it.
+        Number of random-walk steps that the whole ensemble makes in the fast parameters after each move. The initial
+        scale of the walk is 2.38 / sqrt(number of fast parameters) times a root of the conditional covariance; ``tune``
+        adapts it.
 
     Raises
     ------
@@ -107,7 +107,7 @@ class WithFastSweeps(Move):
 
     @property
     def fast_acceptance(self) -> float:
-        """Mean acceptance of the fast sweeps after the latest move; NaN before the first one."""
+        """Mean acceptance of the fast sweeps after the latest move; NaN before the first move."""
         return float(np.mean(self._accepted)) if len(self._accepted) else float("nan")
 
     def calibrate(
@@ -121,7 +121,7 @@ class WithFastSweeps(Move):
         self._walk.calibrate(coords, weights, inside)
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
-        """Pass points (n, ndim) and the logarithm of the target (n,) on to the move if it is a mixture move."""
+        """Pass points (n, ndim) and the log-target (n,) to the move if it is a mixture move."""
         if isinstance(self.move, MixtureMove):
             self.move.cover_basins(coords, log_target)
 

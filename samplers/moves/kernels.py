@@ -1,12 +1,12 @@
 """Mutation kernels in the form of emcee moves.
 
-A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do this. The moves of
+A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do this. The moves in
 this module also adapt to the population: their method ``calibrate(coords, weights, inside)`` is called once per stage
 with the points of the previous stage, their weights at the new beta, and a function that returns which points lie in
 the support of the prior. They propose for all walkers at once.
 
-Proposals are fitted in units of the weighted standard deviations, so parameters of very different size (2e-4 s and
-3e10 Pa, for example) cause no numerical problem.
+Proposals are fitted in units of the weighted standard deviations, so parameters with very different magnitudes (2e-4 s
+and 3e10 Pa, for example) cause no numerical problem.
 
 The acceptance probabilities are derived in ``docs/theory/tempering``.
 """
@@ -47,7 +47,7 @@ __all__ = [
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
-# The same while the independence kernel has a high acceptance: it decorrelates the ensemble fastest.
+# Probabilities while the independence kernel has a high acceptance: it decorrelates the ensemble fastest.
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
 # Attempts to replace independent draws outside the support of the prior; what is left then is rejected.
 REDRAWS = 20
@@ -104,17 +104,17 @@ def calibrate_move(
 
 
 def _first_half(coords: np.ndarray) -> np.ndarray:
-    """Which of the walkers (n, ndim) belong to the first half of their places, in the order of the walkers.
+    """Which walkers (n, ndim) are at the first half of the distinct points, in the order of the walkers.
 
-    Copies of one point are in one half: the other half then contains no point of the walkers that it is fitted for, and
-    each half has half of the distinct points. Without copies, it is the first half of the walkers.
+    Copies of one point are in the same half, so that a proposal is never fitted to a point that it moves, and each half
+    has half the distinct points. Without copies, it is the first half of the walkers.
     """
     _, first, place = np.unique(coords, axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[place.reshape(-1)] < len(first) // 2
 
 
 def _check_half(coords: np.ndarray) -> None:
-    """ValueError if the points (n, ndim) of half of the walkers span no volume; a warning if they are few."""
+    """ValueError if the points (n, ndim) in half the walkers span no volume; a warning if they are few."""
     places, ndim = np.unique(coords, axis=0), coords.shape[1]
     sd = places.std(axis=0)
     standard = (places - places.mean(axis=0)) / np.where(sd > 0.0, sd, 1.0)
@@ -137,12 +137,12 @@ def _check_half(coords: np.ndarray) -> None:
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
 
-    Where it was not calibrated (in a plain EnsembleSampler, or in a run that goes on from a chain without its record),
-    two copies are fitted to one half of the walkers each, and move the other half. A proposal that was fitted to the
-    points that it moves would make their tails too light for many sweeps; this one is independent of them. The halves
-    and both fits stay as they are until the number of walkers changes: the copies of one point are in one half, and
-    each half has half of the distinct points. A half needs ndim + 1 of them or more that span all dimensions
-    (ValueError); with fewer than 5 (ndim + 1) there is a warning, since the proposals may be too narrow.
+    Without a calibration (in a plain EnsembleSampler, or in a run that goes on from a chain without its record), two
+    copies are fitted to one half of the walkers each, and move the other half. A proposal that is fitted to the points
+    that it moves would make their tails too light for many sweeps; these proposals are independent of the points. The
+    halves and both fits do not change until the number of walkers changes: copies of one point are in the same half,
+    and each half has half the distinct points. Each half needs at least ndim + 1 distinct points that span all
+    dimensions (ValueError); with fewer than 5 (ndim + 1) there is a warning, since the proposals may be too narrow.
     """
 
     def __init__(self):
@@ -184,7 +184,7 @@ class _FittedMove(MHMove):
 
 
 class _GaussianFit(_FittedMove):
-    """A move whose proposal has the mean and a root of the covariance of weighted points."""
+    """A move whose proposal has the mean and a covariance root of weighted points."""
 
     def __init__(self):
         super().__init__()
@@ -217,12 +217,12 @@ class RandomWalkMove(_GaussianFit):
     Parameters
     ----------
     scale : float, optional
-        Factor of the root of the covariance; 2.38 / sqrt(ndim) by default.
+        Factor on the covariance root; 2.38 / sqrt(ndim) by default.
     adapt : bool
         Whether ``tune`` adapts the scale to reach the acceptance `target`. The adapted scale is kept for later stages.
     target : float, optional
         Desired acceptance; 0.234 is optimal in many dimensions. None: 0.23 + 0.21 / ndim, for any number of dimensions
-        (Gelman, Roberts & Gilks 1996 for its values; Betz, Papaioannou & Straub 2016 for the formula).
+        (values: Gelman, Roberts & Gilks 1996; formula: Betz, Papaioannou & Straub 2016).
 
     References
     ----------
@@ -295,21 +295,21 @@ class StudentTMove(_GaussianFit):
 
 
 class MixtureMove(_FittedMove):
-    """Three kernels from one mixture of Student t fitted to the stage; each sweep chooses one of them at random.
+    """Three kernels from one Student t mixture fitted to the stage; each sweep chooses one kernel at random.
 
     independence
         Draws from the mixture (`samplers.proposals.mixture`). They cross between modes, and replace most of the
-        ensemble when the mixture fits well. Half of all sweeps use this kernel, and 80 % while more than
-        `independence_threshold` of its proposals are accepted. A draw outside the support of the prior is repeated
-        before it is evaluated: the proposal is the mixture truncated to the support.
+        ensemble when the mixture fits well. Half of all sweeps use this kernel, or 80 % while its acceptance is above
+        `independence_threshold`. A draw outside the support of the prior is repeated before it is evaluated: the
+        proposal is the mixture truncated to the support.
     local walk
         Random walk with the covariance of one component. The component is drawn from the responsibilities of the
-        components for the current point; the acceptance contains the ratio of the responsibilities of that component
-        after and before the step, which makes the kernel reversible.
+        components for the current point; the acceptance contains the ratio of its responsibilities after and before the
+        step, which makes the kernel reversible.
     differences
-        Differential evolution: a step along the difference of two points of the previous stage, drawn by their weights.
-        One step in ten is the whole difference, which leads from mode to mode. The two points come from the stage that
-        the move was calibrated on, so a step does not depend on the ensemble that is being moved.
+        Differential evolution: a step along the difference of two points from the previous stage, drawn by their
+        weights. One step in ten is the whole difference, which leads from mode to mode. The two points come from the
+        stage that the move was calibrated on, so a step does not depend on the ensemble that is being moved.
 
     The first sweep after each calibration uses the independence kernel. The scales of the last two kernels are adapted
     by ``tune`` to reach the acceptance `target`.
@@ -317,9 +317,9 @@ class MixtureMove(_FittedMove):
     Parameters
     ----------
     max_components : int
-        Largest number of components of the mixture, where it is fitted. After recycling, it is the last proposal.
+        Largest number of components in a fitted mixture. After recycling, the mixture is the last proposal.
     independence_threshold : float
-        Acceptance of the independence kernel above which the other two are used less often.
+        Acceptance of the independence kernel above which the other two kernels are used less often.
     target : float
         Desired acceptance of the local walk and of the differences.
 
@@ -361,8 +361,8 @@ class MixtureMove(_FittedMove):
 
         The next sweep uses the independence kernel. The bounds of the support are determined at the first call only.
 
-        A mixture that was fitted to the very points that it moves makes their tails too light for many sweeps: where
-        points in the tails have widened it, they are soon replaced, and where there are none, it hardly proposes any.
+        A mixture that was fitted to the points that it moves makes their tails too light for many sweeps: points in the
+        tails that have widened the mixture are soon replaced, and without such points it hardly proposes any.
         """
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
@@ -378,16 +378,16 @@ class MixtureMove(_FittedMove):
         Parameters
         ----------
         coords : ndarray, shape (n, ndim)
-            Points, also of earlier stages.
+            Points, also from earlier stages.
         log_target : ndarray, shape (n,)
-            Logarithm of the target of the stage, scaled so that its integral is about 1.
+            Log-target of the stage, scaled so that the target's integral is about 1.
         """
         self._mixture = cover_basins(self._mixture, coords, log_target)
 
     def expect_independence(self) -> None:
         """Prefer the independence kernel, without a first sweep that shows its acceptance.
 
-        For points that are independent draws of the target already, from the same mixture. A resumed run then needs no
+        For points that are already independent draws of the target, from the same mixture. A resumed run then needs no
         state of the move.
         """
         self._current, self._independence_accepted = 0, True
@@ -421,7 +421,7 @@ class MixtureMove(_FittedMove):
         proposed : ndarray, shape (n, ndim)
             Proposed points.
         log_ratio : ndarray, shape (n,)
-            Logarithm of the ratio of proposal densities q(x | x') / q(x' | x), for the acceptance probability.
+            Log-ratio of proposal densities q(x | x') / q(x' | x), for the acceptance probability.
         """
         proposed = draw(self._mixture, len(coords), random)
         if self._inside is not None:

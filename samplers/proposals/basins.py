@@ -1,30 +1,30 @@
 """Components for parts of the target that a fitted mixture does not cover.
 
-While the target is annealed, a narrow mode holds little mass: of two modes of equal mass with widths s_1 < s_2 in d
-dimensions, the tempered target gives the narrow one the share (s_1 / s_2)^(d (1 - beta)), relative to the wide one. A
-mixture fitted to weighted points takes the few points there for the tail of the wide mode, and the next draws miss
-them. But these points are out of line: near a mode the logarithm of the target is nearly quadratic, and points of
-another mode lie above that quadratic.
+While the target is annealed, a narrow mode holds little mass: for two modes of equal mass with widths s_1 < s_2 in d
+dimensions, the mass of the narrow mode under the tempered target is (s_1 / s_2)^(d (1 - beta)) times the mass of the
+wide mode. A mixture fitted to weighted points takes the few points there for the tail of the wide mode, and the next
+draws miss them. But these points stand out: near a mode the log-target is nearly quadratic, and points of another mode
+lie above it.
 
 For every component of the mixture, a quadratic
 
     log p(z) = a + g z - z A z / 2
 
-is fitted to the points that belong to it, in the coordinates in which the component is the standard one, by least
-trimmed squares, which ignores a minority of the points.
+is fitted to the points of the component, in the coordinates that standardise the component, by least trimmed squares,
+which ignores a minority of the points.
 
 1. Points clearly above the quadratics of all components belong to another basin. A second quadratic is fitted to the
-   highest of them, its neighbours, and all that agree with these. Its mode, at a limited distance, is the mean of a new
-   component, and A^-1 its covariance. So points on the flank of a mode suffice to find it, long before a draw hits its
-   top. With fewer points than coefficients, A is drawn towards a multiple of the identity by ridge regression, with the
-   strength that has the smallest leave-one-out error. With fewer than 1.5 points per dimension, the new component is
-   centred at these points and somewhat narrower than the component they were taken from. The points that it explains
-   are set aside, and the next basin is found among the others.
+   highest of these points, its neighbours, and all points that agree with them. Its mode, at a limited distance, is the
+   mean of a new component, and A^-1 its covariance. So points on the flank of a mode suffice to find the mode, long
+   before a draw hits its top. With fewer points than coefficients, A is drawn towards a multiple of the identity by
+   ridge regression, with the strength that has the smallest leave-one-out error. With fewer than 1.5 points per
+   dimension, the new component is centred at these points and somewhat narrower than the component they were taken
+   from. The points that it explains are set aside, and the next basin is sought among the other points.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
-The new components only decide where draws are made. The weights of the draws are exact, whatever is proposed.
-Constants are our choice, from trials on two and three modes (``python -m benchmarks truth``).
+The new components only decide where draws are made. The weights of the draws are exact for any proposal. Constants were
+chosen by trials on two and three modes (``python -m benchmarks truth``).
 
 References
 ----------
@@ -65,9 +65,9 @@ LONGEST_STEP, LONGEST_SHIFT = 1.5, 2.0
 # Spread up to which most points agree with a quadratic, and Kullback-Leibler divergence per dimension from which on the
 # component is far from it.
 AGREEING, FAR = 1.0, 0.1
-# Covariance of a new component by A^-1, and its scale around very few points by the component's scale.
+# Covariance of a new component over A^-1, and its scale around very few points over the component's scale.
 WIDER, FEW_POINTS_SCALE = 1.2, 0.7
-# Largest share of one basin, and of all together: an estimated mass may be far too large.
+# Largest share of one basin, and of all basins together: an estimated mass may be far too large.
 LARGEST_SHARE, LARGEST_SHARE_OF_ALL = 0.25, 0.5
 # Logarithms are rounded to 1 / 4096, so that a constant added to all of them changes nothing.
 GRID = 4096.0
@@ -76,7 +76,7 @@ RIDGE = 1e-9
 
 
 class _Basin(NamedTuple):
-    """A new component, in the coordinates in which its neighbour is the standard one, and its estimated log-mass."""
+    """A new component, in the coordinates that standardise its neighbour, and its estimated log-mass."""
 
     log_mass: float
     mean: np.ndarray
@@ -141,13 +141,13 @@ def find_basins(
     most : int
         Largest number of components.
     share : float
-        Smallest weight of a component. It is larger, up to 0.25, if the estimated mass of the basin is.
+        Smallest weight of a component. For a basin with a larger estimated mass, the weight is larger, up to 0.25.
 
     Returns
     -------
     Mixture or None
-        The components, in the component space of the mixture. The sum of their weights, at most 0.5, is the share of
-        the draws that they should receive. None if the mixture covers all points.
+        The components, in the component space of the mixture. Their total weight, at most 0.5, is the share of draws
+        that they should receive. None if the mixture covers all points.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
@@ -170,7 +170,7 @@ def find_basins(
 
 
 def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, most: int) -> list[tuple[int, _Basin]]:
-    """Basins among points (n, d) of the component space, each with the component in whose coordinates it is given."""
+    """Basins among points (n, d) of the component space, each with the component whose coordinates it is given in."""
     ndim, variance = points.shape[1], mixture.dof / (mixture.dof - 2.0)
     owner = log_components(mixture, points).argmax(axis=1)
     log_volumes = np.sum(np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)), axis=1)
@@ -205,7 +205,7 @@ def _basins_of_points(mixture: Mixture, points: np.ndarray, target: np.ndarray, 
 
 
 def _standard(mixture: Mixture, k: int, points: np.ndarray) -> np.ndarray:
-    """Points (n, d) of the component space in the coordinates in which component k is the standard one."""
+    """Points (n, d) of the component space in the coordinates that standardise component k."""
     return (points - mixture.means[k]) @ mixture.inverses[k].T
 
 
@@ -235,7 +235,7 @@ def _quadratic(coefficients: np.ndarray, ndim: int) -> _Quadratic:
 
 
 def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quadratic, float, np.ndarray]:
-    """The quadratic that fits most of the points, the spread of the residuals, and a root F of the uncertainty.
+    """The quadratic that fits most points, the spread of the residuals, and a root F of the uncertainty.
 
     For independent residuals with a standard deviation of 1, a prediction from terms t has the standard error |F t|.
     """
@@ -258,12 +258,12 @@ def _fit_most(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Quad
 
 
 def _log_mass(height: float, curvatures: np.ndarray) -> float:
-    """Logarithm of the integral of the exponential of a quadratic with a given maximum and eigenvalues (d,) of A."""
+    """Log-integral of exp(quadratic), for a quadratic with a given maximum and eigenvalues (d,) of A."""
     return height + 0.5 * len(curvatures) * math.log(2.0 * math.pi) - 0.5 * float(np.sum(np.log(curvatures)))
 
 
 def _own_basin(quadratic: _Quadratic, variance: float) -> _Basin | None:
-    """The quadratic of a component itself, if it is far from the component: mean 0 and covariance variance times I."""
+    """Basin of a component's own quadratic, if it is far from the component: mean 0 and covariance variance times I."""
     curvatures, vectors = np.linalg.eigh(quadratic.curvature)
     if curvatures[0] < CURVATURES[0]:
         return None
@@ -278,7 +278,7 @@ def _own_basin(quadratic: _Quadratic, variance: float) -> _Basin | None:
 
 
 def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[_Basin, np.ndarray]:
-    """The basin of the highest of some points (n, d), and which of them it explains (n,)."""
+    """The basin of the highest point among points (n, d), and which points it explains (n,)."""
     ndim, top = points.shape[1], np.argmax(target)
     apart, below = points - points[top], target - target[top]
     squared = np.sum(apart**2, axis=1)
@@ -305,7 +305,7 @@ def _highest_basin(points: np.ndarray, target: np.ndarray, full: bool) -> tuple[
 
 
 def _fit_near(points: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[_Quadratic, float]:
-    """The quadratic of the points near the origin and of all that agree with it, and the spread of their residuals."""
+    """Quadratic fitted to the points near the origin and all points that agree with it, and the residual spread."""
     terms = _terms(points, True)
     regular = np.diag(np.full(terms.shape[1], RIDGE * len(points)))
     fewest = min(int(PER_COEFFICIENT * terms.shape[1]), len(points))
@@ -321,7 +321,7 @@ def _fit_near(points: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tu
 
 
 def _fit_few(points: np.ndarray, target: np.ndarray, weights: np.ndarray, full: bool) -> tuple[_Quadratic, float]:
-    """The quadratic whose products are penalised by the best strength, and the spread of its leave-one-out errors."""
+    """Quadratic from the best ridge regression on the products, and the spread of its leave-one-out errors."""
     terms, n = _terms(points, full), len(points)
     weights = weights / weights.mean()
     penalised = (np.arange(terms.shape[1]) >= points.shape[1] + 2) * 1.0

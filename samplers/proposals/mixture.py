@@ -1,11 +1,11 @@
 """Mixtures of multivariate Student t, fitted to weighted points: an approximation of a population as a density.
 
 A few components represent a population with several modes or a curved ridge well enough for proposals. The heavy tails
-keep the ratio of target and proposal bounded where the fit is too narrow. The number of components minimises the
-Bayesian information criterion, with the effective number of weighted points as sample size.
+keep the ratio of target to proposal bounded if the fit is too narrow. The number of components minimises the Bayesian
+information criterion, with the effective number of weighted points as sample size.
 
-Fits are made in coordinates that whiten the whole population, so parameters of very different size (2e-4 s and 3e10 Pa,
-for example) cause no numerical problem. Fits are deterministic: the same points and weights give the same mixture.
+Fits are made in coordinates that whiten the whole population, so very different magnitudes of parameters (2e-4 s and
+3e10 Pa, say) cause no numerical problem. Fits are deterministic: the same points and weights give the same mixture.
 
 Equations, constants and their reasons are in ``docs/theory/proposals``.
 
@@ -63,7 +63,7 @@ TOLERANCE = 1e-3
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
 NEGLIGIBLE = 1e-3
-# Scale of the map of a single bound, as a multiple of the usual one, with which it is a logarithm.
+# Scale of the map for a single bound, as a multiple of the usual scale, with which the map is a logarithm.
 LOGARITHMIC = 1e3
 # Numbers per shear that the criterion counts: mean, sd, linear and quadratic coefficient.
 PARAMETERS_PER_SHEAR = 4
@@ -151,7 +151,7 @@ def from_component_space(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
 
 
 def _log_sum(parts: np.ndarray) -> np.ndarray:
-    """Logarithm of the sum of exponentials along the rows (n, K) of finite numbers."""
+    """Row-wise log-sum-exp (n,) of finite numbers (n, K)."""
     top = parts.max(axis=1)
     return top + np.log(np.sum(np.exp(parts - top[:, None]), axis=1))
 
@@ -188,7 +188,7 @@ def fit_mixture(
 ) -> Mixture:
     """Fit a mixture; the number of components minimises the Bayesian information criterion.
 
-    Components are added one at a time, each by splitting an existing one, as long as the criterion improves. Each
+    Components are added one at a time, each by splitting an existing component, as long as the criterion improves. Each
     covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then fewer
     degrees of freedom are tried, for points with heavier tails. If shears (`samplers.proposals.transforms`) improve the
     criterion, the components are fitted to the transformed points.
@@ -202,9 +202,9 @@ def fit_mixture(
     max_components : int
         Largest number of components.
     bounds : SupportBounds, optional
-        Bounds of the support. Those near the population are removed by a transformation if this improves the criterion.
+        Bounds of the support. A transformation removes bounds near the population if this improves the criterion.
     dof : float
-        Largest degrees of freedom, above 2. Of these and 4, 3 and 2.5, the ones with the best criterion are used.
+        Largest degrees of freedom, above 2. The value with the best criterion among `dof`, 4, 3 and 2.5 is used.
 
     Returns
     -------
@@ -278,9 +278,9 @@ def _fit_components(
 def _with_heavier_tails(
     best: Mixture, best_criterion: float, white: np.ndarray, weights: np.ndarray, effective: float
 ) -> tuple[Mixture, float]:
-    """Lower the degrees of freedom of a fit as long as the criterion, with one more parameter, improves.
+    """Lower the fitted degrees of freedom as long as the criterion, with one more parameter, improves.
 
-    Several components may have stood for the tails of one, so one component is tried too.
+    Several components may have represented the tails of one component, so a single component is tried too.
     """
     penalty = math.log(max(effective, 2.0))
     for dof in HEAVIER:
@@ -304,10 +304,10 @@ def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
     """Starting assignments (n, K + 1) with one more component: each component is split in two, along two directions.
 
-    The component's points have their smallest and largest fourth moments in these directions. Two groups of
-    similar size are visible along the former, and a small group beside a large one along the latter, in any number of
-    dimensions (invariant coordinate selection: Tyler, D. E., Critchley, F., Duembgen, L. & Oja, H. (2009), J. R. Stat.
-    Soc. B 71(3), doi:10.1111/j.1467-9868.2009.00706.x).
+    The component's points have their smallest and largest fourth moments in these directions. Two groups of similar
+    size are visible along the first direction, and a small group beside a large group along the second direction, in
+    any number of dimensions (invariant coordinate selection: Tyler, D. E., Critchley, F., Duembgen, L. & Oja, H.
+    (2009), J. R. Stat. Soc. B 71(3), doi:10.1111/j.1467-9868.2009.00706.x).
     """
     owner = log_responsibilities(mixture, white).argmax(axis=1)
     count, ndim = len(mixture.weights), white.shape[1]

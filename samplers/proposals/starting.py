@@ -1,12 +1,12 @@
 """A distribution around the points of a finished run, from which another run can start.
 
-A cheaper model of the same parameters often has nearly the same posterior. A first sampler on the cheap model finds it,
-and a second sampler starts there instead of from the prior: the annealing leads from this distribution to the posterior
-of the model itself, so no value of the cheap model enters the result.
+A cheaper model of the same parameters often has nearly the same posterior. A first sampler finds the posterior of the
+cheap model, and a second sampler starts there instead of from the prior. Its annealing ends at the posterior of the
+full model, so no value of the cheap model enters the result.
 
-Half of the draws come from a mixture that is fitted to the points. The other half are spread evenly over the same
-mixture at 3, 9 and 27 times its width, and the prior: where the two posteriors differ, the way between them is covered.
-A mixture with the prior also bounds the weights (defensive mixture).
+Half the draws come from a mixture that is fitted to the points. The other half are spread evenly over the same mixture
+at 3, 9 and 27 times its width, and the prior, to cover the space between two different posteriors. The prior as a
+component also bounds the weights (defensive mixture).
 
 Reference: Hesterberg, T. (1995), Weighted average importance sampling and defensive mixture distributions,
 Technometrics 37(2), doi:10.1080/00401706.1995.10484303
@@ -21,7 +21,7 @@ from .transforms import find_support_bounds
 
 __all__ = ["StartingProposal"]
 
-# Widths of the mixture, as multiples of the fitted one, and shares of their draws; the rest is drawn from the prior.
+# Widths of the mixture, as multiples of the fitted width, and shares of their draws; the rest is drawn from the prior.
 WIDTHS = (1.0, 3.0, 9.0, 27.0)
 SHARES = (0.5, 0.125, 0.125, 0.125)
 # Draws from which the mass inside the support of the prior is estimated: its logarithm has an error of at most 0.01 for

@@ -3,13 +3,13 @@
 Bounds
 ------
 A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and a mixture of
-bell-shaped components cannot follow it in many dimensions. For a single bound, a map that is the logarithm of the
-distance near the bound and linear far from it has no bound, and makes an exponential posterior symmetric. Between two
-bounds it is the logit.
+bell-shaped components cannot follow it in many dimensions. A map removes the bound. For a single bound, the map is the
+logarithm of the distance near the bound and linear far from it, which makes an exponential posterior symmetric. Between
+two bounds it is the logit.
 
 The bounds are found numerically, because a sampler knows only whether a point lies in the support. Evaluating that
-needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. Where
-the lines disagree, the support is not a box, and the parameter is treated as unbounded. Equations and choices are in
+needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. If the
+lines disagree, the support is not a box, and the parameter is treated as unbounded. Equations and choices are in
 ``docs/theory/proposals``.
 
 Shears
@@ -21,12 +21,11 @@ curved ridge that a small number of ellipsoids cannot cover. A shear
 
 removes the curvature. It is a triangular map with unit Jacobian determinant, and its inverse adds what was subtracted.
 Densities therefore carry over without a correction, and a step that is symmetric in the transformed points is symmetric
-in the original ones.
+in the original points.
 
-The maps are those by which Haario, Saksman & Tamminen (1999) construct banana-shaped targets from Gaussians, applied in
-the opposite direction. Parno & Marzouk (2018) describe triangular maps as preconditioners for sampling in general. The
-greedy selection of pairs by the Bayesian information criterion is a choice of this project; see
-``docs/theory/proposals``.
+Haario, Saksman & Tamminen (1999) use these maps in the opposite direction, to construct banana-shaped targets from
+Gaussians. Parno & Marzouk (2018) describe triangular maps as preconditioners for sampling in general. The greedy
+selection of pairs by the Bayesian information criterion is a choice of this project; see ``docs/theory/proposals``.
 
 References
 ----------
@@ -77,8 +76,8 @@ class SupportBounds(NamedTuple):
     low, high : ndarray, shape (ndim,)
         Lower and upper bounds; -inf and inf where there is none.
     span : ndarray, shape (ndim,)
-        Length scale of each parameter. For a single bound, the distance at which the map changes from the logarithm to
-        a linear one.
+        Length scale of each parameter. For a single bound, the distance at which the map changes from logarithmic to
+        linear.
     """
 
     low: np.ndarray
@@ -92,7 +91,7 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
     Parameters
     ----------
     inside : callable
-        Function of points (m, ndim) that returns which of them (m,) lie in the support. It is called about 85 times.
+        Function of points (m, ndim) that returns which points (m,) lie in the support. It is called about 85 times.
     coords : ndarray, shape (n, ndim)
         Points in the support, for example draws from the prior.
 
@@ -140,9 +139,9 @@ def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.n
 
 
 def near_bounds(bounds: SupportBounds, coords: np.ndarray, weights: np.ndarray) -> SupportBounds:
-    """Keep the bounds that lie within four standard deviations of the mean of a weighted population (n, ndim), (n,).
+    """Keep the bounds within four standard deviations from the mean of a weighted population (n, ndim), (n,).
 
-    A single bound gets as scale the variance of the parameter divided by the distance of the mean from the bound.
+    The scale of a single bound is the variance of the parameter divided by the distance between mean and bound.
     """
     mean = weights @ coords
     reach = NEAR * np.sqrt(weights @ (coords - mean) ** 2)
@@ -164,7 +163,7 @@ def _bounded_parameters(bounds: SupportBounds) -> list[tuple[int, bool, bool]]:
 def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
     """Transform points (n, ndim) to the whole real line.
 
-    ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise for an upper one, and the logit between two bounds.
+    ``log(exp((x - low) / span) - 1)`` for a lower bound, likewise for an upper bound, and the logit between two bounds.
     Points on or beyond a bound are mapped to zero; `log_abs_det_jacobian` is -inf for them.
     """
     coords = coords.copy()
@@ -184,7 +183,7 @@ def to_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
 
 
 def _stretch(distance: np.ndarray) -> np.ndarray:
-    """log(exp(t) - 1) for positive numbers t: near log(t) for small ones, near t for large ones."""
+    """log(exp(t) - 1) for positive numbers t: near log(t) if t is small, near t if t is large."""
     return distance + np.log(-np.expm1(-distance))
 
 
@@ -238,7 +237,8 @@ def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarra
 
 # Smallest share of the variance left by the linear term that the quadratic term must explain.
 MIN_CURVATURE = 0.1
-# Share of its standard deviation below which nothing is left of a target: the points are too few to show a curvature.
+# Share of the standard deviation of a target below which nothing is left of it: the points are too few to show a
+# curvature.
 DEGENERATE = 1e-6
 
 
@@ -289,9 +289,9 @@ def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
 def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
     """Find shears that remove the curvature of a population, greedily: the most curved pair of parameters first.
 
-    A pair is curved if the square of the source explains at least a tenth of the variance of the target that its linear
-    term leaves, and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty
-    includes the number of pairs that were searched.
+    A pair is curved if the squared source explains at least a tenth of the target variance that the linear term leaves,
+    and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty includes the
+    number of pairs that were searched.
 
     Parameters
     ----------

@@ -60,10 +60,10 @@ def to_arviz(
     draws : int
         Number of samples for the groups that need simulations, evenly spaced in the chains.
     block : float, optional
-        Length of the blocks of the log-likelihood [s]. Default: five correlation times of the residuals. Models that
-        are compared need the same length.
+        Length of log-likelihood blocks [s]. Default: five correlation times of the residuals. Models that are compared
+        need the same length.
     seed : int
-        Seed of draws of the prior and of the noise.
+        Seed for draws of the prior and the noise.
 
     Returns
     -------
@@ -265,7 +265,7 @@ def _predictive_groups(
 
 
 def _prediction_group(prediction: Any) -> "xarray.Dataset":
-    """Mean, standard deviation and quantiles of a prediction; the values of each sample where it keeps them."""
+    """Mean, standard deviation and quantiles of a prediction; also the values of each sample if it keeps them."""
     import xarray
 
     attributes = {name: getattr(prediction, name) for name in ("n_samples", "n_failed", "from_state")}

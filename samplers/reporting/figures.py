@@ -71,10 +71,10 @@ def plot_corner(
     max_parameters: int = 12,
     title: str = "",
 ) -> "Figure":
-    """Plot the posterior of all pairs of parameters by `corner.corner`, with the prior on the diagonal.
+    """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
 
     See Foreman-Mackey (2016), corner.py, Journal of Open Source Software 1(2), 24, doi:10.21105/joss.00024. The
-    contours hold 50 and 90 % of the samples. Fewer than 150 distinct samples of a sampler are drawn as points.
+    contours hold 50 and 90 % of the samples. Fewer than 150 distinct samples from one sampler are drawn as points.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def plot_corner(
         Gives units, labels and nominal values (``posterior.parameters``) and the prior (``posterior.prior``). A
         function of your own may have ``parameter_names`` and ``prior``.
     truths : sequence of float, shape (ndim,), or mapping of str to float, optional
-        True values in the units of the samples, as red lines; NaN for none. The panels are widened by up to half of
-        their size to show a true value; otherwise it is written at the edge.
+        True values in the units of the samples, as red lines; NaN for none. The panels are widened by up to half their
+        size to show a true value; otherwise it is written at the edge.
     nominal : sequence of float, shape (ndim,), or mapping of str to float, optional
         Values before the update, as grey dashed lines, or written at the edge. Default: the nominal values of
         ``posterior.parameters``; an empty mapping for none.
@@ -95,9 +95,9 @@ def plot_corner(
     names : sequence of str, optional
         Names of the parameters to draw. Default: all, or the first `max_parameters`.
     labels : sequence of str, shape (ndim,), optional
-        Labels of all parameters, instead of the labels of the posterior.
+        Labels for all parameters, instead of the posterior's labels.
     max_parameters : int
-        Largest number of parameters that are drawn without `names`; the figure says how many are left out.
+        Largest number of parameters drawn without `names`; the figure says how many are left out.
     title : str
         Title of the figure.
 
@@ -190,10 +190,10 @@ def plot_marginals(
     labels: Sequence[str] | None = None,
     title: str = "",
 ) -> "Figure":
-    """Plot prior and posterior density of each parameter: what the data have changed.
+    """Plot the prior and posterior density of each parameter, which shows what the data have changed.
 
-    A panel shows the prior, but is at most 2.5 times as wide as the range of the samples. Where the prior is wider,
-    the title says by how much.
+    A panel shows the prior, but is at most 2.5 times as wide as the range of the samples. If the prior is wider, the
+    title says by how much.
 
     Parameters and errors as for `plot_corner`. All parameters are drawn, in one axes each.
     """
@@ -315,7 +315,7 @@ def _values(given: Values | None, known: list[str], what: str) -> np.ndarray:
 
 
 def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: np.ndarray) -> tuple[list, Any]:
-    """Prior densities of the parameters, from draws where ``prior.distributions`` has none, and draws (n, k)."""
+    """Prior densities of the parameters, estimated from draws if ``prior.distributions`` has none, and draws (n, k)."""
     from scipy.stats import gaussian_kde
 
     prior = getattr(posterior, "prior", None)
@@ -333,7 +333,7 @@ def _priors(posterior: Any, names: Sequence[str], columns: list[int], factors: n
 
 
 def _limits(samples: Mapping[str, np.ndarray], truths: np.ndarray) -> np.ndarray:
-    """Limits (k, 2) of the panels: the range of the samples, widened by up to half of its size to show a true value."""
+    """Limits (k, 2) of the panels: the range of the samples, widened by up to half its size to show a true value."""
     quantiles = np.array([np.quantile(x, [0.002, 0.998], axis=0) for x in samples.values()])
     low, high = quantiles[:, 0].min(axis=0), quantiles[:, 1].max(axis=0)
     size = high - low
@@ -345,12 +345,12 @@ def _limits(samples: Mapping[str, np.ndarray], truths: np.ndarray) -> np.ndarray
 
 
 def _bins(x: np.ndarray) -> int:
-    """Number of bins of a histogram of samples (n, k), of which some are copies."""
+    """Number of bins for a histogram of samples (n, k), some of which are copies."""
     return int(np.clip(np.sqrt(len(np.unique(x[:, 0]))), 12, 36))
 
 
 def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
-    """Prior density, values outside of the panel, and mean and standard deviation of one parameter."""
+    """Prior density, values outside the panel, and mean and standard deviation of one parameter."""
     low, high = drawn.limits[i]
     highest = 1.1 * max(patch.get_xy()[:, 1].max() for patch in axes.patches)  # corner's limit is of the last sampler
     if drawn.densities:
@@ -379,7 +379,7 @@ def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
 
 
 def _set_digits(axis: Any, limits: np.ndarray, size: float) -> None:
-    """Write ticks with all of their digits, instead of an offset in a corner of the axes."""
+    """Write ticks with all digits, instead of an offset in a corner of the axes."""
     from matplotlib.ticker import StrMethodFormatter
 
     digits = int(np.clip(np.ceil(np.log10(np.abs(limits).max() / np.ptp(limits))) + 2, 3, 15))
@@ -388,7 +388,7 @@ def _set_digits(axis: Any, limits: np.ndarray, size: float) -> None:
 
 
 def _wrapped(labels: Sequence[str], characters: int) -> list[str]:
-    """Labels in lines of a number of characters, broken before units and after underscores; formulas stay whole."""
+    """Labels in lines of limited length, broken before units and after underscores; formulas are not broken."""
 
     def wrap(text: str) -> str:
         lines = text.replace("_", "_ ").replace(" [", "\n[", 1).split("\n")

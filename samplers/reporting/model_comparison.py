@@ -3,7 +3,7 @@
 With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j
 (Kass & Raftery 1995, Bayes factors, Journal of the American Statistical Association 90(430),
 doi:10.1080/01621459.1995.10476572). Errors of the log-evidences are propagated to first order. Intervals are computed
-for the log-odds, for which the first order is more accurate. See ``docs/theory/evidence``.
+for the log-odds, for which first-order propagation is more accurate. See ``docs/theory/evidence``.
 """
 
 import math
@@ -90,7 +90,7 @@ class ModelComparison(NamedTuple):
 
 
 def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:
-    """Posterior probabilities of models of the same data.
+    """Posterior probabilities of models for the same data.
 
     Parameters
     ----------

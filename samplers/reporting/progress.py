@@ -22,7 +22,7 @@ __all__ = ["ANNEALING", "Progress", "get_progress_bar", "show_sweeps"]
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
 ANNEALING = "annealing"
-ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important ones first
+ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important figures first
 
 
 class _Lines:
@@ -141,7 +141,7 @@ class Progress:
         self.finished(self._running)
 
     def _simulated(self, points: float) -> None:
-        """Simulations have ended; the simulations of a batch belong to points that were submitted."""
+        """Simulations of submitted points have ended."""
         self._part += points if self._running > 0 else 0.0
         whole = int(self._part + 1e-9)
         self._part -= whole
@@ -196,7 +196,7 @@ class Progress:
         self._bar.update(steps)
 
     def _counts(self) -> dict[str, int]:
-        """Failed evaluations and failed simulations, and simulations of the posterior where it counts them."""
+        """Failed evaluations and failed simulations, and simulations of the posterior if it counts them."""
         reported = self._report()
         counts = {"failures": len(self._evaluator.record.failed) + reported.get("failure_count", 0)}
         return counts | ({"simulations": round(reported["simulations"])} if "simulations" in reported else {})
@@ -210,7 +210,7 @@ def show_sweeps(
     evaluator: Evaluator,
     function: Callable,
 ) -> Iterator[Any]:
-    """Pass on the states of a chain, with a bar of `sweeps` sweeps (None without an end), `per_state` for each state.
+    """Pass on the states of a chain, with a bar of `sweeps` sweeps (None: no end), `per_state` sweeps for each state.
 
     `bar` has the arguments ``progress`` and ``progress_kwargs`` of `emcee.EnsembleSampler.sample`.
     """

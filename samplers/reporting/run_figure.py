@@ -24,8 +24,8 @@ def plot_run(sampler: Any) -> "Figure":
     From above: the evaluations of each phase (rounds of a guide, tempering stages, check of the evidence, sweeps at
     beta = 1); the exponent beta and the acceptance of each stage, if there are several; the effective sample size and
     the number of distinct points; the log-evidence with two standard errors, after each round of a guide and each
-    stage; and the log-probability of the walkers at beta = 1, as median and 90 % range. A run that has converged has a
-    level log-probability. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the Royal
+    stage; and the log-probability of the walkers at beta = 1, as median and 90 % range. The log-probability of a
+    converged run has no trend. The idea is from the run plot of dynesty (Speagle 2020, Monthly Notices of the Royal
     Astronomical Society 493(3), doi:10.1093/mnras/staa278).
 
     `sampler` is a tempered sampler that has run; ValueError if it has no stages.
@@ -75,7 +75,7 @@ def plot_run(sampler: Any) -> "Figure":
 
 
 def _headline(sampler: Any) -> str:
-    """Stages, cost and evidence of a run in one line; what is missing of a run that has not finished."""
+    """Stages, cost and evidence of a run in one line, or how far an unfinished run has come."""
     stages = sampler.ladder
     number = f"{len(stages)} stage{'s' if len(stages) > 1 else ''}"
     cost = f"{sum(stage.evaluations for stage in stages)} evaluations"
@@ -87,7 +87,7 @@ def _headline(sampler: Any) -> str:
 
 
 def _draw_phases(axes: "Axes", sampler: Any) -> None:
-    """One bar, in parts that are as long as the phases needed evaluations."""
+    """One bar with one part per phase, whose length is the number of evaluations."""
     annealing = sum(stage.evaluations for stage in sampler.ladder)
     of_guide = min(sum(each.draws for each in sampler.rounds), annealing)
     check = sampler.log_evidence_check if sampler.ladder[-1].beta == 1.0 else None

@@ -26,7 +26,7 @@ __all__ = [
 
 
 class _NamedParameter(NamedTuple):
-    """A parameter of which only the name is known, with the members of ``posterior.parameters``."""
+    """A parameter with a name only, with the members of ``posterior.parameters``."""
 
     name: str
     label: str
@@ -35,7 +35,7 @@ class _NamedParameter(NamedTuple):
 
 
 def described_parameters_of(posterior: Any, ndim: int) -> Sequence[Any]:
-    """Name, label, unit (``factor``) and nominal value of each of `ndim` parameters; ValueError for another number."""
+    """Name, label, unit (``factor``) and nominal value for each of `ndim` parameters; ValueError for another number."""
     described = getattr(posterior, "parameters", None)
     if described is None:
         names = getattr(posterior, "parameter_names", None) or [f"x{i}" for i in range(ndim)]
@@ -54,7 +54,7 @@ def is_tempered(sampler: Any) -> bool:
 
 
 def log_posterior_of(sampler: Any) -> Any:
-    """The user's function of a sampler (emcee wraps it); None for an object that is no sampler."""
+    """The user's function in a sampler (emcee wraps it); None for an object that is no sampler."""
     return getattr(getattr(sampler, "log_prob_fn", None), "f", None)
 
 
@@ -86,7 +86,7 @@ class Summary(NamedTuple):
     cv : ndarray, shape (ndim,)
         Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
     mean_error : ndarray, shape (ndim,)
-        Monte Carlo standard error of `mean`; NaN where it is not known.
+        Monte Carlo standard error of `mean`; NaN if it is not known.
     """
 
     names: tuple[str, ...]
@@ -211,8 +211,8 @@ class SamplerComparison(NamedTuple):
     """Cost and results of several samplers, one entry per sampler. ``str`` gives a table.
 
     `evaluations` is the number of points for which ``log_prob_fn`` was called, and `effective_sample_size` the number
-    of independent draws with the same error of the mean, for the worst parameter. `seconds` (wall time) is None where
-    it was not measured; `log_evidence` and its standard error are None for samplers without an evidence.
+    of independent draws with the same error of the mean, for the worst parameter. `seconds` (wall time) is None if it
+    was not measured; `log_evidence` and its standard error are None for samplers without an evidence.
     """
 
     names: tuple[str, ...]
@@ -236,9 +236,9 @@ def comparison_table(
 ) -> SamplerComparison:
     """Compare the cost and the effective sample size of several samplers on one posterior.
 
-    The effective sample size is the smallest of all parameters: (standard deviation / Monte Carlo error)^2 for tempered
-    samplers, and the length of the chain divided by its autocorrelation time, which is underestimated for short chains,
-    for emcee's sampler. Modes that were never visited have no effect on it.
+    The effective sample size is computed for the worst parameter. For tempered samplers it is (standard deviation /
+    Monte Carlo error)^2; for emcee's sampler it is the chain length divided by the autocorrelation time, which is
+    underestimated for short chains. Modes that were never visited have no effect on it.
 
     Parameters
     ----------

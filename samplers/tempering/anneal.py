@@ -1,17 +1,17 @@
-"""Annealing from draws of the prior to beta = 1: which path to take, and what to do where it fails.
+"""Annealing from draws of the prior to beta = 1: which path to take, and what to do if it fails.
 
-There are three paths. All of them end with an estimate of the evidence from draws that were not used for the annealing.
+There are three paths. All end with an estimate of the evidence from draws that were not used for the annealing.
 
 guided rounds (`samplers.tempering.guided`)
-    With a guide, its weighted draws replace the annealing. Where they are not reliable, recycling starts from them.
+    With a guide, its weighted draws replace the annealing. If they are not reliable, recycling starts from them.
 recycling (`samplers.tempering.recycling`)
     Adaptive importance sampling. Its weighted draws are resampled to as many points as there are walkers, which are
-    moved only where they are not independent draws already. Where the result is not reliable, moves start again from
-    the draws of the prior.
+    moved only if they are not independent draws already. If the result is not reliable, moves start again from the
+    draws of the prior.
 moves (`samplers.tempering.smc_moves`)
     Sequential Monte Carlo: choose beta, weigh, resample, move.
 
-A limit of simulations ends any path where it is exceeded. The points known by then are weighted by the posterior and
+A limit of simulations ends any path that exceeds it. The points known by then are weighted by the posterior and
 resampled (`StoppedEarly`).
 """
 
@@ -57,7 +57,7 @@ __all__ = ["anneal", "check_population"]
 
 logger = logging.getLogger(__name__)
 
-# Share of distinct points after recycling from which on the population is as good as independent draws.
+# Share of distinct points after recycling above which the population is as good as independent draws.
 ENOUGH_DISTINCT = 0.9
 
 Steps = Iterator[tuple[Population, Report]]
@@ -84,7 +84,7 @@ def anneal(
     schedule : MoveSchedule
         The moves.
     settings : Settings
-        How to anneal.
+        Settings of the annealing.
     guidance : Guidance, optional
         A guide to start from.
 
@@ -133,7 +133,7 @@ def _check_moves(
     settings: Settings,
     visited: VisitedPoints,
 ) -> Steps:
-    """The check of the evidence after annealing by moves, and concerns; `recycled`: an unreliable result before it."""
+    """The evidence check after annealing by moves, and concerns; `recycled`: an unreliable result before the moves."""
     found = check_annealing(stages, *population.coords.shape, correlation)
     found += check_mode_shares(population.coords, population.founders[0], correlation)
     yield from ((population, each) for each in found)
@@ -203,16 +203,16 @@ def _by_recycling(
     settings: Settings,
     compare: Callable[[Recycled], Sequence[Concern]] = lambda found: (),
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """The `steps` of `recycle`, whose weighted draws are resampled to `size` points and moved.
+    """Make the `steps` of `recycle`, then resample the weighted draws to `size` points and move them.
 
-    `population`: the starting points. `compare`: what disagrees with a reliable result.
+    `population`: the starting points. `compare`: function that returns concerns about a reliable result.
     """
     found = yield from steps
     if not found.reliable:
         logger.info("the result of recycling is not reliable, because %s", found.reason)
         yield population, Restart(found.reason)
         return found
-    # the last proposal, since it was not fitted to the draws of the check, most of the points that are moved
+    # the last proposal, since it was not fitted to the draws of the check, which are most of the moved points
     proposal = found.proposals[-1][1]
     schedule.calibrate(found.coords, coarse_weights(found.log_weights), density.inside, proposal)
     population, distinct = _resampled(found.coords, found.records, found.log_weights, size, random)
@@ -251,7 +251,7 @@ def _by_runs(
     schedule: MoveSchedule,
     settings: Settings,
 ) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Several runs of recycling, then one that begins with all their points; they are compared at the end."""
+    """Several recycling runs, then one run that begins with all their points; the runs are compared at the end."""
     runs, size = [], len(population.coords)
     for _ in range(settings.runs):
         try:
@@ -282,7 +282,7 @@ def _from_guide(
     settings: Settings,
     guidance: Guidance,
 ) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
-    """Draws of a guide, or recycling that starts from them; returns the draws if neither result is reliable."""
+    """Draws of a guide, or recycling that starts from the draws; returns the draws if neither result is reliable."""
     size = len(population.coords)
     found = yield from draw_rounds(population, density, random, guidance)
     if found.stopped:
@@ -322,7 +322,7 @@ def _from_guide(
 
 
 def _check_prior(found: RoundsOfGuide, population: Population, density: Density) -> None:
-    """Raise ValueError if a few draws of the prior are as impossible as all draws of the guide."""
+    """Raise ValueError if a few draws of the prior are impossible, like all draws of the guide."""
     few = population.coords[:FEWEST_DRAWS]
     try:
         records = density.evaluate(few)
@@ -336,7 +336,7 @@ def _check_prior(found: RoundsOfGuide, population: Population, density: Density)
 
 
 def _finish_early(stop: StoppedEarly, size: int, random: np.random.RandomState, searched: float) -> Steps:
-    """Resample the points that are known to `size` points at beta = 1; `searched`: simulations made by guides."""
+    """Resample the known points to `size` points at beta = 1; `searched`: simulations made by guides."""
     population = stop.population
     if stop.complete:
         yield population, EarlyStop(1.0, len(population.coords), population.effective_sample_size, float("-inf"), True)

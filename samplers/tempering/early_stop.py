@@ -10,7 +10,7 @@ __all__ = ["NothingToReport", "StoppedEarly", "stop_at"]
 
 
 class NothingToReport(ValueError):
-    """The limit of simulations has ended an annealing in which no possible point is known."""
+    """The limit of simulations has ended an annealing without a possible point."""
 
 
 class StoppedEarly(Exception):
@@ -19,13 +19,13 @@ class StoppedEarly(Exception):
     Parameters
     ----------
     population : Population
-        The points that are known, with log-weights at beta = 1 unless `complete`.
+        The known points, with log-weights at beta = 1 unless `complete`.
     log_evidence, error : float
         Log-evidence of these weights, and its standard error.
     beta : float
         Tempering exponent that the points were made for.
     log_evidence_of_stages : float
-        Part of the log-evidence that is in stages already reported.
+        Part of the log-evidence from stages already reported.
     complete : bool
         Whether beta = 1 was reached and its stage reported; the population is then equally weighted.
     from_guide : bool
@@ -73,9 +73,9 @@ def stop_at(
     population : Population
         The points.
     log_evidence, error : float
-        Log-evidence at their beta, and its standard error.
+        Log-evidence at the beta of the points, and its standard error.
     log_evidence_of_stages : float
-        Part of the log-evidence that is in stages already reported.
+        Part of the log-evidence from stages already reported.
 
     Returns
     -------

@@ -16,7 +16,7 @@ __all__ = ["AdaptedGuide", "Guide", "GuideSession", "check_guide", "guide_finger
 
 UNKNOWN = "it has no attribute concerns, so it is not known whether the posterior has other modes"
 # The optional members of a guide (see `Guide`) that are not methods of the search, and their defaults. A guide that
-# does not say whether parts of the posterior may be missing is itself a reason for concern.
+# does not say whether parts of the posterior may be missing is a reason for concern.
 DEFAULTS = {
     "simulations": 0.0,
     "log_density_error": 0.0,
@@ -28,7 +28,7 @@ DEFAULTS = {
 
 
 class GuideSession(NamedTuple):
-    """What a sampler lends to its guide.
+    """Functions and random numbers that a sampler provides to its guide.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class GuideSession(NamedTuple):
         The sampler's random generator.
     remember : callable
         ``remember(key, compute)`` returns the list of arrays that ``compute()`` returns, and stores it in the record
-        of the run under `key` (str). A run that is made again gets the stored arrays without a call of `compute`. For
-        equal keys, the arrays that were stored first are returned first.
+        of the run under `key` (str). A repeated run gets the stored arrays without a call of `compute`. For equal keys,
+        the arrays that were stored first are returned first.
     fits : callable
         ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
         False, the guide makes none and returns.
@@ -45,7 +45,7 @@ class GuideSession(NamedTuple):
         ``remaining()``: simulations left, inf without a limit. No decision except to stop may depend on it, otherwise a
         run that is continued with a larger limit cannot repeat its first part.
     asynchronous : bool
-        Whether draws arrive in any order, and the next ones are made while some of the last ones run.
+        Whether draws arrive in any order, and new draws are made while earlier draws are still running.
     """
 
     random: np.random.RandomState
@@ -67,29 +67,28 @@ class Guide(Protocol):
         `log_prob_fn` does not return. Requires ``vectorize=True``. In an asynchronous run it is called when they have
         been evaluated, a few at a time.
     ``evaluation_queue()``
-        The queue for points in an asynchronous run, in place of the queue of `log_prob_fn`, for a guide that keeps more
-        of an evaluation than its value.
+        The queue for points in an asynchronous run, which replaces the queue of `log_prob_fn`, for a guide that keeps
+        more than the value of an evaluation.
     ``learns_from_parts`` : bool
         Whether `refine` is to be called in an asynchronous run before all draws of a round have arrived. The first
-        draws have short evaluations: a regression may learn from them, an estimate of the density may not. False by
-        default.
+        draws have short evaluations: a regression may learn from them, a density estimate may not. False by default.
     ``check(log_prob_fn)``
-        Raises ValueError if the guide is of another density than the sampler.
+        Raises ValueError if the guide was made for another density than the sampler.
     ``fresh()``
-        A new guide in the state before `prepare`. A sampler works on it and never changes the guide that it was given;
+        A new guide in the state before `prepare`. A sampler works on this new guide and never changes the given guide;
         without this method, it works on a deep copy.
     ``simulations`` : float
         Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
     ``log_density_error`` : float
-        Standard error of the logarithm of the normalising constant of the density.
+        Standard error of the density's log normalising constant.
     ``concerns`` : sequence of str
-        Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any, the
-        verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is known
-        to miss nothing.
+        Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any concern,
+        the verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is
+        known to miss nothing.
     ``basis`` : str
         How parts of the posterior were searched for, as a clause of the verdict.
     ``fingerprint`` : str
-        Identity of the guide: a run is resumed only with an equal one.
+        Identity of the guide: a run is resumed only with the same fingerprint.
     """
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
@@ -164,7 +163,7 @@ class AdaptedGuide:
 
 
 def check_guide(guide: Any, log_prob_fn: Callable, vectorize: bool) -> None:
-    """Raise ValueError if an object lacks a method that every guide needs, cannot observe, or is of another density."""
+    """Raise ValueError if an object lacks a required method, cannot observe, or was made for another density."""
     missing = [name for name in ("draw", "log_density", "refine") if not callable(getattr(guide, name, None))]
     if missing:
         raise ValueError(

@@ -1,13 +1,13 @@
 """Start from a guide: rounds of draws that are evaluated, weighted and used to refine the guide.
 
 The density of a round is fixed before its draws are made, and each draw is weighted by this density
-(`samplers.estimates.importance`). The rounds end with a *reliable* one: fresh draws with a good effective share and
-Pareto shape. All rounds together must then have an effective sample size of the number of walkers.
+(`samplers.estimates.importance`). The rounds end with a *reliable* round: fresh draws with a good effective share and
+Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers.
 
 Draws that are submitted together are a `Batch`; they may arrive in any order. A batch becomes a round when all its
 draws have arrived. Until then, its draws influence no weight, no share of a round and no decision: the first arrivals
-have short evaluations, and are not a fair sample. They may train a guide that says so (`learns_from_parts`), since the
-draws of the next batch are weighted by their own density.
+have short evaluations, and are not a fair sample. They may train a guide with `learns_from_parts`, since the draws of
+the next batch are weighted by their own density.
 
 A part of the posterior that a guide never proposes is not seen by its draws. Guides with a share of the prior in their
 density can find it; other guides depend on their search (`concerns`). Constants without a reference were chosen by
@@ -63,7 +63,7 @@ MOST_ROUNDS = 20
 # The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
 # size below 1.5: a round of few draws has an effective share of at least one over their number.
 HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
-# The check of the first values of a run needs some that arrive together.
+# The check of a run's first values needs some values that arrive together.
 FIRST_TOGETHER = 8
 LIGHT_TAILS = (
     "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
@@ -72,7 +72,7 @@ LIGHT_TAILS = (
 
 
 class Guidance(NamedTuple):
-    """A guide, what a sampler lends it, and the simulations so far with their limit."""
+    """A guide, the session that a sampler provides to it, and the simulations so far with their limit."""
 
     guide: AdaptedGuide
     session: GuideSession
@@ -82,7 +82,7 @@ class Guidance(NamedTuple):
 def lend(
     guide: AdaptedGuide, random: np.random.RandomState, remember: Callable, budget: Budget, asynchronous: bool
 ) -> Guidance:
-    """A fresh guide with what it is lent; its simulations count from now on."""
+    """A fresh guide with its session; its simulations count from now on."""
     budget.begin(guide)
 
     def remember_with_count(key: str, compute: Callable) -> list[np.ndarray]:
@@ -110,9 +110,9 @@ class RoundsOfGuide(NamedTuple):
     reason : str
         Why the draws cannot be used; empty if they can.
     shortfall : str
-        What was not reached although the draws can be used, or that their tails are too light; empty if all was.
+        What was not reached although the draws can be used, or that their tails are too light; else empty.
     pooled : PooledRounds, or None
-        All draws; None if the limit of simulations did not allow one.
+        All draws; None if the limit of simulations did not allow any.
     last : Round, or None
         The last round.
     stopped : bool
@@ -127,7 +127,7 @@ class RoundsOfGuide(NamedTuple):
 
 
 class Batch:
-    """Draws of one density of a guide.
+    """Draws from one density of a guide.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ class Batch:
         return bool(np.any(self.pending.arrived_part()[1]["log_prob"] > -np.inf))
 
     def as_round(self) -> Round:
-        """The round of the draws, which have all arrived."""
+        """The draws as a round; all must have arrived."""
         coords, records = self.pending.arrived_part()
         log_prob = records["log_prob"]
         alive = log_prob > -np.inf
@@ -173,7 +173,7 @@ class Batch:
     def take_lesson(self, parts: bool) -> tuple[np.ndarray, np.ndarray]:
         """Draws (m, ndim) for the guide to learn from, and their log-probabilities (m,): each draw is taken once.
 
-        `parts`: whether draws are taken before all of the batch have arrived.
+        `parts`: whether draws are taken before the whole batch has arrived.
         """
         coords, records = self.pending.arrived_part()
         new = ~self._learned[self.pending.arrived] & (parts or self.pending.complete)
@@ -187,7 +187,7 @@ class Batch:
 
 
 def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession) -> Batch:
-    """Begin to evaluate draws (n, ndim) of the guide, of which a limit of simulations may allow the first few only.
+    """Begin to evaluate draws (n, ndim) of the guide; a limit of simulations may allow only the first of them.
 
     Raises
     ------
@@ -211,9 +211,9 @@ def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, sess
 def let_arrive(
     batches: Sequence[Batch], most: int, density: Density, guide: AdaptedGuide, session: GuideSession
 ) -> None:
-    """Wait until at most this number of the latest batch is running, and nothing of the earlier ones.
+    """Wait until at most this number of draws in the latest batch is running, and none in earlier batches.
 
-    The guide observes draws as they arrive, a few at a time, so that a run that is killed has kept nearly all of them.
+    The guide observes draws as they arrive, a few at a time, so that a killed run has kept nearly all of them.
     """
     while batches:
         running = [batch.running for batch in batches]
@@ -272,7 +272,7 @@ def draw_rounds(
         return population, GuideTick(phase, budget.simulations, size, finished)
 
     def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
-        """Let draws arrive; returns how the rounds end, or None where another one follows."""
+        """Let draws arrive; returns how the rounds end, or None if another round follows."""
         nonlocal population, pooled
         while True:
             let_arrive(batches, most, density, guide, session)
@@ -288,7 +288,7 @@ def draw_rounds(
                 outcome = RoundsOfGuide("", "", pooled, rounds[-1] if rounds else None, True)
             if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
                 return outcome
-            most = 0  # what was submitted is part of the result
+            most = 0  # submitted draws are part of the result
 
     yield tick("search", False)
     for _ in guide.prepare(session):
@@ -314,7 +314,7 @@ def draw_rounds(
 
 
 def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
-    """What is reported of a round, with all before it."""
+    """The report of a round, with all rounds before it."""
     return GuidedRound(
         len(last.coords),
         last.effective_share,
@@ -341,9 +341,9 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> Rounds
 
 
 def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> bool:
-    """Whether more draws are made while some are running, since these will not be enough.
+    """Whether more draws are made while some are running, since the running draws will not be enough.
 
-    A guide that learns from complete rounds only would repeat draws of the same density.
+    A guide that learns only from complete rounds would draw from the same density again.
     """
     if len(rounds) + len(batches) >= MOST_ROUNDS:
         return False
@@ -353,16 +353,16 @@ def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide
 
 
 def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> float:
-    """Effective draws that are missing, if those that are running have the effective share of the last round."""
+    """Missing effective draws, if the running draws have the effective share of the last round."""
     expected = rounds[-1].effective_share * sum(len(batch) for batch in batches)
     return size - pool_rounds(rounds, guide.log_density_error).effective_sample_size - expected
 
 
 def _even(pooled: PooledRounds) -> bool:
-    """Whether the result of all rounds does not rest on a few weights.
+    """Whether the pooled result does not depend on a few weights.
 
-    The early rounds of a poor guide have heavy-tailed weights but a small part in the result, which the error of the
-    log-evidence accounts for. So it is enough that the shape permits a useful mean.
+    The early rounds of a poor guide have heavy-tailed weights but a small share in the result, for which the error of
+    the log-evidence accounts. So it is enough that the shape permits a useful mean.
     """
     n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
     even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
@@ -370,7 +370,7 @@ def _even(pooled: PooledRounds) -> bool:
 
 
 def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> int:
-    """Number of draws of the next batch; of the `batches` that are running, only their number of draws matters."""
+    """Number of draws in the next batch; only the number of draws in the running `batches` matters."""
     first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
     if not rounds and not batches:
         return first
@@ -388,14 +388,14 @@ def _all_impossible(rounds: Sequence[Round]) -> bool:
 
 
 def _impossible(rounds: Sequence[Round]) -> str:
-    """Why to give up after two rounds without one possible draw; empty if there is no reason."""
+    """Reason to give up after two rounds without a possible draw; empty if there is none."""
     if len(rounds) < 2 or not _all_impossible(rounds):
         return ""
     return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
 
 
 def _hopeless(rounds: Sequence[Round]) -> str:
-    """Why to give up; empty if there is no reason."""
+    """Reason to give up; empty if there is none."""
     recent = rounds[-HOPELESS_ROUNDS:]
     share = np.mean([r.effective_share for r in recent])
     hopeless = share < HOPELESS_SHARE or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
@@ -449,9 +449,9 @@ def start_from_guide(
 
 
 def better_of(stop: StoppedEarly, found: RoundsOfGuide) -> StoppedEarly:
-    """The points known at a stop, or the rounds of the guide before it, whichever are worth more.
+    """The points known at a stop, or the guide's rounds before it, whichever have the larger effective sample size.
 
-    Usable rounds take precedence: each has an independent proposal, and no mode is lost from one to the next.
+    Usable rounds take precedence: each has an independent proposal, and no mode is lost between rounds.
     """
     rounds, pooled = stopped_rounds(found), found.pooled
     rounds.log_evidence_of_stages = stop.log_evidence_of_stages

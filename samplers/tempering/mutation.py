@@ -1,7 +1,7 @@
 """Mutation at a fixed beta: moves of the ensemble, and the rule that ends them.
 
 Resampling copies points, and the moves separate the copies. Moving stops once the population is nearly uncorrelated
-with the resampled one it started from (`StartCorrelation`). The chains of transitional Markov chain Monte Carlo are in
+with its resampled start (`StartCorrelation`). The chains of transitional Markov chain Monte Carlo are in
 `samplers.tempering.leaders`.
 """
 
@@ -38,17 +38,17 @@ MOST_POINTS = 10_000  # kept by `VisitedPoints`
 
 
 def needs_many_walkers(moves: Any) -> bool:
-    """Whether there are red-blue moves of emcee among `moves`: a move, a sequence of moves or of (move, weight)."""
+    """Whether `moves` (a move, or a sequence of moves or (move, weight) pairs) contains red-blue moves of emcee."""
     each = moves if isinstance(moves, Sequence) else [moves]
     return any(isinstance(move[0] if isinstance(move, Sequence) else move, RedBlueMove) for move in each)
 
 
 def check_moves(moves: Sequence[Move], chains: str) -> None:
-    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), or do not keep their target.
+    """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), or do not keep the target.
 
-    The acceptance of ``emcee.moves.DESnookerMove`` (emcee 3.1.6 and earlier) has the exponent (ndim - 1) / 2 in place
-    of ndim - 1 for the ratio of the distances from the third walker (ter Braak & Vrugt 2008, Statistics and Computing
-    18, doi:10.1007/s11222-008-9104-9).
+    The acceptance of ``emcee.moves.DESnookerMove`` (emcee 3.1.6 and earlier) has the exponent (ndim - 1) / 2 instead of
+    ndim - 1 for the ratio of the distances from the third walker (ter Braak & Vrugt 2008, Statistics and Computing 18,
+    doi:10.1007/s11222-008-9104-9).
     """
     if any(type(move) is DESnookerMove for move in moves):
         raise ValueError(
@@ -94,21 +94,21 @@ class MoveSchedule(NamedTuple):
             calibrate_move(move, coords, weights, inside, mixture)
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
-        """Let the moves that can use it propose points in parts of the target that their fits do not cover.
+        """Let mixture moves propose points in parts of the target that their fits do not cover.
 
         Parameters
         ----------
         coords : (n, ndim) float
-            Points, also of earlier stages.
+            Points, also from earlier stages.
         log_target : (n,) float
-            Logarithm of the target of the stage, scaled so that its integral is about 1.
+            Log-target of the stage, scaled so that the target's integral is about 1.
         """
         for move in self.moves:
             if isinstance(move, MixtureMove | WithFastSweeps):
                 move.cover_basins(coords, log_target)
 
     def expect_independence(self) -> None:
-        """Tell the moves that can use it that the points are independent draws of the target already."""
+        """Tell mixture moves that the points are already independent draws of the target."""
         for move in self.moves:
             if isinstance(move, MixtureMove | WithFastSweeps):
                 move.expect_independence()
@@ -146,11 +146,11 @@ def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
 
 
 class VisitedPoints:
-    """Possible points that the annealing has evaluated, as far as they may still show a part of the target.
+    """Possible points that the annealing has evaluated, as far as they may still reveal a part of the target.
 
-    While beta is small, a narrow mode has few points, and the next resampling replaces most of them. They are kept
-    here, with proposals that were not accepted, so that `samplers.proposals.basins` can propose draws there, and so
-    that the result can be compared with them.
+    While beta is small, a narrow mode has few points, and the next resampling replaces most of them. These points are
+    kept here, with rejected proposals, so that `samplers.proposals.basins` can propose draws there, and the result can
+    be compared with them.
     """
 
     def __init__(self) -> None:
@@ -158,7 +158,7 @@ class VisitedPoints:
         self._records: list[np.ndarray] = []
 
     def add(self, coords: np.ndarray, records: np.ndarray) -> None:
-        """Add points (n, ndim) with their records (n,), of which log_prior and log_prob are kept."""
+        """Add points (n, ndim) with log_prior and log_prob from their records (n,)."""
         possible = records["log_prob"] > -np.inf
         kept = np.empty(np.count_nonzero(possible), [("log_prior", float), ("log_prob", float)])
         for name in kept.dtype.names:
@@ -197,8 +197,8 @@ def tempered_model(
 class StartCorrelation:
     """Correlation of a population with the points it started from, sweep by sweep.
 
-    The largest absolute correlation, over the walkers, between start and now of the parameters and of the
-    log-likelihood, which the next weights depend on.
+    The correlation over the walkers between start and present values; the largest absolute value over all parameters
+    and the log-likelihood, on which the next weights depend.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def move_together(
     visited : VisitedPoints, optional
         Points that are evaluated are added to it.
     correlation : StartCorrelation, optional
-        Correlation with an earlier start, from which the points have been moved already; by default with the points.
+        Correlation with an earlier start, from which the points have already been moved; by default they are the start.
 
     Yields
     ------

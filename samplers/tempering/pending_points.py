@@ -1,8 +1,8 @@
-"""Points that were submitted together for evaluation, of which some may still be running.
+"""Points that were submitted together for evaluation; some may still be running.
 
 A synchronous density returns complete points. An asynchronous density lets the points arrive in any order. Points that
-have arrived may shape further proposals, but only complete batches may become part of the result: where the time of an
-evaluation depends on the parameters, the first arrivals are not a fair sample of the proposal.
+have arrived may shape further proposals, but only complete batches may become part of the result: if evaluation times
+depend on the parameters, the first arrivals are not a fair sample of the proposal.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ BASE_FIELDS = [("log_prob", np.float64), ("log_prior", np.float64)]
 
 
 class PendingPoints:
-    """Points (n, ndim) and what is known of them.
+    """Points (n, ndim) and their known records.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class PendingPoints:
     log_base : (n,) float
         Their log-density at beta = 0, -inf outside the support of the prior.
     refused : bool
-        Whether the limit of simulations did not allow all points that were to be submitted; `coords` are the others.
+        Whether the limit of simulations refused some of the points; `coords` are the submitted points.
 
     Attributes
     ----------

@@ -21,7 +21,7 @@ class Density(Protocol):
     workers : int
         Number of points that are evaluated at once, if `submit` returns without waiting; else 0.
     map : callable
-        How an emcee move that evaluates points by itself maps a function over them: ``map`` or ``pool.map``.
+        The map, ``map`` or ``pool.map``, for emcee moves that evaluate points by themselves.
     """
 
     evaluations: int
@@ -33,8 +33,7 @@ class Density(Protocol):
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim), with the fields log_prob, log_prior and, where there are any, blobs.
 
-        `observe` is called with the points directly before they are evaluated; needed only for a guide with a method
-        `observe`.
+        `observe` is called with the points directly before they are evaluated, for a guide with a method `observe`.
         """
 
     def submit(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> PendingPoints:

@@ -1,4 +1,4 @@
-"""Recording of an annealing: what its reports add to its result, with wall times and numbers of evaluations."""
+"""Recording of an annealing: its reports are added to its result, with wall times and numbers of evaluations."""
 
 import time
 
@@ -11,7 +11,7 @@ __all__ = ["Recording"]
 
 
 class Recording:
-    """The result of an annealing as far as it has come.
+    """The result of an annealing so far.
 
     Parameters
     ----------

@@ -1,21 +1,21 @@
 """Recycling: adaptive multiple importance sampling (AMIS) from the prior to the posterior.
 
-All points evaluated so far, draws of the prior and of every proposal since, are weighted by the tempered target over
-the mixture of all densities that they were drawn from (deterministic mixture weights). Each round
+All points evaluated so far, draws of the prior and of all proposals, are weighted by the tempered target over the
+mixture of all densities that they were drawn from (deterministic mixture weights). Each round
 
 1. chooses the next beta, which keeps the effective sample size of *all* points at a target,
 2. fits a mixture to the weighted points at that beta, and
 3. draws from this mixture, evaluates the draws and adds them to the points.
 
-A beta is left only when the draws made at it have an effective sample size of three quarters of the target: among many
-old points some have large weights by chance, and where the likelihood is rough, annealing that follows these points
+Beta is increased only when the draws made at it have an effective sample size of three quarters of the target: among
+many old points some have large weights by chance, and if the likelihood is rough, annealing that follows these points
 ends in a local mode. Once beta = 1 is reached, points are drawn until the effective sample size suffices.
 
-Adaptive proposals can be confidently wrong, so the last fit is checked with fresh draws. The result is used only if
-their weights are well-behaved and their evidence agrees (`Recycled.reliable`). If not, these draws join the other
-points and the next fit is checked, a few times. Reusing points that a proposal was fitted to underweights them, and a
-small mode can vanish. Therefore the resulting population consists only of draws made at beta = 1, each weighted by the
-one proposal that it was drawn from.
+Adaptive proposals can be wrong although their errors are small, so the last fit is checked with fresh draws. The result
+is used only if their weights are well-behaved and their evidence agrees (`Recycled.reliable`). If not, these draws join
+the other points and the next fit is checked, a few times. Reusing points that a proposal was fitted to underweights
+them, and a small mode can vanish. Therefore the resulting population consists only of draws made at beta = 1, each
+weighted by the proposal that it was drawn from.
 
 The equations are in ``docs/theory/recycling``. Constants without a reference were chosen by trials on posteriors with
 known answers. The *efficiency* of a round is the effective sample size of its fresh draws divided by their number.
@@ -52,8 +52,8 @@ POINTS_PER_DIMENSION = 5.0
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
 # Further draws, as a multiple of the number of starting points, spread over the stages below beta = 1. They find narrow
-# modes, which hold few points while beta is small: of modes with a ratio of volumes of 100, 500 starting points without
-# such draws miss one in 30 % of the runs, and in 6 % with them.
+# modes, which hold few points while beta is small: with modes whose volumes have a ratio of 100, runs with 500 starting
+# points miss a mode in 30 % of the runs without such draws, and in 6 % with them.
 SEARCH_DRAWS = 3.0
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
@@ -72,8 +72,8 @@ MOST_BASIN_ROUNDS, DRAWS_PER_BASIN = 4, 30
 SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
 # Draws that contradict a fit also improve it, so a failed check is repeated.
 MOST_CHECKS = 4
-# Smallest efficiency of the check for which the result is used, and the efficiency at which the Pareto shape need no
-# longer be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape of the short tail of even weights is uncertain.
+# Smallest efficiency of the check for which the result is used, and the efficiency above which the Pareto shape need
+# not be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape is uncertain for the short tail of even weights.
 RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
 # Largest difference between the log-evidences of the check and of the earlier points for which the result is used.
 LARGEST_DIFFERENCE = 0.25
@@ -109,9 +109,9 @@ class Recycled(NamedTuple):
         The draws made at beta = 1, including the draws of the check, and their records (log_prob, log_prior and, where
         there are any, blobs).
     log_weights : (n,) float
-        Log-weights of the draws against the mixture of their round, which was not fitted to them. The rounds are
-        combined by `samplers.estimates.importance.round_shares`, which does not depend on the weights of the same
-        round: a round with few points of large weight in a tail would otherwise get a small share, and cut the tail.
+        Log-weights of the draws relative to the mixture of their round, which was not fitted to these draws. The rounds
+        are combined by `samplers.estimates.importance.round_shares`, which does not depend on the weights of the same
+        round: otherwise a round with a few large weights in a tail would get a small share, and cut the tail.
     log_evidence, log_evidence_error : float
         Log-evidence from all points except the draws of the check, and its standard error.
     check : EvidenceCheck, optional
@@ -163,12 +163,12 @@ def recycle(
     random : RandomState
         Source of random numbers.
     start : StartingDensity, optional
-        What the points were drawn from; the prior by default. The path to the posterior is
-        start^(1 - beta) posterior^beta.
+        Density that the points were drawn from; the prior by default. The path to the posterior is start^(1 - beta)
+        posterior^beta.
     size : int, optional
-        Effective sample size wanted at beta = 1, and number of draws of the check; n by default.
+        Wanted effective sample size at beta = 1, and number of draws for the check; n by default.
     target_share : float, optional
-        Effective sample size wanted below beta = 1, as a share of the number n of starting points; `TARGET_SHARE` by
+        Wanted effective sample size below beta = 1, as a share of the number n of starting points; `TARGET_SHARE` by
         default.
     whole : bool
         False for a part of a longer annealing: its stages are not reported, and it ends without a check, as soon as the
@@ -191,7 +191,7 @@ def recycle(
     """
     n, ndim = pending.coords.shape
     size = n if size is None else size
-    # another starting density was fitted by a search of its own
+    # another starting density was fitted by a separate search
     search, basin_rounds = _Search(SEARCH_DRAWS * n if start is None else 0.0), 0
     start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
     share = TARGET_SHARE if target_share is None else target_share
@@ -215,13 +215,13 @@ def recycle(
         effective = effective_sample_size(log_weights)
         if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
             if points.running(latest=False) > 0:
-                # a mode whose evaluations take long would otherwise be left out of every proposal
+                # otherwise a mode with long evaluations would be left out of every proposal
                 density.wait(points.running() - 1)
                 continue
             # more draws shall not make larger steps: it is their number per step that finds narrow modes
             kept = max(target, min(search.increase * target, LARGEST_SHARE_KEPT * effective))
             following = next_beta(points.log_ratio, beta, kept, log_weights)
-            if following == 1.0 and points.running() > 0:  # what is drawn at beta = 1 is the result
+            if following == 1.0 and points.running() > 0:  # the draws at beta = 1 are the result
                 density.wait(0)
                 continue
             beta, drawn, fresh = following, [], 0.0
@@ -295,10 +295,10 @@ def recycle(
 
 
 def pool_runs(runs: Sequence[Recycled], n_prior: int) -> tuple[np.ndarray, np.ndarray, StartingDensity]:
-    """All points of runs that have the same draws of the prior, and the density that they were drawn from.
+    """All points of runs with common draws of the prior, and the density that the points were drawn from.
 
-    A mode that no draw of a run has met is missing in all later proposals of this run, and nothing in the run shows it.
-    A second run makes other draws. All proposals of the runs and the prior are a mixture with a known density, from
+    A mode that no draw of a run has met is missing in all later proposals of this run, and nothing in the run reveals
+    it. A second run makes other draws. All proposals of the runs and the prior are a mixture with a known density, from
     which recycling continues to beta = 1, so the result contains what any run has found (Owen & Zhou 2000).
 
     Parameters
@@ -306,7 +306,7 @@ def pool_runs(runs: Sequence[Recycled], n_prior: int) -> tuple[np.ndarray, np.nd
     runs : sequence of Recycled
         The runs; the first points of each are the draws of the prior.
     n_prior : int
-        Number of draws of the prior.
+        Number of prior draws.
 
     Returns
     -------
@@ -331,7 +331,7 @@ def pool_runs(runs: Sequence[Recycled], n_prior: int) -> tuple[np.ndarray, np.nd
 
 
 class WeightedPoints:
-    """All points that have arrived, and the logarithm of the mixture of all densities that they were drawn from.
+    """All points that have arrived, and the log-mixture over all densities that they were drawn from.
 
     The mixture counts every submitted draw. While some are running, the sum of the weights is therefore smaller than
     the evidence.
@@ -341,7 +341,7 @@ class WeightedPoints:
     pending : PendingPoints
         Starting points.
     start : StartingDensity
-        What they were drawn from.
+        Density that the starting points were drawn from.
 
     Attributes
     ----------
@@ -375,7 +375,7 @@ class WeightedPoints:
         self.update()
 
     def update(self) -> None:
-        """Take in what has arrived."""
+        """Add the points that have arrived."""
         parts = [pending.arrived_part() for pending in self._batches]
         parts = [part for part in parts if len(part[0]) > 0] or parts[:1]
         self.coords = np.concatenate([coords for coords, _ in parts])
@@ -411,7 +411,7 @@ class _Drawn(NamedTuple):
     pending: PendingPoints
 
     def log_weights(self, start: StartingDensity, beta: float) -> np.ndarray:
-        """Log-weights (m,) of the draws that have arrived, against the mixture that they were drawn from."""
+        """Log-weights (m,) of the draws that have arrived, relative to the mixture that they were drawn from."""
         coords, records = self.pending.arrived_part()
         alive = records["log_prob"] > -np.inf
         log_prob = np.where(alive, records["log_prob"], 0.0)
@@ -420,7 +420,7 @@ class _Drawn(NamedTuple):
 
 
 def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, records and log-weights of rounds of draws that have all arrived, as in `Recycled`."""
+    """Points, records and log-weights of complete rounds, as in `Recycled`."""
     parts = [draws.pending.arrived_part() for draws in drawn]
     log_weights = [draws.log_weights(start, beta) for draws in drawn]
     sizes = [draws.made for draws in drawn]
@@ -455,7 +455,7 @@ def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> P
 def most_running(density: Density, submitted: int) -> int:
     """How many points may still run when the next proposal is made: as many as there are workers.
 
-    Half of the points that were submitted last must have arrived: fewer teach a proposal too little.
+    Half the points that were submitted last must have arrived: fewer would improve a proposal too little.
     """
     return min(density.workers, submitted // 2)
 
@@ -470,7 +470,7 @@ class _Search:
         self._left, self.increase = left, 1.0
 
     def enlarge(self, draws: float, beta: float) -> float:
-        """The draws of a stage, increased by an equal share of the draws left for each stage still expected."""
+        """The draws of a stage, plus additional draws: those left are spread evenly over the stages still expected."""
         share = self._left / (1.0 - np.log(beta) / np.log(EXPECTED_GROWTH))
         self._left -= share
         self.increase = 1.0 + share / draws
@@ -480,8 +480,8 @@ class _Search:
 def stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
     """All points, weighted by the posterior over the mixture of their densities, when the limit is exceeded at `beta`.
 
-    `of_stages`: part of the log-evidence that is in stages already reported. `inherited`: variance of the log-evidence
-    from the weights by which the proposals were chosen.
+    `of_stages`: part of the log-evidence from stages already reported. `inherited`: variance of the log-evidence from
+    the weights by which the proposals were chosen.
     """
     log_weights = points.log_weights(1.0)
     n, effective = len(log_weights), effective_sample_size(log_weights)
@@ -498,7 +498,7 @@ def _with_even_share(mixture: Mixture, share: float) -> Mixture:
 
 
 def _reason(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
-    """Why to give up, or not to use the result; empty if there is no reason."""
+    """Reason to give up, or not to use the result; empty if there is none."""
     recent = float(np.mean(efficiencies[-PATIENCE:]))
     if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
         return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
