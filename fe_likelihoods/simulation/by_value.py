@@ -45,9 +45,10 @@ _OF_A_CLASS = {"__dict__", "__weakref__", "_abc_impl", "__abstractmethods__"}
 _IDENTICAL = (types.FunctionType, type, types.ModuleType, types.CodeType, *_LOCKS)  # their contents are seen apart
 _DESCRIPTORS = (property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType)
 _CONSTANT = {int, float, complex, str, bytes, bool, type(None), *_IDENTICAL, *_DESCRIPTORS}
+_COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
+_ABSENT = type("Absent", (), {})  # in place of the value of a name that is not defined
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
-_COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
 
 
@@ -256,7 +257,10 @@ class _Uses:
             objects += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
             objects += function.__closure__ or ()
         for namespace, names in self.namespaces.values():
-            objects += map(namespace.get, names) if names is not None else (*namespace, *namespace.values())
+            if names is None:
+                objects += (*namespace, *namespace.values())
+            else:
+                objects += [namespace.get(name, _ABSENT) for name in names]
         for cls in self.classes.values():
             objects += cls.__bases__
             for name, value in vars(cls).items():
@@ -288,8 +292,8 @@ class _Snapshot(cloudpickle.Pickler):
         if isinstance(obj, _IDENTICAL):
             self.kept.append(obj)
             return abs, (id(obj),)
-        if isinstance(obj, _CACHED):
-            return abs, (), obj.__wrapped__
+        if isinstance(obj, _CACHED | functools.cached_property):
+            return abs, (), getattr(obj, "__wrapped__", None) or obj.func
         return NotImplemented
 
 
@@ -325,6 +329,8 @@ class _Pickler(cloudpickle.Pickler):
             return self._reduce_module(obj) if self._module(obj.__name__) is obj else NotImplemented
         if isinstance(obj, _CACHED) and self._module(obj.__module__) is not None:  # pickled by its name otherwise
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
+        if isinstance(obj, functools.cached_property):  # with a lock in Python 3.11
+            return _new_cached_property, (obj.func, obj.attrname)
         if not isinstance(obj, type):
             return NotImplemented
         self._module(obj.__module__)
@@ -334,7 +340,8 @@ class _Pickler(cloudpickle.Pickler):
         # a new class for each function, since the methods of another one may belong to other values
         self.uses.classes[id(obj)] = obj
         make, (*arguments, _, extra), (state, slots), *tail = reduced
-        state = {name: self._sendable(name, value) for name, value in state.items()}
+        members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
+        state = {name: self._sendable(name, each) for name, each in state.items() if not isinstance(each, members)}
         return make, (*arguments, None, extra), (state, slots), *tail
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
@@ -486,6 +493,12 @@ def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
     return functools.lru_cache(maxsize, typed)(function)
 
 
+def _new_cached_property(function: Any, name: str | None) -> functools.cached_property:
+    new = functools.cached_property(function)
+    new.attrname = name
+    return new
+
+
 def _new_lock(value: Any) -> Any:
     return _Lock(isinstance(value, _LOCKS[1])) if isinstance(value, _LOCKS) else value
 
@@ -504,8 +517,8 @@ class _Probe(cloudpickle.Pickler):
     """Pickler that finds out whether an object can be pickled, without classes, modules and the code of functions."""
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, _CACHED):
-            return self.reducer_override(obj.__wrapped__)
+        if isinstance(obj, _CACHED | functools.cached_property):
+            return self.reducer_override(getattr(obj, "__wrapped__", None) or obj.func)
         if isinstance(obj, types.FunctionType):
             values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
             return abs, (), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))

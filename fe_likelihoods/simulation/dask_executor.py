@@ -26,24 +26,19 @@ SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
 SECONDS_TO_START = 60.0  # within which a worker of a cluster begins to run after it was asked for
 SECONDS_TO_RETURN = 15.0  # within which a nanny starts the process of a worker again
 LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait for a worker of a cluster that has none
+_NO_WORKERS = (
+    "the dask cluster has had no worker for {:g} s: start workers or scale the cluster, or wait longer by "
+    "DaskExecutor(client, longest_wait=...), and run again. Evaluations that are stored are not repeated"
+)
 _DIED = TransientReason("the worker process died in every attempt of dask")
 
 
 class _Item(Future):
-    """Future of one item."""
+    """Future of one item; `deaths` counts the attempts of dask that ended with the death of the worker."""
 
     def __init__(self, item: Any, reference: FunctionReference) -> None:
         super().__init__()
-        self.item, self.function = item, reference
-        self.deaths = 0  # attempts of dask that ended with the death of the worker
-
-
-class _Group:
-    """Items with the same function that are one task of dask."""
-
-    def __init__(self, items: list[_Item], losses_before: int) -> None:
-        self.items, self.losses_before = items, losses_before
-        self.inner: Any = None  # dask's future
+        self.item, self.function, self.deaths = item, reference, 0
 
 
 class DaskExecutor(PoolExecutor):
@@ -88,10 +83,10 @@ class DaskExecutor(PoolExecutor):
         self._seconds: float | None = None  # mean duration of an item in the last map or stream
         self._total, self._done = 0.0, 0
         self._lock = threading.RLock()
-        self._sent: set[_Group] = set()
-        self._ended: SimpleQueue[_Group | None] = SimpleQueue()  # of which dask has reported the end
+        self._sent: dict[Any, tuple[list[_Item], int]] = {}  # by dask's future: items, and losses before
+        self._ended: SimpleQueue = SimpleQueue()  # futures of which dask has reported the end, at last None
         self._suspects: deque[_Item] = deque()
-        self._suspect: _Group | None = None  # the one that runs
+        self._suspect: Any = None  # the future of the one that runs
         self._losses = 0  # tasks that dask has given up
         self._no_workers: RuntimeError | None = None
         self._workers = _Workers()
@@ -115,10 +110,8 @@ class DaskExecutor(PoolExecutor):
             return futures
         n_workers = self.n_workers if len(items) > 1 or not self._sent else 1
         if not n_workers:
-            logger.warning(
-                "The dask cluster has no worker; %d simulations wait for one. Start workers or scale the cluster",
-                len(items),
-            )
+            text = "The dask cluster has no worker; %d simulations wait for one. Start workers or scale the cluster"
+            logger.warning(text, len(items))
         with self._lock:
             if self._done:
                 self._seconds = self._total / self._done
@@ -134,117 +127,106 @@ class DaskExecutor(PoolExecutor):
             wanted = set(futures)
             at_work = set() if running else {key for keys in self.pool.processing().values() for key in keys}
             self._suspects = deque(item for item in self._suspects if item not in wanted)
-            left = {item for group in self._sent for item in group.items}
-            groups = [
-                group
-                for group in self._sent
-                if wanted.issuperset(group.items) and getattr(group.inner, "key", None) not in at_work
-            ]
-            self._forget(groups)
-        if groups:
-            self.pool.cancel([group.inner for group in groups])
-        for future in wanted.difference(left).union(*(group.items for group in groups)):
+            left = {item for items, _ in self._sent.values() for item in items}
+            inner = [each for each, (items, _) in self._sent.items() if wanted.issuperset(items)]
+            inner = [each for each in inner if getattr(each, "key", None) not in at_work]
+            left -= {item for each in inner for item in self._sent[each][0]}
+            self._forget(inner)
+        if inner:
+            self.pool.cancel(inner)
+        for future in wanted - left:
             future.cancel()
 
-    def _send(self, groups: list[list[_Item]]) -> list[_Group]:
-        """Send groups of items with the same function; the lock is held."""
-        sent = [_Group(items, self._losses) for items in groups]
-        if not self._sent:
-            self._ended, self._no_workers = SimpleQueue(), None
+    def _send(self, groups: list[list[_Item]]) -> list[Any]:
+        """Send groups of items with the same function; returns dask's futures. The lock is held."""
+        function = partial(_run_group, groups[0][0].function)
+        options = {"resources": self.resources} if self.resources else {}
+        starts = not self._sent
+        if starts:
             self._workers.note(getattr(self.pool, "cluster", None))
+        inner = self.pool.map(function, [[each.item for each in items] for items in groups], pure=False, **options)
+        self._sent |= {each: (items, self._losses) for each, items in zip(inner, groups, strict=True)}
+        if starts:
+            self._ended, self._no_workers = SimpleQueue(), None
             # not in the threads of dask, for which Python waits at its end: a lost scheduler sends no result
             for target in (self._receive_all, self._watch):
                 threading.Thread(target=target, args=(self._ended,), name="results of dask", daemon=True).start()
-        self._sent.update(sent)
-        function = partial(_run_group, groups[0][0].function)
-        options = {"resources": self.resources} if self.resources else {}
-        try:
-            inner = self.pool.map(function, [[each.item for each in items] for items in groups], pure=False, **options)
-        except BaseException:
-            self._forget(sent)
-            raise
-        for group, future in zip(sent, inner, strict=True):
-            group.inner = future
-        for group in sent:
-            group.inner.add_done_callback(lambda _, group=group, ended=self._ended: ended.put(group))
-        return sent
+        for each in inner:
+            each.add_done_callback(self._ended.put)
+        return inner
 
-    def _forget(self, groups: Iterable[_Group]) -> None:
-        """Groups have ended; the lock is held."""
-        self._sent.difference_update(groups)
+    def _forget(self, inner: Iterable[Any], goes_on: bool = False) -> None:
+        """Groups have ended, and the next suspect is tried if others go on; the lock is held."""
+        for each in inner:
+            self._sent.pop(each, None)
         if self._suspect not in self._sent:
             self._suspect = None
         if not self._sent:
             self._ended.put(None)
+        while goes_on and self._suspect is None and self._suspects:
+            item = self._suspects.popleft()
+            if not item.cancelled():
+                (self._suspect,) = self._send([[item]])
 
     # in threads of their own --------------------------------------------------------------------------------------
 
-    def _receive_all(self, ended: "SimpleQueue[_Group | None]") -> None:
+    def _receive_all(self, ended: SimpleQueue) -> None:
         """Receive groups as they end, those that have ended meanwhile together, until none is left."""
-        goes_on = True
-        while goes_on:
-            groups = [ended.get()]
+        inner: list = []
+        while None not in inner:
+            inner = [ended.get()]
             with contextlib.suppress(Empty):
                 while True:
-                    groups.append(ended.get_nowait())
-            goes_on = None not in groups
-            finished = [group for group in groups if group is not None and group.inner.status == "finished"]
-            answers: dict[_Group, Any] = {}
+                    inner.append(ended.get_nowait())
+            finished = [each for each in inner if each is not None and each.status == "finished"]
+            answers: dict = {}
             with contextlib.suppress(Exception):  # a worker was lost with its results: dask has repeated them
-                answers = dict(zip(finished, self.pool.gather([group.inner for group in finished]), strict=True))
-            for group in groups:
-                if group in self._sent:
-                    self._receive(group, answers.get(group))
+                answers = dict(zip(finished, self.pool.gather(finished), strict=True))
+            for each in inner:
+                self._receive(each, self._sent.get(each, ((), 0))[0], answers.get(each))
 
-    def _receive(self, group: _Group, answer: tuple[list, float] | None) -> None:
-        """Pass on the outcomes of a group, or the error."""
+    def _receive(self, inner: Any, items: Sequence[_Item], answer: tuple[list, float] | None) -> None:
+        """Pass on the outcomes of a group, or the error; there are no items if they were given up meanwhile."""
+        if not items:
+            return
         try:
-            (outcomes, seconds), failure = answer or group.inner.result(), None
+            (outcomes, seconds), failure = answer or inner.result(), None
             self._total, self._done = self._total + seconds, self._done + len(outcomes)
         except BaseException as error:
             if type(error).__name__ == "KilledWorker":
-                self._lose(group)
+                self._lose(inner)
                 return
-            outcomes, failure = [None] * len(group.items), self._no_workers or error
+            outcomes, failure = [None] * len(items), self._no_workers or error
             if not isinstance(failure, Exception) or type(failure).__name__ == "FutureCancelledError":
                 failure = RuntimeError(f"dask has cancelled a simulation ({error}); run again with a new client")
+        pairs = list(zip(items, outcomes, strict=True))
+        again = [item for item, outcome in pairs if isinstance(outcome, Missing) and not item.cancelled()]
         with self._lock:
-            self._forget([group])
-            pairs = list(zip(group.items, outcomes, strict=True))
-            again = [item for item, outcome in pairs if isinstance(outcome, Missing) and not item.cancelled()]
             for item in again:
                 item.function = item.function.carried()
             if again:
                 self._send([[item] for item in again])
-            self._try_next_suspect()
+            self._forget([inner], goes_on=True)
         for item, outcome in pairs:
             if item not in again:
                 resolve(item, outcome, failure)
 
-    def _lose(self, group: _Group) -> None:
+    def _lose(self, inner: Any) -> None:
         """Give up the item of a task whose worker died in every attempt, or suspect the items."""
         time.sleep(SECONDS_FOR_MESSAGES)
         with self._lock:
-            others = self._losses > group.losses_before or any(
-                other is not group and other.inner is not None and other.inner.status == "error" for other in self._sent
-            )
-            self._losses += 1
-            for item in group.items:
+            items, losses_before = self._sent.get(inner, ((), 0))
+            others = any(other is not inner and other.status == "error" for other in self._sent)
+            others, self._losses = others or self._losses > losses_before, self._losses + 1
+            for item in items:
                 item.deaths += 1
                 if item.deaths == MAX_ATTEMPTS or (item.deaths > 1 and not others):
                     resolve(item, (None, _DIED))
                 else:
                     self._suspects.append(item)
-            self._forget([group])
-            self._try_next_suspect()
+            self._forget([inner], goes_on=True)
 
-    def _try_next_suspect(self) -> None:
-        while self._suspect is None and self._suspects:
-            item = self._suspects.popleft()
-            if not item.cancelled():
-                (self._suspect,) = self._send([[item]])
-
-    def _watch(self, ended: "SimpleQueue[_Group | None]") -> None:
+    def _watch(self, ended: SimpleQueue) -> None:
         """While items are waited for: ask for workers that are lost, and cancel everything after a time without any."""
         last_seen = time.monotonic()
         while True:
@@ -257,13 +239,9 @@ class DaskExecutor(PoolExecutor):
                 last_seen = time.monotonic() if self.pool.nthreads() else last_seen
             longest = LONGEST_WITHOUT_WORKER if self._longest_wait is None else self._longest_wait
             if time.monotonic() - last_seen > longest and ended is self._ended:
-                self._no_workers = RuntimeError(
-                    f"the dask cluster has had no worker for {longest:g} s: start workers or scale the cluster, or "
-                    "wait longer by DaskExecutor(client, longest_wait=...), and run again. Evaluations that are stored "
-                    "are not repeated"
-                )
+                self._no_workers = RuntimeError(_NO_WORKERS.format(longest))
                 with contextlib.suppress(Exception):
-                    self.pool.cancel([group.inner for group in self._sent], force=True)
+                    self.pool.cancel(list(self._sent), force=True)
                 return
 
 
@@ -305,19 +283,11 @@ class _Workers:
         lost = self._started & absent.keys() - jobs
         late = {n for n in absent.keys() - jobs - self._started if absent[n] > SECONDS_TO_START}
         if lost or ended:
-            logger.warning(
-                "The dask cluster has given up %d of its %d %s: starting them again",
-                len(lost | ended),
-                len(wanted),
-                "jobs" if ended else "workers",
-            )
+            what = f"{len(lost | ended)} of its {len(wanted)} {'jobs' if ended else 'workers'}"
+            logger.warning("The dask cluster has given up %s: starting them again", what)
         if late:
-            logger.warning(
-                "%d of %d workers of the dask cluster have not started within %g s: asking for them again",
-                len(late),
-                len(wanted),
-                SECONDS_TO_START,
-            )
+            text = "%d of %d workers of the dask cluster have not started within %g s: asking for them again"
+            logger.warning(text, len(late), len(wanted), SECONDS_TO_START)
         if ended:
             cluster.sync(cluster.scale_down, ended)
         if lost or late or ended:
@@ -352,9 +322,9 @@ def wait_for_nanny() -> None:
 
 def _groups(items: list, n_workers: int, largest: int) -> list[list]:
     """Groups of items: each is half of a worker's share of the remaining items, at least one and at most `largest`."""
-    groups, start = [], 0
-    while start < len(items):
-        size = min(max(1, (len(items) - start) // (2 * n_workers)), max(1, largest))
-        groups.append(items[start : start + size])
-        start += size
+    groups = []
+    while items:
+        size = min(max(1, len(items) // (2 * n_workers)), max(1, largest))
+        groups.append(items[:size])
+        items = items[size:]
     return groups

@@ -56,6 +56,15 @@ class Cached:
     @functools.lru_cache(maxsize=3)
     def force(self, x):
         return K * x
+class Private:
+    __slots__ = ("__k", "__dict__")
+    def __init__(self):
+        self.__k = K
+    @functools.cached_property
+    def stiffness(self):
+        return self.__k
+def through_private_slots(x):
+    return Private().stiffness * x
 class Named:
     def __reduce__(self):
         return "ufunc"
@@ -199,6 +208,23 @@ def test_every_change_reaches_a_worker_that_has_loaded_the_function(how, user, p
         del sys.modules["changing"]
 
 
+def test_a_global_that_is_not_defined_yet_is_not_none(pool):
+    """As in a notebook whose cells are run in another order."""
+    script = sys.modules["__main__"]
+    exec(
+        "def defined(item):\n    try:\n        return [_late_value]\n    except NameError:\n        return []",
+        vars(script),
+    )
+    try:
+        for _ in range(3):
+            assert pool.map(script.defined, [0]) == [[]]
+        script._late_value = None
+        assert pool.map(script.defined, [0]) == [[None]]
+    finally:
+        del script.defined
+        vars(script).pop("_late_value", None)
+
+
 def test_an_unchanged_function_is_not_pickled_again(user, monkeypatch):
     for _ in range(2):
         Pickled.of(user.by_module)
@@ -264,6 +290,7 @@ def test_lambdas_closures_and_arrays_are_sent(pool):
 def test_cached_functions_are_sent_and_compiled_objects_end_the_run_where_they_are_used(user, pool):
     assert pool.map(user.law.through_a_cache, [1.0]) == pool.map(user.law.cached, [1.0]) == [3.0]
     assert pool.map(user.law.through_numpy, [3.0]) == [3.0]
+    assert pool.map(user.law.through_private_slots, [1.0]) == [3.0]
     with pytest.raises(ChangedModel, match="uses the value 'ufunc' of its module, .* by its name only"):
         pool.map(user.law.through_a_ufunc, [1.0])
 
