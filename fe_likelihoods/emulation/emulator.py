@@ -20,8 +20,8 @@ of Laplace, the expectation over the coefficients is
     log E L = max over s of [log L(S(m + s)) - sum_k s_k^2 / (2 v_k)] - sum_k log(1 + H_kk v_k) / 2,
 
 which is exact for a quadratic with a diagonal H. The steps s_k = t v_k g_k / (1 + H_kk v_k) are tried, with t = 0 and
-with the t that is best for the quadratic. Where the emulator is certain, this is log L at the mean; where it is not,
-residuals within its own uncertainty cost little, so that draws are made there and the emulator is trained there next.
+with the t that is best for the quadratic. Where the emulator is certain, this is log L at the mean. Where it is not,
+residuals within its uncertainty cost little, so that draws are made there and train the emulator next.
 
 A Gaussian process with one length scale per input underestimates its error where the response has a kink or a jump. The
 variances are therefore widened, per component, until the largest error of a left-out run is as large as the largest of

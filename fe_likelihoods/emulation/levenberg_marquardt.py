@@ -72,7 +72,7 @@ class Ascent(NamedTuple):
     iterations : int
         Number of steps.
     merged : int
-        Number of the ascent in whose mode this one would have ended, -1 if it went to its own end.
+        Index of the ascent in whose mode this ascent would have ended, -1 if it ran to the end.
     starts : tuple of int
         Starts that ended here.
     """

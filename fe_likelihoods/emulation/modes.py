@@ -169,11 +169,11 @@ def search_modes(
         whole = part is target
         ends: list[Ascent] = []
         tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
-        # the more starts, the closer they are, and none may be lost before the part that its difference acts in
+        # many starts are close together, and none may be lost before the part of the record where they differ
         apart = np.inf if whole else min(_APART, _APART_OF_ALL / len(starts))
         origin = np.zeros(target.n_structural)
         batches = Batches(part, remember, lambda points, share=share: fits(share * points), overlap)
-        # two waves: the ascents of the second one stop as soon as they head for an end of the first. That saves a few
+        # two waves: ascents of the second wave stop as soon as they head for an end of the first. That saves a few
         # simulations and doubles the time, so that it is left out where the time matters
         first = len(fronts) if overlap else _FIRST_WAVE if part is parts[0] else 1
         for wave in (fronts[:first], fronts[first:]):

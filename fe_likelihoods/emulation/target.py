@@ -359,7 +359,7 @@ class ResponseTarget:
         Parameters
         ----------
         statistics : (n_numbers,) float
-            Of the residuals.
+            Statistics of the residuals.
         start : (n_noise,) float, optional
             Coordinates near the result, such as the best ones at a neighbouring point. By default a grid is searched.
         """

@@ -280,7 +280,7 @@ class HierarchicalPosterior:
         return self.prior.transform(u)
 
     def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
-        """Draws (n, ndim) of the prior; arguments as of `Posterior.sample_prior`."""
+        """Draws (n, ndim) of the prior; arguments as for `Posterior.sample_prior`."""
         return self.prior.rvs(n, rng)
 
     def log_marginals(self, x: Any) -> np.ndarray:

@@ -192,7 +192,7 @@ class EventRatios:
         return self.median * np.exp(self.scale * rng.standard_t(self.degrees_of_freedom, (n, *self.shape)))
 
     def draw_at(self, predicted: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draw one ratio for each predicted value (n, ...), which it does not depend on."""
+        """Draw one ratio for each predicted value (n, ...); it does not depend on the value."""
         return self.draw(len(predicted), rng)
 
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:

@@ -19,12 +19,12 @@ __all__ = ["CheckedModel", "opened_cache"]
 
 
 def opened_cache(cache: SimulationCache | str | os.PathLike | None) -> SimulationCache | None:
-    """The cache on disk, of which a path was given; None for None."""
+    """The cache on disk, opened if a path was given; None for None."""
     return cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
 
 
 class CheckedModel:
-    """Label of a model, the comparisons that tell whether the model has changed, and its rows in the cache on disk.
+    """A model's label, the comparisons that show whether the model has changed, and its rows in the cache on disk.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class CheckedModel:
 
     @property
     def label(self) -> ModelLabel:
-        """Label of the model, which likelihoods of one model and file share."""
+        """Label of the model, shared by likelihoods with the same model and file."""
         return self._label if self.rows is None else self.rows.label
 
     @property
@@ -72,14 +72,14 @@ class CheckedModel:
         return self._guard.unchecked
 
     def complete(self, opened: Opened | None) -> None:
-        """Add to the label of the model what simulations opened."""
+        """Add the files that simulations opened to the model's label."""
         if self.rows is None:
             self._label.add(opened)
         else:
             self.rows.complete(opened)
 
     def share_trust(self, other: "CheckedModel") -> None:
-        """Verify no row that the model of another simulator has verified or stored, unless the code is another one."""
+        """Trust rows that another simulator has verified or stored, unless its code differs."""
         if self.rows is not None and other.rows is not None:
             self.rows.share_trust(other.rows)
 
@@ -90,12 +90,12 @@ class CheckedModel:
         ----------
         run : VerifyingRun
         earlier : callable
-            Returns a known simulation that can be run again, where the model has run none in this process.
+            Returns a known simulation that can be run again, if the model has run none in this process.
 
         Raises
         ------
         ChangedModel
-            If the model has changed; the simulations at `unchecked` may be those of either state.
+            If the model has changed; the simulations at `unchecked` may be from before or after the change.
         """
         self._know_more()
         if not self._guard.points:
@@ -113,7 +113,7 @@ class CheckedModel:
         return self._guard.after(run, thetas, misfit, reasons, seconds, last)
 
     def _know_more(self) -> None:
-        """Compare with what later simulations have opened and changed as well."""
+        """Include what later simulations have opened and changed in the comparison."""
         self._guard.known.add(self.label.opened)
         self._guard.changing |= self.label.changing
 

@@ -1,7 +1,7 @@
 """Results of earlier simulations: statistics in memory, on disk, then responses in memory, on disk, then failures.
 
-From a response, which is cached in double precision, the statistics are computed; they have the same bits as those of a
-new simulation.
+Statistics are computed from a cached response, which is in double precision, with the same bits as from a new
+simulation.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class Requested(NamedTuple):
     misfit : (n, n_numbers) float
         Statistics of the residuals; NaN where they are not known.
     known : (n,) bool
-        Whether the statistics are known, those of failures included.
+        Whether the statistics are known, including failures.
     reasons : list of n str
         Reasons of failures.
     response : (n, n_channels, n_steps) float, optional
@@ -61,7 +61,7 @@ class Requested(NamedTuple):
         known: np.ndarray,
         response: np.ndarray | None = None,
     ) -> "Requested":
-        """A request of which the statistics are in memory where `known`."""
+        """A request whose statistics are in memory where `known`."""
         n = len(keys)
         thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, n_structural).copy()
         return cls(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
@@ -79,9 +79,9 @@ class KnownSimulations:
     responses : ResponseMemory
         Responses in memory.
     checked : CheckedModel
-        Has the rows on disk.
+        Gives access to the rows on disk.
     failures : FailureLog
-        Failures that are found are recorded there.
+        Where failures that are found are recorded.
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class KnownSimulations:
         self._has_repeated_remark = False
 
     def clear(self) -> None:
-        """Forget what is in memory, because it may be of another model."""
+        """Empty the caches in memory, because their results may belong to another model."""
         self.memory.clear()
         self.responses.clear()
 
     def earlier_points(self, run: VerifyingRun) -> list[EarlierPoint]:
-        """A successful simulation that is in memory, if there is one, to be run again."""
+        """A successful simulation in memory, if there is one, to be run again."""
         thetas = self.memory.successes(len(run.model.parameter_names))[:1]
         statistics, _ = self.memory.look_up([theta.tobytes() for theta in thetas], run.n_numbers)
         return list(map(EarlierPoint, thetas, statistics))
@@ -129,7 +129,7 @@ class KnownSimulations:
         self._note(requested, rows, run)
 
     def _verified(self, look_up: Callable, *arguments: Any) -> Any:
-        """Rows from the disk, of which some are simulated again; if these differ, the caches in memory are emptied."""
+        """Rows from the disk. Some are simulated again; if they differ, the caches in memory are emptied."""
         try:
             return look_up(*arguments)
         except StaleCache:
@@ -200,7 +200,7 @@ class KnownSimulations:
         self.memory.store([requested.keys[row] for row in rows], requested.misfit[rows])
 
     def _name_failures(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
-        """Fill in reasons of failures of which only the statistics were cached."""
+        """Fill in failure reasons where only the statistics were cached."""
         rows = [row for row in rows if not requested.reasons[row]]
         if not rows or requested.response is None:
             return

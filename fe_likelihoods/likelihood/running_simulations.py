@@ -1,7 +1,7 @@
 """Simulations that were requested and have not ended, one by one and in groups.
 
-A request that is not waited for only fills the caches of a simulator: when it has ended, `Simulator.simulate` returns
-its responses without a simulation. So nothing depends on it but the time.
+A request only fills the caches of a simulator: when it has ended, `Simulator.simulate` returns its responses without a
+simulation. It affects the time, never the result.
 """
 
 from collections.abc import Hashable
@@ -30,13 +30,13 @@ class RunningSimulation:
     Attributes
     ----------
     key : bytes
-        Of the structural parameters, see `distinct_keys`.
+        Key of the structural parameters, see `distinct_keys`.
     theta : (n_structural,) float
         Structural parameters.
     responses : bool
         Whether its response was requested.
     future : Future or None
-        Of the pool; None if it waits to be run in this process, or as one of a batch.
+        Future of the pool; None if the simulation waits to be run in this process, or in a batch.
     users : set of SimpleQueue
         Queues of the requests that wait for it.
     received : bool
@@ -44,7 +44,7 @@ class RunningSimulation:
     result : Simulated or None
         Set when it was received.
     error : BaseException or None
-        What went wrong instead, for which no simulation can be blamed.
+        What went wrong instead, if the model is not to blame.
     """
 
     __slots__ = ("error", "future", "key", "received", "responses", "result", "theta", "users")
@@ -69,9 +69,9 @@ def take_all(arrived: SimpleQueue, wait: bool) -> list:
 
 
 class RunningRequests:
-    """Groups of simulations for responses, each of which is waited for as a whole.
+    """Groups of simulations for responses; each group is waited for as a whole.
 
-    Without a pool to which single simulations can be submitted, nothing is simulated here, and all requests have ended.
+    Without a pool that accepts single simulations, nothing is simulated here, and all requests count as ended.
 
     Parameters
     ----------

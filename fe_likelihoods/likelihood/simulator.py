@@ -2,8 +2,8 @@
 
 A request first takes what is known (`fe_likelihoods.likelihood.known_simulations`). The other simulations are run in a
 pool to which single items can be submitted, where each is cached when it arrives and nothing waits for a batch.
-Otherwise they are run in parts, each of which is cached when it has ended: in this process, on threads by compiled
-models, or by the ``map`` of a pool. Both ways are one for those who request simulations: `start`, `wait`, `leave`.
+Otherwise they are run in parts, and each part is cached when it has ended: in this process (compiled models on
+threads), or by the ``map`` of a pool. Callers use the same methods for both: `start`, `wait`, `leave`.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk
 
 
 def reported(likelihood: Any, name: str) -> Any:
-    """An entry of the report of a likelihood that is read as an attribute; AttributeError for any other name."""
+    """A report entry that is read as an attribute of a likelihood; AttributeError for any other name."""
     if name not in (*COUNTS, "failures", "failure_reasons"):
         raise AttributeError(f"{type(likelihood).__name__!r} object has no attribute {name!r}")
     return likelihood.report()[name]
@@ -80,7 +80,7 @@ class _Pool:
 
 
 class Simulator:
-    """A model's simulations, each of which is run once, compared with measurements.
+    """A model's simulations, compared with measurements; each is run once.
 
     `statistics` and, where responses are needed, `simulate` are the only places where a likelihood requests
     simulations; samplers without barriers and guides use `start`, `wait` and `leave`.
@@ -89,7 +89,7 @@ class Simulator:
     ----------
     model : Model
     measurements : Measurements
-        In the order of the model's channels.
+        Measurements in the order of the model's channels.
     statistic : Statistic, optional
         Statistic of the residuals; by default the sums of squares.
     time_shifts : mapping of str to float, optional
@@ -106,16 +106,15 @@ class Simulator:
     cache_hits : int
         Rows whose statistics were cached, in memory or on disk.
     disk_hits : int
-        Rows among them that came from the cache on disk.
+        Those cache hits that came from the cache on disk.
     failures : FailureLog
-        Failed simulations, those known from the cache on disk included.
+        Failed simulations, including failures known from the cache on disk.
     memory_cache : MemoryCache
         The statistics that are cached in memory.
     response_memory : ResponseMemory
         The responses that are cached in memory.
     chunk_size : int
-        Number of simulations after which the next results are stored on disk, where they are simulated in chunks;
-        adapted to their duration.
+        Number of simulations between two writes to the disk, for simulation in chunks; adapted to their duration.
     when_simulated : callable or None
         Called with the number of simulations that have ended, in this process only.
 
@@ -163,7 +162,7 @@ class Simulator:
 
     @property
     def seconds(self) -> float:
-        """Wall time of the simulations [s], those for verification included."""
+        """Wall time of the simulations [s], including verification."""
         rows = self._checked.rows
         return self._seconds + (0.0 if rows is None else rows.seconds)
 
@@ -194,9 +193,9 @@ class Simulator:
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of everything that is known of what the statistics depend on: `simulation_key` and code.
+        """Hex digest of everything the statistics are known to depend on: `simulation_key` and code.
 
-        The code and values of the user are those at the time when the simulator was made.
+        The user's code and values are taken as they were when the simulator was made.
         """
         text = f"{self.simulation_key} {self._checked.label.identity}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -254,7 +253,7 @@ class Simulator:
         Raises
         ------
         TooManyFailures, ChangedModel, StaleCache
-            Simulations that have ended are cached, except those of a model that has changed.
+            Simulations that have ended are cached, except after the model has changed.
         """
         thetas = as_rows(thetas, self.model.parameter_names)
         if not np.isfinite(thetas).all():
@@ -282,8 +281,8 @@ class Simulator:
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses of the model; they and their statistics are cached.
 
-        Duplicates are simulated once, and cached responses are reused. The statistics of a point may be cached without
-        its response. Such a point is simulated again, unless its simulation failed.
+        Duplicates are simulated once, and cached responses are reused. A point whose statistics are cached without its
+        response is simulated again, unless its simulation failed.
 
         Parameters
         ----------
@@ -327,7 +326,7 @@ class Simulator:
         return requested.cached
 
     def are_stored(self, thetas: np.ndarray) -> np.ndarray:
-        """Whether a response in memory or anything on disk is known (n,); it is neither read nor verified."""
+        """Whether a response in memory or any result on disk exists (n,); it is neither read nor verified."""
         stored = np.zeros(len(thetas), dtype=bool)
         if len(self.response_memory):
             keys = [row.tobytes() for row in thetas + 0.0]
@@ -338,7 +337,7 @@ class Simulator:
         return stored
 
     def in_memory(self, theta: np.ndarray) -> np.ndarray | None:
-        """Statistics (1, n_numbers) at one point (n_structural,), if its success is cached in memory."""
+        """Statistics (1, n_numbers) at one point (n_structural,), if a successful simulation is cached in memory."""
         misfit, (known,) = self.memory_cache.look_up([(theta + 0.0).tobytes()], self.n_numbers)
         if not known or misfit[0, 0] != misfit[0, 0]:  # NaN
             return None
@@ -346,14 +345,14 @@ class Simulator:
         return misfit
 
     def look_up(self, keys: list[bytes], distinct: list[int], on_disk: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Statistics that are cached, without a new simulation of others.
+        """Cached statistics; missing ones are not simulated.
 
         Parameters
         ----------
         keys : list of n bytes
             Distinct, see `distinct_keys`.
         distinct : list of int
-            Index of the key of every row that was requested, for the counts.
+            For every requested row, the index of its key, for the counts.
         on_disk : bool
             Whether to look in the cache on disk as well. Some of its rows may be simulated again for verification.
 
@@ -450,7 +449,7 @@ class Simulator:
         self.failures.check(len(self._submitted.running))
 
     def running_requests(self) -> RunningRequests:
-        """Requests for responses of which several run at once; `simulate` then finds the responses in the cache."""
+        """Requests for responses, several at once; `simulate` then finds the responses in the cache."""
         return RunningRequests(self)
 
     def start(
@@ -469,8 +468,8 @@ class Simulator:
         responses : bool
             Whether the responses are requested.
         arrived : SimpleQueue
-            Receives each `RunningSimulation` that has ended in the pool, for `wait` or `receive`. Pass those that are
-            no longer waited for to `leave`.
+            Receives each `RunningSimulation` that has ended in the pool, for `wait` or `receive`. Pass simulations that
+            are no longer needed to `leave`.
 
         Returns
         -------
@@ -517,14 +516,14 @@ class Simulator:
         Parameters
         ----------
         waiting : collection of RunningSimulation
-            All of one `start`; a first part of them is run here unless they run in a pool.
+            All simulations of one `start`; unless they run in a pool, a first part of them is run here.
         arrived : SimpleQueue
             As for `start`.
 
         Returns
         -------
         list of RunningSimulation
-            Those that have ended, with `result` or `error` set.
+            The ended simulations, with `result` or `error` set.
 
         Raises
         ------
@@ -558,7 +557,7 @@ class Simulator:
         Raises
         ------
         ChangedModel
-            If the model has changed; these simulations and those since the last comparison are not stored.
+            If the model has changed; these simulations, and all since the last comparison, are not stored.
         """
         pool = self._submitted
         with pool.lock:
@@ -585,7 +584,7 @@ class Simulator:
     def leave(
         self, waiting: Sequence[RunningSimulation], arrived: SimpleQueue, running: bool
     ) -> list[RunningSimulation]:
-        """No longer wait for simulations: those that have ended are cached, others cancelled if nobody else waits.
+        """Stop waiting for simulations: ended ones are cached, others cancelled if nobody else waits for them.
 
         Parameters
         ----------
@@ -593,12 +592,12 @@ class Simulator:
         arrived : SimpleQueue
             As for `start`.
         running : bool
-            Whether those that have started are cancelled too.
+            Whether started simulations are cancelled too.
 
         Returns
         -------
         list of RunningSimulation
-            Those that go on.
+            The simulations that go on.
         """
         pool = self._submitted
         with pool.lock:
@@ -726,7 +725,7 @@ class Simulator:
         return VerifyingRun(self.model, self.pool, self.measured, self.statistic, self.n_numbers, tolerance)
 
     def _check_before(self) -> None:
-        """Check failures and the model before simulations and not after them, so that finished ones are stored."""
+        """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
         with self._dropping_rows_of_a_changed_model():
             self._checked.before(self._run, lambda: self._known.earlier_points(self._run))

@@ -177,7 +177,7 @@ def quantiles_with_errors(
     Returns
     -------
     quantiles : ndarray, shape (n_probabilities, k)
-        Quantiles as of `numpy.quantile` with every row repeated `counts` times.
+        Quantiles as by `numpy.quantile` with every row repeated `counts` times.
     errors : ndarray, shape (n_probabilities, k)
         Their standard errors, inf for a single sample.
 

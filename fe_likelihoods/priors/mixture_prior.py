@@ -140,7 +140,7 @@ class MixtureDistribution(MultivariateDistribution):
         return scores.reshape(x.shape)
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws, shape (size, dim); arguments as of `Prior.rvs`."""
+        """Independent draws, shape (size, dim); arguments as for `Prior.rvs`."""
         rng = as_generator(random_state)
         rows = np.searchsorted(np.cumsum(self.weights)[:-1], rng.random(size))
         z = self.means[rows] + np.einsum("nij,nj->ni", self._factors[rows], rng.standard_normal((size, self.dim)))

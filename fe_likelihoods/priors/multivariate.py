@@ -74,7 +74,7 @@ class MultivariateDistribution(ABC):
         return self.from_normal(x)  # raises
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws, shape (size, dim); arguments as of `Prior.rvs`."""
+        """Independent draws, shape (size, dim); arguments as for `Prior.rvs`."""
         return self.from_normal(as_generator(random_state).standard_normal((size, self.dim)))
 
 

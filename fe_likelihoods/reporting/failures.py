@@ -76,7 +76,7 @@ class Failures(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """What is said where there is no table of failures."""
+        """The sentence for a report without a table of failures."""
         return self.remark or "No simulation failed."
 
 

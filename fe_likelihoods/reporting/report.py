@@ -119,8 +119,8 @@ def report(
     sampler : SMCSampler, TMCMCSampler or emcee.EnsembleSampler
         A sampler that has run.
     posterior : Posterior or callable, optional
-        What was sampled. Default: the log-density of the sampler. A log-density of the user's own has no units, no data
-        and no fit; the report then leaves these sections out, and says so.
+        What was sampled. Default: the log-density of the sampler. A user-defined log-density has no units, no data and
+        no fit; the report then leaves these sections out, and says so.
     prediction : Prediction, or mapping of str to Prediction, optional
         Results of `fe_likelihoods.propagate`, by title.
     out : path
