@@ -90,7 +90,7 @@ class CostEstimate(NamedTuple):
             ),
         }
         rows |= {"failed evaluations": str(self.failures)} if self.failures else {}
-        rows |= {"note": f"{self.cached} points were cached, and the times contain theirs"} if self.cached else {}
+        rows |= {"note": f"{self.cached} points were cached; the times include them"} if self.cached else {}
         width = max(map(len, rows))
         return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
 

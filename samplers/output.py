@@ -29,7 +29,7 @@ __all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file", "stored
 logger = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
-STORED = "stored step"  # key of the checksums of the steps that were stored as a whole
+STORED = "stored step"  # key of the checksums of completely stored steps
 STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 

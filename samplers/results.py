@@ -154,7 +154,7 @@ class RunResults:
 
     @property
     def guide(self) -> Guide | None:
-        """The guide in use: a copy of the given guide, which learns from this run; None before the run."""
+        """A copy of the given guide that learns from this run; None before the run or without a guide."""
         return None if self._guide is None else self._guide.guide
 
     @property

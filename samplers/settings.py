@@ -152,7 +152,7 @@ def check_names(sampler: str, names: Collection[str], given: Collection[str], ar
         near = get_close_matches(name, [*names, *arguments], n=1, cutoff=0.6)
         raise TypeError(
             f"{sampler}() got an unexpected keyword argument {name!r}{f': did you mean {near[0]}?' if near else ''}; "
-            f"arguments besides those of emcee are {', '.join(arguments)}; settings are {', '.join(sorted(names))}"
+            f"arguments, besides those in emcee, are {', '.join(arguments)}; settings are {', '.join(sorted(names))}"
         )
 
 

@@ -19,7 +19,7 @@ from .tempered import TemperedSampler
 __all__ = ["SMCSampler"]
 
 FEWEST_TO_RECYCLE = 150
-# settings of the choice of beta
+# settings for the choice of beta
 _OF_WEIGHTS = ("ess_ratio", "ess_rule", "ess_floor")
 
 

@@ -41,7 +41,7 @@ __all__ = [
     "fiber_stresses",
 ]
 
-# Layout of the constants of one concrete.
+# Layout of the concrete constants.
 FC, E0, ECU, EC, FT, ETU, BETA, ESEC, R, ECT, DECAY = range(11)
 N_CONSTANTS = 11
 

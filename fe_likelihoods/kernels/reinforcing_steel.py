@@ -55,7 +55,7 @@ __all__ = [
     "update",
 ]
 
-# Layout of the constants of one steel.
+# Layout of the steel constants.
 E0, FYP, YP, SHP, FSH, UP, EU, FSU, EH, EP, F0, P, FT, EHT, A_SHIFT, VIRGIN_LIMIT, YIELD_STRAIN = range(17)
 N_CONSTANTS = 17
 

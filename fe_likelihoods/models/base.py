@@ -52,7 +52,7 @@ class History:
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.names:
-            raise invalid(f"the name of a history out of {self.names}", name, "names are those of the attribute names")
+            raise invalid(f"the name of a history out of {self.names}", name, "the attribute names lists them")
         return self.values[self.names.index(name)]
 
 

@@ -37,7 +37,7 @@ __all__ = ["EquivalentLinear", "Settled", "response_level"]
 
 _LARGEST_LOG = math.log(1000.0)  # of a level as a multiple of the reference
 _STEP = 0.5  # of the search for a sign change, in the logarithm of the level
-_TOLERANCE = 1e-13  # of the logarithm of the level
+_TOLERANCE = 1e-13  # of the log-level
 _OWN = ("softening", "damping_growth")
 
 
@@ -171,7 +171,7 @@ class EquivalentLinear:
             if abs(end) >= _LARGEST_LOG:
                 side = "above 1000 times" if step > 0.0 else "below 1/1000 of"
                 raise SimulationFailed(
-                    f"stiffness and damping do not settle: no level of the response agrees with its own properties at "
+                    f"stiffness and damping do not settle: no response level agrees with its own properties at "
                     f"softening {theta[-2]:.4g} and damping_growth {theta[-1]:.4g}; the search ended {side} the "
                     f"reference level of {self.reference:g} m"
                 )

@@ -404,7 +404,7 @@ class IsolatedBridge(ThreadedModel):
         """Raise ValueError for parts of the wrong type or number."""
         if not isinstance(self.record, Record):
             raise invalid(
-                "a Record of the acceleration of the table",
+                "a Record of the table acceleration",
                 type(self.record).__name__,
                 "read one with fe_likelihoods.read_csv, read_at2 or read_v2",
             )

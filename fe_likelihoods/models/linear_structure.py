@@ -78,9 +78,7 @@ class LinearStructure(ExternalModel):
     ) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
-            raise ValueError(
-                f"LinearStructure: expected Records of the accelerations of the supports; got {supports!r}"
-            )
+            raise ValueError(f"LinearStructure: expected Records of the support accelerations; got {supports!r}")
         first = supports[0]
         for support in supports[1:]:
             if not same_sampling(first.dt, first.n_steps, support.dt, support.n_steps):

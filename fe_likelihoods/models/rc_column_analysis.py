@@ -353,4 +353,4 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason
-    return f"{reason}; bars with {lost:.0%} of the area of all bars of a section had fractured before"
+    return f"{reason}; bars with {lost:.0%} of the area of all bars in a section had fractured before"

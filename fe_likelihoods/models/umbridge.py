@@ -112,7 +112,7 @@ class UMBridgeModel(ExternalModel):
     ) -> None:
         kind = type(self).__name__
         if output is not None and not callable(output):
-            raise ValueError(f"{kind}: output must be a function of the vectors of the server; got {output!r}")
+            raise ValueError(f"{kind}: output must be a function of the server's vectors; got {output!r}")
         if output is not None and n_steps is None:
             raise ValueError(f"{kind}: give n_steps, the number of samples that output returns per channel")
         super().__init__(parameter_names, channels, dt, 1 if n_steps is None else n_steps, depends_on)
@@ -190,7 +190,7 @@ class UMBridgeModel(ExternalModel):
         try:
             vectors = [np.asarray(vector, dtype=float) for vector in answer]
         except (TypeError, ValueError) as error:
-            raise SimulationFailed(f"the output of the server is not a list of vectors of numbers: {error}") from error
+            raise SimulationFailed(f"the output of the server is not a list of numeric vectors: {error}") from error
         if [vector.shape for vector in vectors] != [(size,) for size in self.output_sizes]:
             shapes = [vector.shape for vector in vectors]
             raise SimulationFailed(f"the output has vectors of shapes {shapes}, expected sizes {self.output_sizes}")

@@ -179,7 +179,7 @@ def align(
     best = int(np.argmax(score))
     if best in (0, len(lags) - 1):
         raise ValueError(
-            f"the correlation is largest at a lag of {lags[best]:g} s, the end of the range; give a larger max_lag, or "
+            f"the correlation is largest at a lag of {lags[best]:g} s, an end of the range; give a larger max_lag, or "
             "other channels"
         )
     peaks = 1 + np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:]))

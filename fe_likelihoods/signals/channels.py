@@ -188,7 +188,7 @@ class Measurements:
         if not self.simultaneous:
             raise ValueError(
                 f"the channels {', '.join(channel.name for channel in self.channels)} have different times; call "
-                "times(name) for those of one channel"
+                "times(name) for the times of one channel"
             )
         return self.times(self.channels[0].name)
 

@@ -201,8 +201,8 @@ class Events(Record):
         for name, each in measurements.items():
             if not isinstance(each, Measurements) or not each.simultaneous or not same_step(first.dt, each.dt):
                 raise ValueError(
-                    f"measurements of events must have one time step for all channels and events; those of {name!r} "
-                    "differ: use Measurements.decimate, or join channels with steps of their own by NaN in one "
+                    f"measurements of events must have one time step for all channels and events; the steps of "
+                    f"{name!r} differ: use Measurements.decimate, or join channels with different steps by NaN in one "
                     "Measurements"
                 )
             for channel in each.channels:
@@ -313,15 +313,15 @@ def events_of(model: Any) -> Events:
     events = find_events(model)
     if events is None:
         raise ValueError(
-            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]); that of this "
-            f"{type(model).__name__} is not"
+            f"measurements and noise per event need a model whose excitation is Events([eq1, eq2, ...]), unlike the "
+            f"excitation of this {type(model).__name__}"
         )
     missing = events.duration - (model.n_steps - 1) * model.dt
     if missing > 1.000001 * model.dt:
         raise ValueError(
-            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and that of "
-            f"this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the measurements "
-            "of the first event are not to be compared"
+            f"measurements and noise per event need a response to all {events.duration:g} s of the events, and the "
+            f"response of this {type(model).__name__} lacks {missing:g} s; leave out its lead, and put NaN where the "
+            "measurements of the first event are not to be compared"
         )
     return events
 

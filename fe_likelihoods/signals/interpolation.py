@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 __all__ = ["POINTS", "Interpolation", "interpolate", "make_interpolation"]
 
 POINTS = 6
-"""Number of samples that determine a value between two of them."""
+"""Number of samples that determine a value between two samples."""
 
 _SAME_TIME = 1e-6  # in steps: times nearer to a sample than this are equal to the time of the sample
 

@@ -143,7 +143,7 @@ def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str,
     data = itertools.islice((place for place, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)
     places = list(data)
     if places:
-        # the width of most of the first rows: a number above the table is no row
+        # the width of most first rows: a number above the table is no row
         width = Counter(len(lines[place][1]) for place in places).most_common(1)[0][0]
         first = next(place for place in places if len(lines[place][1]) == width)
     else:

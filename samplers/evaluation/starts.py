@@ -22,7 +22,7 @@ FRESH_PER_POINT, FEWEST_FRESH, MOST_FRESH = 40, 4_000, 200_000
 LARGEST_TIED_SHARE = 0.5  # in a continuous parameter
 METROPOLIS_STEPS = 20
 FEWEST_FOR_METROPOLIS = 32  # signed ranks of fewer points cannot reach the level
-SEED = 20_131  # the tests have random numbers of their own, so that they change no run
+SEED = 20_131  # the tests use separate random numbers, so that they change no run
 
 
 def draws_to_compare(n: int) -> int:
@@ -63,8 +63,8 @@ def compare_with_draws(coords: np.ndarray, fresh: np.ndarray, names: Sequence = 
         abs(np.median(coords[:, j]) - middle) / width,
     )
     return (
-        f"the interquartile range of parameter {names[j]} is {ratio:.2g} times that of the draws, and the median "
-        f"differs by {shift:.2g} interquartile ranges (p = {p_values[worst]:.1g})"
+        f"the interquartile range of parameter {names[j]} is {ratio:.2g} times the range of the draws, and the "
+        f"median differs by {shift:.2g} interquartile ranges (p = {p_values[worst]:.1g})"
     )
 
 

@@ -342,7 +342,7 @@ class MixtureMove(_FittedMove):
         self._bounds: SupportBounds | None = None
         self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
         self._log_factors = [0.0, 0.0, 0.0]
-        self._current: int | None = None  # index of the kernel of the latest sweep; None right after a calibration
+        self._current: int | None = None  # kernel index in the latest sweep; None right after a calibration
         self._independence_accepted = False
 
     @property

@@ -64,7 +64,7 @@ DOUBLINGS = 30
 BISECTIONS = 55
 # Largest disagreement of the lines, as a share of the range of the points.
 AGREEMENT = 1e-9
-# A bound matters if it lies within so many standard deviations of the mean of the population.
+# A bound matters if it lies within so many standard deviations from the population mean.
 NEAR = 4.0
 
 

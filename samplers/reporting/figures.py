@@ -28,7 +28,7 @@ COLOURS = (BLUE, ORANGE, "#5b8c5a", "#7b5ea7", "#3aa0a8", "#6b4a2f")  # of sever
 LEVELS = (0.5, 0.9)
 FEW_POINTS = 150  # fewer distinct samples are drawn as points, since a contour through them shows chance
 PRIOR_DRAWS = 20_000  # for densities of parameters without a distribution and for the width of a prior
-LARGEST_PANEL = 2.5  # largest width of a panel of `plot_marginals`, as a multiple of the range of the samples
+LARGEST_PANEL = 2.5  # largest panel width in `plot_marginals`, as a multiple of the range of the samples
 
 
 class _Drawn(NamedTuple):

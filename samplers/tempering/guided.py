@@ -49,10 +49,10 @@ __all__ = [
     "reliable",
 ]
 
-# Draws of each later round, as a share of the number of walkers. After a reliable round, a round has as many draws as
+# Draws in each later round, as a share of the number of walkers. After a reliable round, a round has as many draws as
 # are expected to suffice.
 ROUND_SHARE = 0.6
-# Smallest number of draws of a round. The Pareto shape cannot be estimated from fewer than 25.
+# Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
 FEWEST_DRAWS = 25
 # A reliable round has at least this effective share, and a Pareto shape below this value, for which the variance of its
 # weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.

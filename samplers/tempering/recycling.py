@@ -44,7 +44,7 @@ from .population import Density, Population
 
 __all__ = ["Recycled", "StartingDensity", "most_running", "pool_runs", "recycle", "stopped_at", "submit_start"]
 
-# Effective sample size wanted at each beta (the target), as a share of the number of starting points. A small target
+# Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2
 # Smallest target per dimension (and one more): fewer effective points do not determine the covariances of the mixture.
@@ -508,7 +508,7 @@ def _reason(check: EvidenceCheck | None, log_evidence: float, beta: float, effic
     if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
         return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
     if efficiencies[-1] < RELIABLE_EFFICIENCY:
-        return f"the effective sample size of the draws of the check is {100 * efficiencies[-1]:.2g} % of their number"
+        return f"the effective sample size of the check is {100 * efficiencies[-1]:.2g} % of their number"
     if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
         return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
     return ""
