@@ -4,7 +4,7 @@ An evaluation needs a simulation unless only fast parameters differ from an eval
 record of the run (`samplers.record`); simulations that a guide makes by itself are counted in addition.
 
 A limit only ends a run, and changes nothing before its end. So a run that is continued with a larger limit repeats the
-same steps from the record, which costs no simulation, and goes on.
+same steps from the record, which costs no simulation, and continues.
 """
 
 from numbers import Real
@@ -99,7 +99,7 @@ class Budget:
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))
 
     def begin(self, guide: CountsSimulations) -> None:
-        """Count the simulations of a new guide from now on, besides the simulations of earlier guides."""
+        """Count the simulations of a new guide from now on, in addition to the simulations of earlier guides."""
         self._of_earlier_guides = self.of_guides
         self._guide, self.refused = guide, False
 

@@ -1,8 +1,8 @@
 """Data stored with a chain: the run that it belongs to, the ladder, the check of the evidence, the verdict.
 
-The chain itself is written by emcee's own backend. In an HDF5 file, the group of the chain has the attribute ``run``,
-the dataset ``tempering`` (JSON), and the group ``restart``, the state from which a reset chain goes on. In memory,
-these are attributes of the backend.
+emcee's backend writes the chain. In an HDF5 file, the group of the chain has the attribute ``run``, the dataset
+``tempering`` (JSON), and the group ``restart``, the state from which a reset chain continues. In memory, these are
+attributes of the backend.
 """
 
 import contextlib
@@ -52,8 +52,8 @@ class Output:
     first_step : int
         Number of steps that were stored before the last annealing.
     provisional : bool
-        Whether the last step is the estimate of a run that the limit of simulations ended, and is replaced when the
-        run goes on.
+        Whether the last step is the estimate of a run that the limit of simulations ended, and is replaced when the run
+        continues.
     """
 
     def __init__(self, backend: Backend, record: Record):
@@ -133,7 +133,7 @@ class Output:
         return State(values.pop("coords"), **values, random_state=backend.random_state)
 
     def clear_chain(self, state: State | None) -> None:
-        """Remove all steps; the chain goes on from `state`."""
+        """Remove all steps; the chain continues from `state`."""
         backend = self._backend
         cut_chain(backend, 0)
         self.first_step, self.provisional = 0, False

@@ -1,7 +1,7 @@
 """Repeating a run from its record: the files of a run, and whether they belong to the sampler.
 
 The record of evaluations (`samplers.record`) and emcee's HDF5 file are kept on disk. If a sampler is made with the file
-of a run, the annealing is repeated from the record without an evaluation, and the chain goes on from its last stored
+of a run, the annealing is repeated from the record without an evaluation, and the chain continues from its last stored
 step, as in emcee. A damaged or missing chain is repeated as well.
 """
 

@@ -49,7 +49,7 @@ class Concern(NamedTuple):
     Attributes
     ----------
     message : str
-        What was found, and what to do.
+        The finding, and what to do.
     grave : bool
         Whether the numbers may be wrong by more than their stated errors.
     """
@@ -239,7 +239,7 @@ class AnnealingResult(NamedTuple):
     basis : str
         How the guide searched for parts of the posterior; empty if it does not say.
     findings : tuple of Concern
-        What the checks found.
+        Findings of the checks.
     independent_points : float, optional
         Effective sample size of the walkers when beta = 1 was reached; None for a result that was read from a backend.
     """

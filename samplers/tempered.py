@@ -8,7 +8,7 @@ Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State,
 Therefore any emcee move works below beta = 1, and a change of beta needs no evaluation.
 
 Three collaborators do the rest: `samplers.evaluation.evaluator.Evaluator` calls the user's function,
-`samplers.record.Record` keeps what it returned, and `samplers.output.Output` stores the ladder and the verdict with the
+`samplers.record.Record` keeps its values, and `samplers.output.Output` stores the ladder and the verdict with the
 chain.
 """
 
@@ -72,7 +72,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
         support of the prior are not evaluated. With an emcee `HDFBackend`, a record of all evaluations is kept beside
-        the file, and a killed run goes on without repeating an evaluation (`run_mcmc`).
+        the file, and a killed run continues without repeating an evaluation (`run_mcmc`).
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -90,8 +90,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
     max_simulations : float, optional
         Largest number of simulations (`simulations`). When it is reached, the posterior is estimated from the known
         points, the final walkers are stored as one step if the chain is empty, and a `SamplingWarning` says so; see
-        `verdict`. To go on, set the attribute `max_simulations` to a larger number, or make a new sampler with the same
-        file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
+        `verdict`. To continue, set the attribute `max_simulations` to a larger number, or make a new sampler with the
+        same file, and call `run_mcmc` again: the result equals a run with the larger number from the start.
     seed : int or array of int, optional
         Seed of the run. By default it is drawn from NumPy's global generator, so that ``np.random.seed`` determines
         the run, and two samplers never share a stream. A file that contains a run keeps its seed: another seed has no
@@ -256,10 +256,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
     def run_mcmc(self, initial_state, nsteps, **kwargs):
         """Anneal to beta = 1 if that has not been done, then make `nsteps` steps at beta = 1.
 
-        With an emcee `HDFBackend`, a new sampler with the file of a run goes on with it, as in emcee: the annealing is
-        repeated from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last stored
-        step. The results equal a run that was never interrupted, to the last bit. So a script that is restarted after a
-        kill calls ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
+        With an emcee `HDFBackend`, a new sampler with the file of a run continues the run, as in emcee: the annealing
+        is repeated from the record, without an evaluation, and ``run_mcmc(None, nsteps)`` adds steps after the last
+        stored step. The results equal a run that was never interrupted, to the last bit. So a script that is restarted
+        after a kill calls ``run_mcmc(None, max(0, nsteps - sampler.iteration))``.
 
         Parameters
         ----------
@@ -435,7 +435,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
     # ------------------------------------------------------------------ where a call begins
 
     def _first_state(self, given: State | None, skip_check: bool) -> State | RunStart:
-        """The state at beta = 1 from which a call goes on, or the start of the annealing that comes first."""
+        """The state at beta = 1 from which a call continues, or the start of the annealing that comes first."""
         self._open_record()
         if self._record.start is not None:
             self._output.drop_provisional_step()

@@ -34,7 +34,7 @@ N_STATES = 12
 N_OUT = 16
 """Columns of the output: the state, the isolator forces F (2), Z (2)."""
 N_MEMORY = 20
-"""Numbers from which an integration goes on: r (12), F at the last two instants (2 + 2), Z (2), displacements (2)."""
+"""Size of the state between two steps: r (12), F at the last two instants (2 + 2), Z (2), displacements (2)."""
 
 
 class StepMatrices(NamedTuple):
@@ -77,7 +77,7 @@ class Isolators(NamedTuple):
 
 @kernel
 def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out, first, memory):
-    """Integrate from rest, or go on from a sample of an earlier integration.
+    """Integrate from rest, or continue from a sample of an earlier integration.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
         0 for an integration from rest. Otherwise `memory` holds the state at this sample, and only later samples are
         computed and written.
     memory : ndarray (20,)
-        Written: the state from which the integration can go on after the last sample. Read if `first` is not 0.
+        Written: the state from which the integration can continue after the last sample. Read if `first` is not 0.
 
     Returns
     -------

@@ -52,7 +52,7 @@ def _is_ours(path: str) -> bool:
 def _private_folder(path: str) -> str:
     """Create a folder that only this user can read and write; OSError if that is impossible.
 
-    numba's index is a pickle, and loading it runs what it contains: nobody else may have written it. An existing folder
+    numba's index is a pickle, and loading it runs the code in it: nobody else may have written it. An existing folder
     that others could write to is emptied.
     """
     with suppress(FileExistsError):

@@ -99,7 +99,7 @@ def _record_forces(column, force, out):
 
 @kernel
 def newmark(column, dynamics, ground, dt, every, iteration, history, sections, first, energies):
-    """Apply gravity, then the base acceleration `ground` along x; or go on from a step of an earlier analysis.
+    """Apply gravity, then the base acceleration `ground` along x; or continue from a step of an earlier analysis.
 
     Parameters
     ----------

@@ -182,8 +182,8 @@ class EquivalentLinear:
         """Find all levels that agree with their own properties, from 1/1000 to 1000 times the reference level.
 
         There are several levels where the response grows faster than the level while the frequency moves through a peak
-        of the response spectrum. `settle` uses the first one in its direction of search, and the likelihood may jump
-        where it disappears. Two fixed points within a factor of 1.65 of each other may be missed.
+        of the response spectrum. `settle` uses the first level in its direction of search, and the likelihood may jump
+        where this level disappears. Two fixed points within a factor of 1.65 of each other may be missed.
 
         Parameters
         ----------

@@ -55,9 +55,9 @@ class FunctionModel(UserModel):
         Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
         under another record then need no `from_state`.
     version : str, optional
-        Text in the fingerprint; cached simulations are used only if their text is the same. Without it, a change of the
-        code, or of anything that it uses or opens, is noticed by the label of the model
-        (`fe_likelihoods.simulation.label`), and stored simulations are used where some of them agree with new ones.
+        Text in the fingerprint; cached simulations are used only if their text is the same. Without it, the label of
+        the model (`fe_likelihoods.simulation.label`) notices a change in the code, or in anything that it uses or
+        opens, and stored simulations are used if some of them agree with new simulations.
     depends_on : sequence, optional
         Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
         or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.

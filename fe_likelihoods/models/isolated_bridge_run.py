@@ -1,7 +1,7 @@
 """One simulation of the isolated bridge, from rest or from the state at the end of an earlier one.
 
-The state at a sample of the response is one array: the number of the sample, and what the kernel keeps between two
-steps (`fe_likelihoods.kernels.isolated_bridge.N_MEMORY` numbers).
+The state at a sample of the response is one array: the number of the sample, and the kernel's memory between two steps
+(`fe_likelihoods.kernels.isolated_bridge.N_MEMORY` numbers).
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     prepared : PreparedBridge
     theta : ndarray[n_parameters]
     state : ndarray or None
-        State at a response sample, from which the simulation goes on; the results begin with the next response sample.
-        None: from rest.
+        State at a response sample, from which the simulation continues; the results begin with the next response
+        sample. None: from rest.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Model that is built and run in OpenSees.
 
 OpenSees holds one model per process, may end its process, and prints a lot. It therefore runs in a separate process,
-where it is wiped before each run, and is never imported into the process of the user. After a run that crashes or takes
-too long, the next run starts a new process.
+where it is wiped before each run, and is never imported into the user's process. After a run that crashes or takes too
+long, the next run starts a new process.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ class OpenSeesModel(FunctionModel):
     version : str, optional
         Text that replaces the code in the fingerprint; see `FunctionModel`.
     depends_on : sequence, optional
-        Files and values that the response depends on besides the code, such as ``Path("record.txt")``; see
-        `FunctionModel`.
+        Other files and values that the response depends on, such as ``Path("record.txt")``; see `FunctionModel`.
 
     Raises
     ------

@@ -55,7 +55,7 @@ class MomentCurvature(NamedTuple):
     curvature : ndarray[n]
         Curvature, positive where the column bends towards positive displacements [1/m].
     moment : ndarray[n]
-        Bending moment, with the sign of the curvature where it is elastic [N m].
+        Bending moment, with the sign of the curvature in the elastic range [N m].
     axial_strain : ndarray[n]
         Strain at the axis, positive in tension.
     axial_force : float

@@ -1,6 +1,6 @@
 """One simulation of the reinforced-concrete column, from the beginning or from the state at the end of an earlier one.
 
-The state at a sample of the response is one array: the number of the sample, the energies, and what the kernel keeps
+The state at a sample of the response is one array: the number of the sample, the energies, and the kernel's memory
 between two steps (`fe_likelihoods.kernels.newmark.committed_state`).
 """
 
@@ -84,7 +84,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     prepared : PreparedColumn
     theta : ndarray[n_parameters]
     state : ndarray or None
-        State at a response sample, from which the simulation goes on; the results begin after this sample. None: from
+        State at a response sample, from which the simulation continues; the results begin after this sample. None: from
         the beginning.
 
     Returns

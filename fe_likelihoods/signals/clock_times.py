@@ -70,7 +70,7 @@ def parse_clock(cell: str, where: str) -> ClockTime:
 def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
     """Return the seconds since the midnight before the first time, NaN for None.
 
-    Without dates, a time that is earlier than the one before by more than half a day belongs to the next day.
+    Without dates, a time that is more than half a day earlier than the previous time belongs to the next day.
 
     Raises
     ------

@@ -285,7 +285,7 @@ def read_csv(
     dt : float, optional
         Time step [s], needed for a file without times.
     column : str, optional
-        Name of the column, needed if there is more than one besides the time.
+        Name of the column, needed if there are several columns in addition to the time.
     time_unit : str, optional
         Unit of the times, if the column name does not end with it.
     skip : int, optional

@@ -310,7 +310,7 @@ class Round(NamedTuple):
 
     @property
     def pareto_shape(self) -> float:
-        """`tail_shape` of the weights; inf for too few of them."""
+        """`tail_shape` of the weights; inf for too few weights."""
         return tail_shape(self.log_weights)
 
 

@@ -1,10 +1,10 @@
 """Evaluation of points that arrive in any order, so that no worker waits for the slowest point of a batch.
 
 Points are submitted to a queue as soon as they are proposed. The record of the run contains the finished points and,
-for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had arrived before it. An interrupted run
-repeats these decisions from the record when it is made again, and continues with the same bits. Points that were
-running when the process ended are submitted again. If Ctrl-C or an error ends the run, finished points are entered in
-the record first.
+for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had arrived before it. An interrupted run,
+when repeated, makes the same decisions from the record and continues with the same bits. Points that were running when
+the process ended are submitted again. If Ctrl-C or an error ends the run, finished points are entered in the record
+first.
 """
 
 import hashlib

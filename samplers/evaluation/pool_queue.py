@@ -138,7 +138,7 @@ class PoolQueue:
         Raises
         ------
         RuntimeError
-            If no point is running, or the pool cannot go on. Points that finished before are returned first.
+            If no point is running, or the pool cannot continue. Points that finished before are returned first.
         """
         for ticket in self._handed:
             self._ended.pop(ticket, None)  # first: `ended` may be called if Ctrl-C comes between the two

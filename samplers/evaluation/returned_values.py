@@ -1,4 +1,4 @@
-"""Arrays of log-probabilities and blobs from what a user's function returned, or an error that says what is wrong.
+"""Arrays of log-probabilities and blobs from the values of a user's function, or an error that says what is wrong.
 
 emcee's conventions hold: one number per point, or a sequence of the number and blobs; blobs of several points are
 stacked; text and blobs of different lengths become objects. Unlike in emcee, NaN is left to the caller to judge, and
@@ -64,7 +64,7 @@ def log_probabilities(
     Parameters
     ----------
     results : array or sequence
-        What the function returned: (n,) numbers, or n sequences (number, blob, ...).
+        Values of the function: (n,) numbers, or n sequences (number, blob, ...).
     n : int
         Number of points for which the function was called.
     name : str
@@ -132,7 +132,7 @@ class Failed:
     Parameters
     ----------
     error : Exception or str
-        What was raised, or the reason.
+        The raised exception, or the reason.
 
     Attributes
     ----------

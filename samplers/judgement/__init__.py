@@ -1,4 +1,4 @@
-"""What the result of a run is worth: concerns found while it runs and after it, and the verdict."""
+"""Quality of a run's result: concerns found during and after the run, and the verdict."""
 
 from .failures import NearFailures, failures_near
 

@@ -41,7 +41,7 @@ class NearFailures(NamedTuple):
     Attributes
     ----------
     failed : int
-        Number of failures in the ellipsoid about the mean of the samples that holds 99 % of them.
+        Number of failures in the ellipsoid about the mean of the samples that holds 99 % of the samples.
     evaluated : int
         Number of all distinct points there.
     known : bool

@@ -71,7 +71,7 @@ class RunParts(NamedTuple):
 
     `get_chain`, called without arguments, returns the chain (nsteps, nwalkers, ndim) at beta = 1. `near` are the
     failures in the region of the last walkers, or None for a chain that was read from a file. `failed_simulations` is
-    the count of a log-density that counts failed simulations itself.
+    the number counted by a log-density that counts failed simulations.
     """
 
     result: AnnealingResult
@@ -151,7 +151,7 @@ class Verdict(_Stored):
 
     @cached_property
     def unknown(self) -> tuple[str, ...]:
-        """What the run cannot know."""
+        """Questions that the run cannot answer."""
         return tuple(_unknown(self._parts))
 
     @cached_property
@@ -240,11 +240,11 @@ def judge(
     Parameters
     ----------
     result : AnnealingResult
-        What the annealing has found.
+        Result of the annealing.
     nwalkers, ndim : int
         Size of the ensemble.
     simulations, searched : float
-        Simulations made, and how many of them the guide made by itself.
+        Simulations made, and the part made by the guide for its search.
     missing_steps : int
         Steps at beta = 1 that the limit of simulations did not allow.
     failures : str

@@ -137,7 +137,7 @@ def _check_half(coords: np.ndarray) -> None:
 class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
 
-    Without a calibration (in a plain EnsembleSampler, or in a run that goes on from a chain without its record), two
+    Without a calibration (in a plain EnsembleSampler, or in a run that continues a chain without its record), two
     copies are fitted to one half of the walkers each, and move the other half. A proposal that is fitted to the points
     that it moves would make their tails too light for many sweeps; these proposals are independent of the points. The
     halves and both fits do not change until the number of walkers changes: copies of one point are in the same half,

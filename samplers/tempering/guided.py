@@ -187,7 +187,7 @@ class Batch:
 
 
 def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession) -> Batch:
-    """Begin to evaluate draws (n, ndim) of the guide; a limit of simulations may allow only the first of them.
+    """Begin to evaluate draws (n, ndim) of the guide; a limit of simulations may allow only the first draws.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def let_arrive(
 ) -> None:
     """Wait until at most this number of draws in the latest batch is running, and none in earlier batches.
 
-    The guide observes draws as they arrive, a few at a time, so that a killed run has kept nearly all of them.
+    The guide observes draws as they arrive, a few at a time, so that a killed run has kept nearly all draws.
     """
     while batches:
         running = [batch.running for batch in batches]
@@ -326,7 +326,7 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
 
 
 def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
-    """How the rounds end; None if they go on."""
+    """How the rounds end; None if they continue."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
     if enough and reliable(last) and _even(pooled):
         light = tails_are_light([r for r in rounds if reliable(r)])
@@ -405,7 +405,7 @@ def _hopeless(rounds: Sequence[Round]) -> str:
 
 
 def _describe(last: Round, pooled: PooledRounds) -> str:
-    """What the rounds have reached, and what they lack."""
+    """Text on what the rounds have reached, and what is missing."""
     return (
         f"after {MOST_ROUNDS} rounds, the effective sample size of fresh draws is "
         f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and the "

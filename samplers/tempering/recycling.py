@@ -404,7 +404,7 @@ class WeightedPoints:
 
 
 class _Drawn(NamedTuple):
-    """The draws of a mixture inside the support of the prior, of `made` draws in all."""
+    """The draws from a mixture that lie inside the support of the prior, out of `made` draws."""
 
     mixture: Mixture
     made: int
@@ -437,7 +437,7 @@ def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
 
 
 def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> PendingPoints:
-    """Begin to evaluate the draws (n, ndim) of the prior that an annealing starts from; `whole`: wait for all of them.
+    """Begin to evaluate the draws (n, ndim) of the prior that an annealing starts from; `whole`: wait for all draws.
 
     Raises
     ------
