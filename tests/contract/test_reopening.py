@@ -6,6 +6,7 @@ evaluated again: not after a kill, not with a larger limit, not without the file
 
 import os
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import emcee
@@ -65,6 +66,14 @@ def run(kind, path, *calls, **kwargs):
     return sampler
 
 
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory):
+    """Like `run`, each made once: the runs without an interruption, which tests only read."""
+    return cache(
+        lambda kind, *calls, **settings: run(kind, tmp_path_factory.mktemp("whole") / "run.h5", *calls, **settings)
+    )
+
+
 def same(sampler, other):
     """Everything but the wall time is equal to the last bit."""
     for get in ("get_chain", "get_log_prob", "get_blobs"):
@@ -91,27 +100,27 @@ def record_of(path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_steps_are_added_after_the_last_stored_one(kind, tmp_path):
+def test_steps_are_added_after_the_last_stored_one(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 3)
     posterior = Counted()
     reopened = make(kind, tmp_path / "run.h5", posterior, seed=8)
     reopened.run_mcmc(None, 4)
     assert reopened.iteration == 7
-    assert same(reopened, run(kind, tmp_path / "whole.h5", 3, 4))
+    assert same(reopened, whole_run(kind, 3, 4))
     assert len(posterior.evaluated) <= 4 * N  # those of the added steps only
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_equal_calls_add_steps_too(kind, tmp_path):
+def test_equal_calls_add_steps_too(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     for _ in range(2):
         reopened = make(kind, tmp_path / "run.h5", Counted())
         reopened.run_mcmc(None, 2)
-    assert same(reopened, run(kind, tmp_path / "whole.h5", 2, 2, 2))
+    assert same(reopened, whole_run(kind, 2, 2, 2))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_loop_over_sample_adds_steps(kind, tmp_path):
+def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     reopened = make(kind, tmp_path / "run.h5", Counted())
     seen = []
@@ -120,7 +129,7 @@ def test_a_loop_over_sample_adds_steps(kind, tmp_path):
         if reopened.iteration == 5:
             break
     assert np.array_equal(reopened.get_chain()[2:], seen)
-    assert np.array_equal(reopened.get_chain(), run(kind, tmp_path / "whole.h5", 2, 3).get_chain())
+    assert np.array_equal(reopened.get_chain(), whole_run(kind, 2, 3).get_chain())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -140,8 +149,8 @@ def test_reset_begins_anew(kind, tmp_path):
 
 @pytest.mark.parametrize("fingerprint", ["counted", None])
 @pytest.mark.parametrize("kind", OURS)
-def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path):
-    whole = run(kind, tmp_path / "whole.h5", 3)
+def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path, whole_run):
+    whole = whole_run(kind, 3)
     path = tmp_path / "run.h5"
     begin(make(kind, path, Counted(fingerprint)), 3)
     path.unlink()
@@ -152,12 +161,12 @@ def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_pat
     assert same(again, whole)
     assert len(posterior.evaluated) <= (2 if fingerprint is None else 0)  # a comparison replaces the fingerprint
     again.run_mcmc(None, 2)
-    assert same(again, run(kind, tmp_path / "longer.h5", 3, 2))
+    assert same(again, whole_run(kind, 3, 2))
 
 
 @pytest.mark.parametrize("kind", OURS)
-def test_a_damaged_file_is_set_aside_and_made_again(kind, tmp_path):
-    whole = run(kind, tmp_path / "whole.h5", 3)
+def test_a_damaged_file_is_set_aside_and_made_again(kind, tmp_path, whole_run):
+    whole = whole_run(kind, 3)
     path = tmp_path / "run.h5"
     begin(make(kind, path, Counted()), 3)
     os.truncate(path, path.stat().st_size // 2)
@@ -175,10 +184,10 @@ def test_a_damaged_file_is_set_aside_and_made_again(kind, tmp_path):
 @pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
 @pytest.mark.parametrize("place", ["annealing", "at beta = 1"])
 @pytest.mark.parametrize("kind", OURS)
-def test_a_limit_that_is_raised(kind, place, reopened, tmp_path):
+def test_a_limit_that_is_raised(kind, place, reopened, tmp_path, whole_run):
     """The result is that of the larger limit from the start, and nothing is evaluated twice."""
-    annealing = run(kind, tmp_path / "annealed.h5", 0, max_simulations=10_000).evaluations
-    whole = run(kind, tmp_path / "whole.h5", 4, max_simulations=10_000)
+    annealing = whole_run(kind, 0, max_simulations=10_000).evaluations
+    whole = whole_run(kind, 4, max_simulations=10_000)
     limit = annealing // 2 if place == "annealing" else annealing + int(1.5 * N)
     posterior = Counted()
     sampler = begin(make(kind, tmp_path / "run.h5", posterior, max_simulations=limit), 4)
@@ -196,9 +205,9 @@ def test_a_limit_that_is_raised(kind, place, reopened, tmp_path):
 @pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
 @pytest.mark.parametrize("place", ["start", "annealing", "at beta = 1"])
 @pytest.mark.parametrize("kind", OURS)
-def test_an_interrupt_loses_no_evaluated_point(kind, place, reopened, tmp_path):
-    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
-    whole = run(kind, tmp_path / "whole.h5", 4)
+def test_an_interrupt_loses_no_evaluated_point(kind, place, reopened, tmp_path, whole_run):
+    annealing = whole_run(kind, 0).evaluations
+    whole = whole_run(kind, 4)
     at = {"start": N // 2, "annealing": annealing // 2 + 5, "at beta = 1": annealing + int(1.5 * N)}[place]
     posterior = Counted(interrupt_at=at)
     sampler = make(kind, tmp_path / "run.h5", posterior)
@@ -218,9 +227,9 @@ def test_an_interrupt_loses_no_evaluated_point(kind, place, reopened, tmp_path):
 
 
 @pytest.mark.parametrize("kind", OURS)
-def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path):
+def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run):
     path = tmp_path / "run.h5"
-    annealing = run(kind, tmp_path / "whole.h5", 0).evaluations
+    annealing = whole_run(kind, 0).evaluations
     with pytest.raises(KeyboardInterrupt):
         begin(make(kind, path, Counted(interrupt_at=annealing // 2)), 2)
     other = np.random.default_rng(2).standard_normal((N, NDIM))
@@ -228,7 +237,7 @@ def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path):
         make(kind, path, Counted()).run_mcmc(other, 2)
     again = make(kind, path, Counted())
     again.run_mcmc(None, 2)
-    assert same(again, run(kind, tmp_path / "two.h5", 2))
+    assert same(again, whole_run(kind, 2))
 
 
 @pytest.mark.parametrize("kind", OURS)
@@ -282,10 +291,10 @@ class Spoilt(Counted):
 @pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
 @pytest.mark.parametrize("place", ["annealing", "at beta = 1"])
 @pytest.mark.parametrize("kind", OURS)
-def test_an_error_and_then_the_same_call(kind, place, reopened, tmp_path):
+def test_an_error_and_then_the_same_call(kind, place, reopened, tmp_path, whole_run):
     """The batch that contains the error is evaluated again; everything before it is kept."""
-    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
-    whole = run(kind, tmp_path / "whole.h5", 4)
+    annealing = whole_run(kind, 0).evaluations
+    whole = whole_run(kind, 4)
     posterior = Spoilt({"annealing": annealing // 2 + 5, "at beta = 1": annealing + int(1.5 * N)}[place])
     sampler = make(kind, tmp_path / "run.h5", posterior)
     with pytest.raises(ValueError, match="must return a number"):
@@ -337,19 +346,19 @@ def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", OURS)
-def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path):
-    annealing = run(kind, tmp_path / "annealed.h5", 0).evaluations
+def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
+    annealing = whole_run(kind, 0).evaluations
     posterior = Counted(interrupt_at=annealing + int(2.5 * N))
     sampler = make(kind, tmp_path / "run.h5", posterior)
     with pytest.raises(KeyboardInterrupt):
         begin(sampler, 4)
     begin(sampler, 4 - sampler.iteration)  # the same cell
-    assert same(sampler, run(kind, tmp_path / "whole.h5", 4))
+    assert same(sampler, whole_run(kind, 4))
 
 
 @pytest.mark.parametrize("kind", OURS)
-def test_reset_of_a_reopened_run_goes_on(kind, tmp_path):
-    whole = run(kind, tmp_path / "whole.h5", 2, 2)
+def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
+    whole = whole_run(kind, 2, 2)
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     again = make(kind, tmp_path / "run.h5", Counted())
     again.reset()

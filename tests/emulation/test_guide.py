@@ -48,7 +48,7 @@ def test_every_noise_is_sampled_together_with_its_parameters(noise):
     )
     sampler.run_mcmc(None, 1)
     assert sampler.verdict.status == "converged"
-    reference = SMCSampler(500, posterior.ndim, vibration(noise), vectorize=True, seed=3)
+    reference = SMCSampler(250, posterior.ndim, vibration(noise), vectorize=True, seed=3)
     reference.run_mcmc(None, 2)
     joint = np.hypot(sampler.log_evidence_error, reference.log_evidence_error)
     assert abs(sampler.log_evidence - reference.log_evidence) < 4.0 * joint

@@ -130,7 +130,7 @@ def _largest_shares(dimensions, walkers, seeds, Sampler, **settings):
     return found
 
 
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+@pytest.mark.parametrize("Sampler", [SMCSampler, pytest.param(TMCMCSampler, marks=pytest.mark.slow)])
 def test_modes_that_the_moves_do_not_connect_are_no_converged_result(Sampler):
     """150 walkers in 11 dimensions: shares of modes are wrong by more than 0.1 in about half of the runs."""
     settings = {"recycle": False} if Sampler is SMCSampler else {}

@@ -94,11 +94,11 @@ def test_evidence_chooses_the_form_and_few_events_choose_none(rng):
 
 @pytest.mark.parametrize("truth", ("slope 0", "slope 0.2"))
 def test_intervals_cover_new_events_and_constant_ratios_miss_far_ones(truth):
-    found = [ratio_twin(truth, 10, None, seed) for seed in range(80)]
+    found = [ratio_twin(truth, 10, None, seed) for seed in range(40)]
     inside, far, score = (np.array(each) for each in zip(*found, strict=True))
     for k, level in enumerate((0.5, 0.9)):
-        assert abs(inside[:, k].mean() - level) < 4.0 * inside[:, k].std() / np.sqrt(80)
-    found = [ratio_twin(truth, 10, "constant", seed) for seed in range(80)]
+        assert abs(inside[:, k].mean() - level) < 4.0 * inside[:, k].std() / np.sqrt(40)
+    found = [ratio_twin(truth, 10, "constant", seed) for seed in range(40)]
     _, far_constant, score_constant = (np.array(each) for each in zip(*found, strict=True))
     shares = [each[:, 1].sum() / each[:, 2].sum() for each in (far, far_constant)]
     assert shares[0] > 0.8
