@@ -97,7 +97,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "cache": {"stored": 10_000},
     "opensees_memory": {"runs": 20},
     "job": {"limit": 20.0},
-    "utilisation": {"workers": (16,), "lengths": ("uniform",), "walkers": 100},
+    "utilisation": {"workers": (16,), "lengths": ("uniform",), "walkers": 300},
     "overhead": {"dimensions": (5,), "budget": 200},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-from fe_likelihoods.noise.gaussian import noise_statistic
+from fe_likelihoods.noise.protocol import noise_statistic
 
 from .case import HardPosterior
 
