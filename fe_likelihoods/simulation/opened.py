@@ -69,7 +69,7 @@ class _Observer:
     def result(self, known: Opened | None = None) -> Opened | None:
         """Files that were read and not written, of new modules too, and shared libraries; None for no unknown ones."""
         files = {} if known is None else known.files
-        if known is not None and not self.noted and len(sys.modules) == len(self.modules):
+        if known is not None and self.noted.keys() <= files.keys() and len(sys.modules) == len(self.modules):
             if not any(path not in files and _counts(path) for path in self.read - self.written):
                 return None
         new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]

@@ -22,11 +22,11 @@ import threading
 import time
 import weakref
 from collections.abc import Mapping
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 from .by_value import Pickled, Recent, without_addresses
@@ -47,40 +47,15 @@ class WorkerDied(RunFailed):
     """The process of a worker has ended before it answered."""
 
 
-class _Starter:
-    """Starts processes in one thread that lasts: Linux kills a process when the thread that started it ends."""
-
-    def __init__(self) -> None:
-        self._requests: SimpleQueue = SimpleQueue()
-        self._owner, self._lock = 0, threading.Lock()
-
-    def start(self, command: list[str], **options: Any) -> subprocess.Popen:
-        with self._lock:
-            if self._owner != os.getpid():
-                self._requests, self._owner = SimpleQueue(), os.getpid()
-                threading.Thread(target=_start_all, args=(self._requests,), name="starts workers", daemon=True).start()
-        future: Future = Future()
-        self._requests.put((future, command, options))
-        return future.result()
-
-    def forget_lock(self) -> None:
-        """In a forked process: another thread of the parent may have held the lock."""
-        self._lock = threading.Lock()
+def _renew_starter() -> None:
+    """Thread that starts processes and lasts: Linux kills a process when the thread that started it ends."""
+    global _starter
+    _starter = ThreadPoolExecutor(1, "starts workers")
 
 
-def _start_all(requests: SimpleQueue) -> None:
-    while True:
-        future, command, options = requests.get()
-        try:
-            future.set_result(subprocess.Popen(command, **options))
-        except BaseException as error:
-            future.set_exception(error)
-        del future, options
-
-
-_STARTER = _Starter()
+_renew_starter()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_STARTER.forget_lock)
+    os.register_at_fork(after_in_child=_renew_starter)
 
 
 class Worker:
@@ -111,7 +86,8 @@ class Worker:
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
             settings = json.dumps([*texts, theirs.fileno(), memory_limit, os.getpid()])
-            self._process = _STARTER.start(
+            start = partial(
+                subprocess.Popen,
                 [sys.executable, "-c", _BOOT, settings],
                 env={**os.environ, **(environment or {})},
                 pass_fds=(theirs.fileno(),),
@@ -120,6 +96,7 @@ class Worker:
                 stderr=output,
                 start_new_session=True,
             )
+            self._process = _starter.submit(start).result()
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
