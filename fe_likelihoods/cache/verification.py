@@ -449,6 +449,7 @@ class VerifiedCache:
                 with self._trust.lock:
                     self._trust.start_again()
                     self._trust.stale = None
+                    self._again.found.clear()
             self._model = run.model
 
     def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:

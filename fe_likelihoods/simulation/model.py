@@ -288,9 +288,14 @@ def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
     """Sums of squared residuals, or another statistic of them, for given responses; arguments as of `misfit_batch`."""
-    rows = [reduce_response(response, measured, statistic or sums_of_squares) for response in batch.response]
-    misfit = np.reshape(rows, (len(rows), statistic_width(measured, statistic)))
-    reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, batch.reasons, strict=True)]
+    misfit = np.full((len(batch.response), statistic_width(measured, statistic)), np.nan)
+    reasons = list(batch.reasons)
+    for place, response in enumerate(batch.response):
+        try:
+            misfit[place] = _reduced(response, measured, statistic or sums_of_squares)
+        except SimulationFailed as error:
+            reasons[place] = reasons[place] or error.reason
+    reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
 
@@ -356,6 +361,11 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
     response = _response(model, theta)
     if reason := not_finite(model, response):
         raise SimulationFailed(reason)
+    return _reduced(response, measured, reduce)
+
+
+def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
+    """Statistic of a response; `SimulationFailed` if it cannot be computed."""
     try:
         return reduce_response(response, measured, reduce)
     except Exception as error:

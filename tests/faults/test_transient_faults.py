@@ -27,7 +27,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.likelihood.failures import FailureLog
 from fe_likelihoods.simulation.faults import TransientReason
-from fe_likelihoods.simulation.model import misfit_batch, simulate_batch
+from fe_likelihoods.simulation.model import misfit_batch, misfit_of_responses, simulate_batch
 from samplers import SMCSampler
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
@@ -142,6 +142,9 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
     far = misfit_batch(Faulty(), THETAS, np.full((1, N_STEPS), 100.0), statistic=_undefined)
     cache.store_failures(Faulty(), THETAS, far.reasons)
     assert far.reasons == ["ZeroDivisionError: the statistic is not defined"] * 3
+    responses = simulate_batch(Faulty(), THETAS)
+    known = misfit_of_responses(Faulty(), responses, np.full((1, N_STEPS), 100.0), _undefined)
+    assert known.reasons == far.reasons and np.isnan(known.misfit).all()
     assert cache.look_up_failures(Faulty(), THETAS) == [""] * 3
 
 
