@@ -249,14 +249,7 @@ class CacheFile:
     def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
         """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action.
 
-        Parameters
-        ----------
-        what : str
-            Participle that the warning uses, such as "read"; actions of one name pause together.
-        action : callable
-            Takes the connection.
-        otherwise : object
-            Returned where the action fails or pauses.
+        The warning names the action by the participle `what`, such as "read"; actions of one name pause together.
         """
         with self.lock:
             if time.monotonic() < self.retry_times.get(what, -math.inf):

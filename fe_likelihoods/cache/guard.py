@@ -51,10 +51,8 @@ class ModelGuard:
         Items of the label that have changed without an effect.
     unchecked : list of (n, n_structural) ndarray
         Parameters of the simulations since the last comparison.
-    compared : int
-        Simulations that were run again.
-    seconds : float
-        Their wall time [s].
+    compared, seconds : int, float
+        Simulations that were run again, and their wall time [s].
     """
 
     def __init__(self, model: Model, label: ModelLabel) -> None:

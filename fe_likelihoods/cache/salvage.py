@@ -25,6 +25,7 @@ from .rows import (
     is_undamaged,
     is_undamaged_label,
     is_undamaged_response,
+    transaction,
 )
 
 __all__ = ["Salvaged", "number_or_unknown", "read_options", "salvage"]
@@ -51,17 +52,9 @@ _ADDED = "generation, label"  # columns that files of earlier releases do not ha
 
 
 class Salvaged(NamedTuple):
-    """What was copied.
+    """Numbers of simulations and responses that were copied, and that cannot be read or have a wrong checksum.
 
-    Attributes
-    ----------
-    rows : int
-        Simulations that were copied.
-    lost : int or None
-        Simulations that could not be read, or whose checksum is wrong; at most so many where rows had been deleted.
-        None where the file does not tell how many there were.
-    responses, lost_responses : int
-        The same of stored responses.
+    Where rows had been deleted, at most so many were lost; None where the file does not tell how many there were.
     """
 
     rows: int
@@ -71,22 +64,27 @@ class Salvaged(NamedTuple):
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
-    """Copy the readable simulations and responses of a damaged cache.
+    """Copy the readable simulations and responses of a damaged cache, which is not changed.
 
     Parameters
     ----------
     damaged : Path
-        The damaged file, with its log; it is not changed.
+        The damaged file, with its log.
     connection : sqlite3.Connection
         Connection to the new cache.
-
-    Returns
-    -------
-    Salvaged
-        The counts.
     """
-    _copy_labels(damaged, connection)
+    with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError), _opened(damaged) as source:
+        rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
+        connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])
     return Salvaged(*_copy(damaged, connection, _SIMULATIONS), *_copy(damaged, connection, _RESPONSES))
+
+
+@contextlib.contextmanager
+def _opened(damaged: Path) -> Iterator[sqlite3.Connection]:
+    with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
+        source.text_factory = bytes
+        source.execute("PRAGMA writable_schema = ON")  # a file that was cut off is read as far as it goes
+        yield source
 
 
 def read_options(path: Path) -> str:
@@ -103,9 +101,7 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
     """Copy the readable rows of a table; return how many were copied, and how many were lost, None if not known."""
     kept, lost, known = 0, 0, True
     try:
-        with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
-            source.text_factory = bytes
-            source.execute("PRAGMA writable_schema = ON")  # a file that was cut off is read as far as it goes
+        with _opened(damaged) as source:
             table = _as_stored(source, table)
             if (largest := _largest_id(source, table.name)) is None:
                 known, largest = False, damaged.stat().st_size // FEWEST_BYTES
@@ -114,13 +110,10 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
                 known = known and missing is not None
                 lost += (missing or 0) + len(rows) - len(good)
                 if good:
-                    connection.execute("BEGIN IMMEDIATE")
-                    connection.executemany(table.store, good)
-                    connection.execute("COMMIT")
+                    with transaction(connection):
+                        connection.executemany(table.store, good)
                     kept += len(good)
     except (sqlite3.Error, OSError, ValueError, MemoryError) as error:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
         logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table.name, error)
         known = False
     return kept, lost if known else None
@@ -128,22 +121,11 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
 
 def _as_stored(source: sqlite3.Connection, table: _Table) -> _Table:
     """The table with the columns that it has in a file, and zeros in place of those that are not there."""
-    try:
-        source.execute(f"SELECT {_ADDED} FROM {table.name} LIMIT 0")
-    except sqlite3.OperationalError as error:
-        if "no such column" in str(error):
+    with contextlib.suppress(sqlite3.DatabaseError):
+        known = [name for _, name, *_ in source.execute(f"PRAGMA table_info({table.name})")]
+        if known and b"label" not in known:
             return table._replace(columns=table.columns.replace(_ADDED, "0, 0"))
-    except sqlite3.DatabaseError:
-        pass
     return table
-
-
-def _copy_labels(damaged: Path, connection: sqlite3.Connection) -> None:
-    with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError):
-        with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
-            source.execute("PRAGMA writable_schema = ON")
-            rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
-        connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])
 
 
 def _ranges(

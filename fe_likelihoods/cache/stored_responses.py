@@ -28,15 +28,9 @@ class StoredResponses:
     Parameters
     ----------
     model : Model
-    pool : object with ``map(function, items)``, or None
-        As for `simulate_batch`.
+    pool : executor or None
     cache : SimulationCache
-        One or two stored responses per process are simulated again and compared (`SimulationCache`).
-
-    Attributes
-    ----------
-    simulations : int
-        Number of simulations that were not stored.
+        One or two stored responses per process are simulated again and compared.
     """
 
     def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
@@ -55,15 +49,7 @@ class StoredResponses:
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) [SI], stored or new, and the reasons of failures.
 
-        Parameters
-        ----------
-        thetas : (n, n_parameters) float
-            Distinct parameter sets.
-
-        Raises
-        ------
-        StaleCache
-            If a stored response and a new simulation differ.
+        The parameter sets (n, n_parameters) are distinct. `StaleCache` if a stored and a new simulation differ.
         """
         responses = np.full((len(thetas), len(self.model.channels), self.model.n_steps), np.nan)
         left = []
