@@ -246,19 +246,17 @@ def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats
         with contextlib.suppress(ValueError):  # a value that cannot be compared
             values, objects = value_digest(model), []
     key = str(cache.path), cache.tolerance, cache.verify, is_local, model.fingerprint, label.code, values, len(objects)
-    for place, (known, referred, trust) in enumerate(_shared):
+    others, found = [], Trust(label, is_local, uuid.uuid4().hex)
+    for known, referred, trust in list(_shared):
         if known == key and all(refer() is each for refer, each in zip(referred, objects, strict=True)):
-            _shared.append(_shared.pop(place))
-            # the label is not in the file that another one has replaced
-            stored = trust.stored
+            stored = trust.stored  # not in the file if another one has replaced it
             if stored is None or stored.id in {each.id for each in labels_of(cache.file, stored.source)}:
-                return trust
-            _shared.pop()
-            break
-    trust = Trust(label, is_local, uuid.uuid4().hex)
-    _shared.append((key, [_reference(each) for each in objects], trust))
-    del _shared[:-MAX_TRUSTS]
-    return trust
+                found = trust
+        elif all(refer() is not None for refer in referred):
+            others.append((known, referred, trust))
+    # a new list, since another thread may look for its own at the same time
+    _shared[:] = [*others[1 - MAX_TRUSTS :], (key, [_reference(each) for each in objects], found)]
+    return found
 
 
 def _reference(value: Any) -> Callable[[], Any]:
