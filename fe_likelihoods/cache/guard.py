@@ -58,15 +58,22 @@ class ModelGuard:
     def __init__(self, model: Model, label: ModelLabel) -> None:
         self._fingerprint = model.fingerprint
         self.known = copy.copy(label)  # because the label of stored rows never changes
-        self.changing: set[str] = label.changing  # items that have changed without an effect
+        self.changing: set[str] = label.changing
+        self.compared, self.seconds = 0, 0.0
+        self._begin()
+
+    def _begin(self) -> None:
         self.points: list[EarlierPoint] = []
         self.unchecked: list[np.ndarray] = []
-        self.compared, self.seconds = 0, 0.0
         self._rows_since = 0  # the last repetition
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
 
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"unchecked": [], "points": [], "_not_before": -np.inf}
+    def __getstate__(self) -> tuple:
+        return self._fingerprint, self.known, self.changing, self.compared, self.seconds
+
+    def __setstate__(self, state: tuple) -> None:
+        self._fingerprint, self.known, self.changing, self.compared, self.seconds = state
+        self._begin()
 
     def before(self, run: VerifyingRun) -> None:
         """Compare before simulations, unless the last comparison was too short ago.
