@@ -13,14 +13,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["bilinear_form", "check_quadratic", "sums_of_squares"]
+from ..noise.statistics import sums_of_squares
+
+__all__ = ["bilinear_form", "check_quadratic"]
 
 _TOLERANCE = 1e-6
-
-
-def sums_of_squares(residuals: np.ndarray) -> np.ndarray:
-    """Sums of squares (n_channels,) of residuals (n_channels, n_steps)."""
-    return np.square(residuals).sum(axis=-1)
 
 
 def bilinear_form(

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.protocol import noise_title
-from ..noise.statistics import needs_response
+from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch
-from .quadratic import sums_of_squares
 
 __all__ = ["TIME_SHIFTS", "StackedLikelihood", "is_joint", "stack"]
 

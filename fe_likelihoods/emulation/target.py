@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..noise.protocol import noise_title
-from ..noise.statistics import needs_response
+from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
-from .quadratic import check_quadratic, sums_of_squares
+from .quadratic import check_quadratic
 from .stacked import TIME_SHIFTS, stack
 
 __all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.emulation.quadratic import bilinear_form, check_quadratic, sums_of_squares
+from fe_likelihoods.emulation.quadratic import bilinear_form, check_quadratic
 from fe_likelihoods.noise.residuals import lag_one_sums
+from fe_likelihoods.noise.statistics import sums_of_squares
 
 
 @pytest.mark.parametrize("statistic", [sums_of_squares, lag_one_sums])
