@@ -27,7 +27,7 @@ from fe_likelihoods import (
     dissipated_energy,
     peak,
     read_columns,
-    read_v2,
+    read_record,
 )
 
 from .measured_transfer import Case, calibrate, ratios_of, score_case, skipped, within
@@ -126,7 +126,7 @@ def meloland(repeats: int = 1) -> list[Row]:
     if rows := skipped("transfer_meloland", _MELOLAND):
         return rows
     path = _MEASURED / _MELOLAND
-    records = {number: read_v2(path, number, member=f"CHAN{number:02d}.V2") for number in (2, 3, 13, 7)}
+    records = {number: read_record(path, number, member=f"CHAN{number:02d}.V2") for number in (2, 3, 13, 7)}
     channel = Channel("ch7", "absolute acceleration", "g")
 
     def structure(start: float, stop: float | None) -> tuple[LinearStructure, Measurements]:

@@ -35,13 +35,12 @@ from fe_likelihoods import (
     HalfNormal,
     Measurements,
     Posterior,
-    QuantityScores,
     SimulationCache,
     propagate,
-    share_within,
 )
 from fe_likelihoods.prediction.quantities import ChannelQuantity, measured_quantity
-from fe_likelihoods.prediction.score_tables import score_values
+from fe_likelihoods.prediction.score_tables import QuantityScores, score_values
+from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler
 
 from .rows import Row

@@ -27,17 +27,17 @@ from fe_likelihoods import (
     FELikelihood,
     GaussianNoise,
     HalfNormal,
-    HistoryScores,
     LinearStructure,
     Measurements,
-    Noise,
     Posterior,
     Record,
     Uniform,
     propagate,
-    read_v2,
+    read_record,
 )
 from fe_likelihoods.noise.draws import sample_noise
+from fe_likelihoods.noise.protocol import Noise
+from fe_likelihoods.prediction.score_tables import HistoryScores
 from samplers import SMCSampler, compare_models
 
 from .rows import Row
@@ -197,7 +197,7 @@ def _channel(path: Path, number: int) -> Record:
     reason: ValueError | None = None
     for member in _MEMBERS:
         try:
-            return read_v2(path, number, member=member.format(number))
+            return read_record(path, number, member=member.format(number))
         except ValueError as error:
             reason = error
     raise ValueError(f"{path.name}: no channel {number}: {reason}")

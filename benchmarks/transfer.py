@@ -45,14 +45,11 @@ from fe_likelihoods import (
     HalfNormal,
     HierarchicalPosterior,
     Hierarchy,
-    HistoryScores,
     LinearStructure,
     LogNormal,
     Measurements,
     Posterior,
-    Prediction,
     Prior,
-    QuantityScores,
     Record,
     StoredPosterior,
     Uniform,
@@ -62,12 +59,14 @@ from fe_likelihoods import (
     predict_from_median,
     predict_new_event,
     propagate,
-    read_v2,
+    read_record,
     residual_checks,
-    share_within,
 )
 from fe_likelihoods.models.equivalent_linear import response_level
 from fe_likelihoods.models.linear_system import respond_structure
+from fe_likelihoods.prediction.prediction import Prediction
+from fe_likelihoods.prediction.score_tables import HistoryScores, QuantityScores
+from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler
 
 from .rows import Row
@@ -238,7 +237,7 @@ def _records(path: Path) -> dict[int, Record]:
     for number in (*_INPUTS, _OUTPUT):
         for member in _MEMBERS:
             try:
-                found[number] = read_v2(path, number, member=member.format(number))
+                found[number] = read_record(path, number, member=member.format(number))
                 break
             except ValueError as error:
                 reason = error

@@ -43,17 +43,17 @@ from fe_likelihoods import (
     HalfNormal,
     LinearStructure,
     Measurements,
-    Prediction,
     Record,
     Uniform,
     from_si,
     plot_bands,
     plot_residuals,
     propagate,
-    read_v2,
+    read_record,
     residual_checks,
     rrmse,
 )
+from fe_likelihoods.prediction.prediction import Prediction
 from samplers import compare_models, plot_corner
 
 SOURCE = "https://www.strongmotioncenter.org (CESMD): the processed data of the station in the name of the file"
@@ -133,7 +133,7 @@ def read_records(bridge: Bridge, folder: Path | None) -> dict[int, Record]:
     """The transverse channels by number [m/s²]."""
     path = real_data.find_file(folder, bridge.file, SOURCE)
     numbers = (bridge.column, *bridge.ends, bridge.middle, *(bridge.spans or ()))
-    return {number: read_v2(path, number, member=bridge.member.format(number)) for number in numbers}
+    return {number: read_record(path, number, member=bridge.member.format(number)) for number in numbers}
 
 
 def make_measurements(records: dict[int, Record], numbers: tuple[int, ...], start: float, stop: float | None):

@@ -67,10 +67,10 @@ from fe_likelihoods import (
     predict_from_median,
     predict_new_event,
     propagate,
-    read_v2,
+    read_record,
     score_left_out,
-    share_within,
 )
+from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler, compare_models
 
 parser = argparse.ArgumentParser(description="Predict earthquakes of one bridge from other earthquakes.")
@@ -394,7 +394,7 @@ def read_real(folder: Path) -> dict[str, tuple[tuple[Record, ...], Measurements]
         for number in (3, 4, 9, 7):
             for member in ("CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2"):
                 try:
-                    channels[number] = read_v2(path, number, member=member.format(number))
+                    channels[number] = read_record(path, number, member=member.format(number))
                     break
                 except ValueError as error:
                     reason = error

@@ -165,5 +165,5 @@ class AutoregressiveNoise:
     def with_channels(
         self, channels: Sequence[Channel], weights: np.ndarray
     ) -> "tuple[AutoregressiveNoise, np.ndarray]":
-        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`."""
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`."""
         return AutoregressiveNoise(channels, sensor=weighted(self.sensor, weights)), np.kron(np.eye(2), weights)

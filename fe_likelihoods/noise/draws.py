@@ -76,7 +76,7 @@ def sample_noise(
     Parameters
     ----------
     noise : Noise
-        With a method ``standard_deviations``, see `fe_likelihoods.Noise`.
+        With a method ``standard_deviations``, see `fe_likelihoods.noise.protocol.Noise`.
     parameters : (n, n_noise) float
         Parameters of the noise.
     n_channels : int

@@ -512,7 +512,7 @@ class GaussianNoise:
         )
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
-        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`.
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.
 
         With events, the level of a channel in an event is the mean of the levels of channels with a weight that were
         measured in this event.

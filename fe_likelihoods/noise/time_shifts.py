@@ -76,7 +76,7 @@ class ShiftedNoise:
         return self.noise.standard_deviations(np.asarray(parameters, dtype=float)[..., : self._n_noise])
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple[Noise, np.ndarray]:
-        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.Noise`.
+        """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.
 
         A measured channel keeps its unknown shift, another one has none.
         """

@@ -87,7 +87,7 @@ def plot_spectra(
     Parameters
     ----------
     spectra : sequence of SpectrumLike
-        Spectra such as `fe_likelihoods.ResponseSpectrum`, for instance of one record with several damping ratios.
+        Spectra such as `ResponseSpectrum`, for instance of one record with several damping ratios.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
     quantity : {"pseudo_acceleration", "pseudo_velocity", "displacement"}

@@ -81,7 +81,7 @@ class ChannelHistories(Protocol):
 
 
 class SpectrumLike(Protocol):
-    """A response spectrum, such as `fe_likelihoods.ResponseSpectrum`."""
+    """A response spectrum, such as `fe_likelihoods.signals.response_spectrum.ResponseSpectrum`."""
 
     periods: np.ndarray
     damping_ratio: float
@@ -91,7 +91,7 @@ class SpectrumLike(Protocol):
 
 
 class PredictionLike(Protocol):
-    """A prediction of histories, such as `fe_likelihoods.Prediction`."""
+    """A prediction of histories, such as `fe_likelihoods.prediction.prediction.Prediction`."""
 
     channels: Sequence[ChannelLike]
     mean: np.ndarray
@@ -107,7 +107,7 @@ class PredictionLike(Protocol):
 
 
 class HistoryScoresLike(Protocol):
-    """Scores of predicted histories, such as `fe_likelihoods.HistoryScores`."""
+    """Scores of predicted histories, such as `fe_likelihoods.prediction.score_tables.HistoryScores`."""
 
     channels: Sequence[ChannelLike]
     level: float
@@ -122,7 +122,7 @@ class HistoryScoresLike(Protocol):
 
 
 class QuantityScoresLike(Protocol):
-    """Scores of predicted numbers, such as `fe_likelihoods.QuantityScores`."""
+    """Scores of predicted numbers, such as `fe_likelihoods.prediction.score_tables.QuantityScores`."""
 
     names: Sequence[str]
     units: Sequence[str]
@@ -148,7 +148,7 @@ class CurveLike(Protocol):
 
 
 class FragilityLike(Protocol):
-    """Probabilities of exceedance per record, such as `fe_likelihoods.Fragility`."""
+    """Probabilities of exceedance per record, such as `fe_likelihoods.prediction.fragility.Fragility`."""
 
     intensity: np.ndarray
     probability: np.ndarray
@@ -158,14 +158,14 @@ class FragilityLike(Protocol):
 
 
 class ExceedanceLike(Protocol):
-    """Probabilities of exceedance, such as `fe_likelihoods.Exceedance`."""
+    """Probabilities of exceedance, such as `fe_likelihoods.prediction.reliability.Exceedance`."""
 
     probability: np.ndarray
     standard_error: np.ndarray
 
 
 class DamageLike(Protocol):
-    """Damage of a column after events, such as `fe_likelihoods.Damage`; lengths in metres."""
+    """Damage of a column after events, such as `fe_likelihoods.column_damage.damage.Damage`; lengths in metres."""
 
     events: Sequence[str]
     presence: Mapping[str, ExceedanceLike]
@@ -180,7 +180,7 @@ class DamageLike(Protocol):
 
 
 class ResidualChecksLike(Protocol):
-    """Checks of residuals, such as `fe_likelihoods.ResidualChecks`."""
+    """Checks of residuals, such as `fe_likelihoods.noise.residuals.ResidualChecks`."""
 
     lag_one: np.ndarray
     n_effective: np.ndarray
@@ -200,14 +200,14 @@ class HistoryLike(Protocol):
 
 
 class MaterialCurveLike(NamedLike, Protocol):
-    """Stress of a material under a history of strain, such as `fe_likelihoods.MaterialCurve`."""
+    """Stress of a material under a history of strain, such as `MaterialCurve`."""
 
     strain: np.ndarray
     stress: np.ndarray
 
 
 class MomentCurvatureLike(Protocol):
-    """Moment of a section under a history of curvature, such as `fe_likelihoods.MomentCurvature`."""
+    """Moment of a section under a history of curvature, such as `MomentCurvature`."""
 
     curvature: np.ndarray
     moment: np.ndarray

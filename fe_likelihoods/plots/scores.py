@@ -40,7 +40,7 @@ def plot_scores(
     Parameters
     ----------
     scores : HistoryScoresLike, QuantityScoresLike, or mapping from names of events to them
-        Results of `fe_likelihoods.Prediction.score`, all of histories or all of numbers, with one level.
+        Results of `Prediction.score`, all of histories or all of numbers, with one level.
 
     Returns
     -------

@@ -56,9 +56,9 @@ class Fragility(NamedTuple):
     probability : ndarray, shape (n_records,)
         Mean over the samples of the probability to exceed.
     standard_error : ndarray, shape (n_records,)
-        Monte Carlo error, as in `fe_likelihoods.Exceedance`.
+        Monte Carlo error, as in `Exceedance`.
     lower, upper : ndarray, shape (n_records,)
-        Interval of each probability, as in `fe_likelihoods.Exceedance`.
+        Interval of each probability, as in `Exceedance`.
     n_failed : ndarray of int, shape (n_records,)
         Number of samples whose simulation failed.
     curve : FragilityCurve or None
@@ -121,7 +121,7 @@ class Fragility(NamedTuple):
         -------
         lower, upper : ndarray, shape (n_records,)
             The narrowest band between quantiles of equal probabilities at all records (Besag et al. 1995, section 6.3),
-            extended to the probabilities where these are outside, as intervals are (`fe_likelihoods.Exceedance`).
+            extended to the probabilities where these are outside, as intervals are (`Exceedance`).
 
         Raises
         ------

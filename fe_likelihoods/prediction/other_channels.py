@@ -68,7 +68,7 @@ def predict_channels_of(
     if not hasattr(calibrated, "with_channels"):
         raise ValueError(
             f"{noise_title(calibrated)} does not say what the noise of other channels is: give it a method "
-            "with_channels(channels, weights), see fe_likelihoods.Noise, or predict with noise=False"
+            "with_channels(channels, weights), see fe_likelihoods.noise.protocol.Noise, or predict with noise=False"
         )
     weights, remark = _weights(model, source)
     other, of_parameters = calibrated.with_channels(model.channels, weights)

@@ -117,7 +117,7 @@ class QuantityScores(NamedTuple):
 
     ``print(scores)`` is a table in the display units of the channels. All arrays are in SI units and have one entry
     per quantity. One value says little about calibration: collect `pit` over events and channels, and see
-    `fe_likelihoods.share_within`.
+    `share_within`.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class QuantityScores(NamedTuple):
 
     @property
     def within(self) -> np.ndarray:
-        """Whether each measured value is in its interval, from its `pit` as `fe_likelihoods.share_within`.
+        """Whether each measured value is in its interval, from its `pit` as `share_within`.
 
         Fewer than ten samples cannot show that a value is outside a 90 % interval.
         """
@@ -276,7 +276,7 @@ def score_values(
     level : float
         Probability of the intervals, between 0 and 1.
     effective_sample_size : float, optional
-        As for `fe_likelihoods.crps_samples`.
+        As for `fe_likelihoods.prediction.scores.crps_samples`.
 
     Returns
     -------

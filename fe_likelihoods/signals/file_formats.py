@@ -100,7 +100,7 @@ class V2Channel(NamedTuple):
 
 
 def parse_at2(text: str, file: str) -> Series:
-    """Return the samples of a PEER AT2 file (see `fe_likelihoods.read_at2`)."""
+    """Return the samples of a PEER AT2 file (see `fe_likelihoods.signals.readers.read_at2`)."""
     lines = text.splitlines()
     index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
     if index is None:
@@ -131,7 +131,7 @@ def _at2_header(line: str) -> tuple[str, str, str] | None:
 
 
 def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Channel]:
-    """Return the channels with corrected acceleration in a V2 file or zip archive (see `fe_likelihoods.read_v2`)."""
+    """Return the channels with corrected acceleration in a V2 file or zip archive (see `read_v2`)."""
     content = read_bytes(path)
     files = list(_unzip(content, str(path))) if zipfile.is_zipfile(io.BytesIO(content)) else [(str(path), content)]
     if member is not None:

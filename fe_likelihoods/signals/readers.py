@@ -173,6 +173,7 @@ def read_record(
     channel: int | str | None = None,
     units: str | None = None,
     missing: Sequence[float] | None = None,
+    member: str | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -186,6 +187,8 @@ def read_record(
         Unit of the acceleration, if an AT2 or CSV file does not state it.
     missing : sequence of float, optional
         For a CSV file: numbers that stand for missing samples, as in `read_csv`.
+    member : str, optional
+        For a zip archive of V2 files: name of the file in the archive, if several have the channel.
 
     Returns
     -------
@@ -199,7 +202,7 @@ def read_record(
     """
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
-        return read_v2(path, channel)
+        return read_v2(path, channel, member)
     name, reader = network_formats.recognise(content.decode("latin-1"))
     if name and reader is None:
         raise ValueError(f"{path}: {_looks_like(name, None)}")

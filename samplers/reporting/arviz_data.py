@@ -51,7 +51,7 @@ def to_arviz(
         Samplers that have run, with chains of equal length; `emcee.EnsembleSampler` is accepted too.
     posterior : fe_likelihoods.Posterior, optional
         Adds the groups that need simulations: ``posterior_predictive`` and ``log_likelihood``, from `draws` samples.
-    prediction : fe_likelihoods.Prediction, optional
+    prediction : fe_likelihoods.prediction.prediction.Prediction, optional
         The result of `fe_likelihoods.propagate`; adds the group ``predictions``.
     parameter_names : sequence of str, optional
         One name per parameter; by default the names of the posterior, or else theta_0, theta_1, ...

@@ -25,18 +25,17 @@ from fe_likelihoods import (
     FELikelihood,
     FunctionModel,
     HalfNormal,
-    LocalPool,
     Measurements,
     Posterior,
     Prior,
     SimulationCache,
     SimulationFailed,
-    TransientReason,
     TruncatedNormal,
     UMBridgeModel,
     serve,
 )
-from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
+from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler
 
 from . import served

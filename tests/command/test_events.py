@@ -10,7 +10,6 @@ import pytest
 from fe_likelihoods import (
     LinearOscillator,
     Measurements,
-    Prediction,
     SimulationCache,
     SimulationFailed,
     from_si,
@@ -21,6 +20,7 @@ from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
+from fe_likelihoods.prediction.prediction import Prediction
 from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
 from tests.reporting.report_page import read_page
 

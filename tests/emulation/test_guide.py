@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import FELikelihood, Posterior, ResponseGuide
+from fe_likelihoods import FELikelihood, Posterior
+from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
 from tests.faults import guided_run
 from tests.statistics.hard_posteriors import CASES

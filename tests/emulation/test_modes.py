@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, find_modes, problems
+from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, problems
 from fe_likelihoods.emulation.levenberg_marquardt import Ascent, _connected, _has_valley
+from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
 from .problems import acts_late, free_vibration, misleading, symmetric, vibration

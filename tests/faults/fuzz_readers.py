@@ -27,18 +27,13 @@ from fe_likelihoods import (
     Channel,
     Measurements,
     Record,
-    read_at2,
     read_columns,
     read_csv,
     read_dataset,
-    read_esm,
-    read_geonet,
-    read_knet,
     read_record,
-    read_smc,
-    read_v2,
     write_dataset,
 )
+from fe_likelihoods.signals.readers import read_at2, read_esm, read_geonet, read_knet, read_smc, read_v2
 from tests.signals.network_files import esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 

@@ -19,7 +19,6 @@ from fe_likelihoods import (
     FELikelihood,
     FunctionModel,
     LinearOscillator,
-    LocalPool,
     Measurements,
     Record,
     SimulationCache,
@@ -27,6 +26,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.likelihood.failures import FailureLog
 from fe_likelihoods.simulation.faults import TransientReason
+from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import misfit_batch, misfit_of_responses, simulate_batch
 from samplers import SMCSampler
 from tests.faults import treacherous as bad

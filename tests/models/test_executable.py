@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods import ExecutableModel, LocalPool, SimulationFailed
+from fe_likelihoods import ExecutableModel, SimulationFailed
 from fe_likelihoods.simulation import programs
 from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.label import ModelLabel
+from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
 

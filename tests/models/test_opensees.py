@@ -6,8 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from fe_likelihoods import LinearOscillator, LocalPool, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods import LinearOscillator, OpenSeesModel, Record, SimulationFailed
 from fe_likelihoods.simulation.label import ModelLabel
+from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
 from tests.opensees_column import require_opensees
 from tests.opensees_oscillator import CHANNELS, DAMPING, PERIOD, Oscillator

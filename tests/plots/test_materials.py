@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import MaterialCurve, MomentCurvature, plot_material, plot_moment_curvature
+from fe_likelihoods import plot_material, plot_moment_curvature
+from fe_likelihoods.models.rc_column_curves import MaterialCurve, MomentCurvature
 from tests.plots.reading import shows, texts
 
 

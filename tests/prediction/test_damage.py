@@ -14,9 +14,7 @@ from fe_likelihoods import (
     EventRatios,
     Events,
     IsolatedBridge,
-    LimitState,
     LinearOscillator,
-    ParkAng,
     RCColumn,
     Record,
     SimulationFailed,
@@ -28,6 +26,8 @@ from fe_likelihoods import (
     problems,
     propagate,
 )
+from fe_likelihoods.column_damage.damage import LimitState
+from fe_likelihoods.column_damage.park_ang import ParkAng
 
 TRUTH = np.array(list(problems.BRIDGE_COLUMN_MEANS.values()))
 CONSTANTS = ParkAng(0.36, 5e5)

@@ -8,8 +8,6 @@ import pytest
 from fe_likelihoods import (
     EventRatios,
     LevelRatios,
-    LimitState,
-    ParkAng,
     Prior,
     Record,
     StoredPosterior,
@@ -17,12 +15,14 @@ from fe_likelihoods import (
     average_predictions,
     compare_tests,
     exceedance,
-    fit_fragility,
     fragility,
     leave_one_out,
     peak,
     propagate,
 )
+from fe_likelihoods.column_damage.damage import LimitState
+from fe_likelihoods.column_damage.park_ang import ParkAng
+from fe_likelihoods.prediction.fragility_curve import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore
 from fe_likelihoods.prediction.score_tables import score_values
 from fe_likelihoods.text_tables import NamedResults, text_table

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from fe_likelihoods import ContinuedResponse, Record, SimulationCache, peak, propagate
+from fe_likelihoods import Record, SimulationCache, peak, propagate
 from fe_likelihoods.prediction.kept_states import KEPT_STATES
-from fe_likelihoods.simulation.model import SimulationFailed
+from fe_likelihoods.simulation.model import ContinuedResponse, SimulationFailed
 from tests.prediction.flexible import Flexible
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))

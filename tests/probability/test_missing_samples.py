@@ -20,13 +20,13 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
     effective_samples,
-    find_modes,
     innovations,
     plot_residuals,
     propagate,
     residual_checks,
     rrmse,
 )
+from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.noise.residuals import autocorrelation, lag_one_sums
 from fe_likelihoods.noise.sample_counts import SampleCounts, count_samples

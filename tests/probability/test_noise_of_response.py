@@ -24,11 +24,11 @@ from fe_likelihoods import (
     Record,
     SimulationCache,
     TruncatedNormal,
-    find_modes,
     propagate,
     residual_checks,
 )
 from fe_likelihoods.cache.comparison import largest_difference
+from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
 N, DT = 240, 0.02

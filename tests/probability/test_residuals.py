@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from fe_likelihoods import FELikelihood, FunctionModel, LocalPool, Measurements
+from fe_likelihoods import FELikelihood, FunctionModel, Measurements
 from fe_likelihoods.noise.residuals import (
     autocorrelation,
     effective_samples,
@@ -16,6 +16,7 @@ from fe_likelihoods.noise.residuals import (
     residual_checks,
 )
 from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods.simulation.local_pool import LocalPool
 
 N = 4000
 

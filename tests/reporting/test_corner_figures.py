@@ -19,7 +19,7 @@ RED, GREY = "#b03a48", "#8a8f98"
 
 
 class Shown(NamedTuple):
-    """As `fe_likelihoods.Parameter`."""
+    """As `fe_likelihoods.likelihood.parameters.Parameter`."""
 
     name: str
     label: str

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, FELikelihood, FunctionModel, LocalPool, Measurements
+from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements
+from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler, TMCMCSampler, estimate_cost
 from samplers.cost import as_duration
 from tests.contract.targets import Gaussian

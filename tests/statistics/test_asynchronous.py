@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import FELikelihood, JointLikelihood, LocalPool, Posterior
+from fe_likelihoods import FELikelihood, JointLikelihood, Posterior
+from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler
 from samplers.tempering.guided import Batch
 from samplers.tempering.pending_points import PendingPoints
