@@ -52,9 +52,10 @@ docs: $(READY)   ## build the documentation into docs/_build/html; warnings are 
 figures: $(READY) ## make the figures of README and docs again
 	$(BIN)/python docs/make_figures.py
 
-lint: $(READY)   ## check format and rules with ruff
+lint: $(READY)   ## check format and rules with ruff, and how docstrings read
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/python -m tests.prose
 
 format: $(READY) ## format and fix with ruff
 	$(BIN)/ruff format .
