@@ -261,7 +261,7 @@ def fragility(
     if limit.shape != ():
         raise ValueError(f"fragility needs one threshold; got an array of shape {limit.shape}")
     if ratios is not None and (ratios.shape or not limit > 0.0):
-        raise ValueError("fragility needs ratios of one quantity, (n_events,), and with them a positive threshold")
+        raise ValueError("with ratios, fragility needs those of one quantity, (n_events,), and a positive threshold")
     records = list(records)
     if not records:
         raise ValueError("fragility needs one record or more, such as [record.scale(k) for k in factors]; got none")
