@@ -46,7 +46,10 @@ healthy = pytest.mark.filterwarnings(
 @healthy
 @pytest.mark.parametrize(
     "preset, stages, evaluations",
-    [(RAMANCHA_2022_CONSTANT, 126, 1.04e6), (RAMANCHA_2022_LITERAL, 30, 235e3)],
+    [
+        pytest.param(RAMANCHA_2022_CONSTANT, 126, 1.04e6, marks=pytest.mark.slow),
+        (RAMANCHA_2022_LITERAL, 30, 235e3),
+    ],
     ids=["constant", "literal"],
 )
 def test_readings_of_table_1(column, preset, stages, evaluations, seed):
