@@ -32,7 +32,7 @@ def check_model(model: Model) -> None:
 
 def check_noise(model: Model, noise: Noise) -> None:
     """Raise ValueError if an object is no noise, or has other channels than the model."""
-    if not hasattr(noise, "log_likelihood"):
+    if isinstance(noise, type) or not hasattr(noise, "log_likelihood"):
         raise ValueError(
             "noise must be a noise, such as GaussianNoise(model.channels) or GaussianNoise(model.channels, "
             f'groups="event"); got {noise!r}'

@@ -412,10 +412,13 @@ class GaussianNoise:
         Raises
         ------
         ValueError
-            If the window is shorter than three time steps; a band is above half the sampling frequency; gaps leave a
-            stretch that is shorter than a period of the lowest edge; or with events, if channels have times of their
-            own or a sample is outside of every event.
+            If the channels are others; the window is shorter than three time steps; a band is above half the sampling
+            frequency; gaps leave a stretch that is shorter than a period of the lowest edge; or with events, if
+            channels have times of their own or a sample is outside of every event.
         """
+        names, got = ([channel.name for channel in each.channels] for each in (self, measurements))
+        if names != got:
+            raise ValueError(f"expected measurements of {', '.join(names)}; got {', '.join(got)}: select({names!r})")
         if self._scaled and self.scales is None:
             return replace(self, scales=measurements.root_mean_squares)
         if self._whole:

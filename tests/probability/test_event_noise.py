@@ -189,7 +189,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
     cases = {
         "no event 'EQ3'; the events are EQ1, EQ2": {"EQ3": measured["EQ1"]},
         "expected Measurements for one or more of EQ1, EQ2": {},
-        "those of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
+        "the steps of 'EQ2' differ": measured | {"EQ2": measured["EQ2"].decimate(2)},
         "end at 1.18 s, after the end of the event at 0.98 s": {"EQ2": measured["EQ1"]},
         r"begin at -0.02 s, before .*\.trim\(0.0, stop\)": {"EQ1": measured["EQ1"].shift(-0.02)},
         "'EQ2' begin at -1.2 s, before": {"EQ2": measured["EQ2"].shift(-1.2)},
@@ -202,8 +202,12 @@ def test_bad_input_is_refused_before_anything_is_simulated(model, events, measur
     whole = Measurements(model.channels, 0.02, model.simulate([1.0, 1.0]))
     with pytest.raises(ValueError, match="100 measured samples are outside of every event, the first at 1.2 s"):
         FELikelihood(model, whole, noise=GaussianNoise(model.channels, groups="event"))
-    with pytest.raises(ValueError, match='groups="event".; got .per event.'):
-        FELikelihood(model, whole, noise="per event")
+    for wrong in ("per event", GaussianNoise):
+        with pytest.raises(ValueError, match="noise must be a noise, such as .*got .*(per event|class)"):
+            FELikelihood(model, whole, noise=wrong)
+    turned = whole.select(["displacement", "acceleration"])
+    with pytest.raises(ValueError, match="expected measurements of acceleration, displacement; got displacement"):
+        GaussianNoise(model.channels, groups="all").with_measurements(turned)
     plain = LinearOscillator(events.trim(0.0, 1.0))
     for arguments in ((measured,), (whole, GaussianNoise(plain.channels, groups="event"))):
         with pytest.raises(ValueError, match="need a model whose excitation is Events"):
