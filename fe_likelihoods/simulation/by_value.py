@@ -42,9 +42,8 @@ _CACHED = type(functools.cache(len))
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _OF_A_CLASS = {"__dict__", "__weakref__", "_abc_impl", "__abstractmethods__"}
-_IDENTICAL = (types.FunctionType, type, types.ModuleType, types.CodeType, *_LOCKS)  # their contents are seen apart
-_DESCRIPTORS = (property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType)
-_CONSTANT = {int, float, complex, str, bytes, bool, type(None), *_IDENTICAL, *_DESCRIPTORS}
+_DESCRIPTORS = {property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType}
+_CONSTANT = {*_PLAIN, *_LOCKS, types.FunctionType, types.CodeType} | _DESCRIPTORS  # or their contents are seen apart
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _ABSENT = type("Absent", (), {})  # in place of the value of a name that is not defined
 _lock = threading.RLock()
@@ -202,8 +201,8 @@ def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
 def _pickled(function: Any) -> Pickled:
     """Pickle a function, or find the pickle of an earlier call that has used the same; the lock is held."""
     seen, header = _snapshot(function), sources_digest() + _this_process(os.getpid())
-    same = (each for each in reversed(_sent.values()) if each.seen[0] == seen[0] and each.is_unchanged())
-    sent = next((each for each in same if each.pickled.payload.startswith(header)), None)
+    known = [each for each in reversed(_sent.values()) if seen[0] is not None and each.seen[0] == seen[0]]
+    sent = next((each for each in known if each.pickled.payload.startswith(header) and each.is_unchanged()), None)
     if sent is not None and sent.is_confirmed:
         return _sent.use(sent.pickled.key).pickled
     uses = _Uses()
@@ -275,7 +274,7 @@ def _snapshot(thing: Any) -> tuple[bytes | None, list]:
     Much faster than a pickle by value. The objects whose identities are in the bytes are returned as well: as long as
     they are kept, no other object has these identities. None for an object that cannot be pickled.
     """
-    pickler = _Snapshot(file := io.BytesIO(), protocol=5)
+    pickler = _Snapshot(file := io.BytesIO())
     try:
         pickler.dump(thing)
     except Exception:
@@ -284,17 +283,22 @@ def _snapshot(thing: Any) -> tuple[bytes | None, list]:
 
 
 class _Snapshot(cloudpickle.Pickler):
-    def __init__(self, file: io.BytesIO, protocol: int) -> None:
-        super().__init__(file, protocol)
+    """Pickler in which functions, classes and modules count by identity; it fails for what cannot be sent."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
         self.kept: list[Any] = []
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, _IDENTICAL):
-            self.kept.append(obj)
-            return abs, (id(obj),)
         if isinstance(obj, _CACHED | functools.cached_property):
             return abs, (), getattr(obj, "__wrapped__", None) or obj.func
-        return NotImplemented
+        if not isinstance(obj, types.FunctionType | type | types.ModuleType | types.CodeType):
+            return NotImplemented
+        self.kept.append(obj)
+        if not isinstance(obj, types.FunctionType) or not (obj.__module__ is None or is_of_user(obj.__module__)):
+            return abs, (id(obj),)
+        values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
+        return abs, (id(obj),), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
 
 
 class _Pickler(cloudpickle.Pickler):
@@ -394,7 +398,7 @@ class _Pickler(cloudpickle.Pickler):
         if plain or isinstance(value, _LOCKS):
             return _new_lock(value)
         try:
-            _Probe(io.BytesIO(), protocol=5).dump(value)
+            _Snapshot(io.BytesIO()).dump(value)
             _refuse_a_name(value)
         except Exception as error:
             self.uses.unsent[id(value)] = value
@@ -511,18 +515,6 @@ def _refuse_a_name(value: Any) -> None:
     name = reduce(value)
     if isinstance(name, str) and is_of_user(sys.modules[pickle.whichmodule(value, name)]):
         raise TypeError("it is known by its name only")
-
-
-class _Probe(cloudpickle.Pickler):
-    """Pickler that finds out whether an object can be pickled, without classes, modules and the code of functions."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, _CACHED | functools.cached_property):
-            return self.reducer_override(getattr(obj, "__wrapped__", None) or obj.func)
-        if isinstance(obj, types.FunctionType):
-            values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
-            return abs, (), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
-        return (abs, ()) if isinstance(obj, type | types.ModuleType) else NotImplemented
 
 
 class _Lock:

@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,6 @@ __all__ = ["run_program"]
 _MOST_IDLE = 16  # supervisors that are kept
 _STOP_SECONDS = 15.0  # longer than a supervisor tries to kill a program
 _idle: "list[_Supervisor]" = []
-_lock = threading.Lock()
 
 
 class _Supervisor:
@@ -130,11 +128,10 @@ def run_program(
     finally:
         if not answer and keeper.alive:
             keeper.stop()
-        with _lock:
-            if keeper.alive and len(_idle) < _MOST_IDLE:
-                _idle.append(keeper)
-            else:
-                keeper.kill()
+        if keeper.alive and len(_idle) < _MOST_IDLE:
+            _idle.append(keeper)
+        else:
+            keeper.kill()
 
 
 def _end(process: subprocess.Popen, owner: int) -> None:
@@ -150,21 +147,15 @@ def _end(process: subprocess.Popen, owner: int) -> None:
         process.wait()
 
 
-def _forget() -> None:
-    """In a forked process: the supervisors belong to its parent, and one of its threads may have held the lock."""
-    global _lock
-    _lock = threading.Lock()
-    _idle.clear()
-
-
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget)
+    os.register_at_fork(after_in_child=_idle.clear)  # they belong to the parent
 
 
 def _take() -> _Supervisor:
-    with _lock:
-        while _idle:
+    while True:
+        try:
             keeper = _idle.pop()
-            if keeper.alive:
-                return keeper
-    return _Supervisor()
+        except IndexError:
+            return _Supervisor()
+        if keeper.alive:
+            return keeper

@@ -158,7 +158,8 @@ def test_a_forked_process_has_a_supervisor_of_its_own():
     """As in a pool of multiprocessing that forks while threads of the parent run programs."""
     model = model_of()
     model.simulate(THETA)
-    with programs._lock, multiprocessing.get_context("fork").Pool(1) as pool:
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        assert programs._idle
         np.testing.assert_array_equal(pool.apply_async(model.simulate, (THETA,)).get(20.0), line(THETA))
     np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
 

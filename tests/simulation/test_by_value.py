@@ -208,6 +208,13 @@ def test_every_change_reaches_a_worker_that_has_loaded_the_function(how, user, p
         del sys.modules["changing"]
 
 
+def test_functions_of_which_no_snapshot_can_be_taken_are_pickled_each_time(user, monkeypatch):
+    monkeypatch.setattr(by_value, "_snapshot", lambda thing: (None, []))
+    for _ in range(3):
+        assert [Pickled.of(f).load()(1.0) for f in (user.by_module, user.deep)] == [3.0, 3.0]
+        assert len({Pickled.of(f).key for f in (user.by_module, user.deep, user.late)}) == 3
+
+
 def test_a_global_that_is_not_defined_yet_is_not_none(pool):
     """As in a notebook whose cells are run in another order."""
     script = sys.modules["__main__"]
