@@ -342,8 +342,9 @@ def test_what_belongs_to_the_user():
 def test_the_script_is_not_run_again(tmp_path):
     """Values of the script that the function does not use are not sent, whatever they are."""
     (tmp_path / "script.py").write_text(
-        "print('runs')\nfrom fe_likelihoods import LocalPool\nunused = (i for i in range(3))\nK = 2\n"
-        "def f(x): return K * x\nK = 3\nwith LocalPool(2) as pool:\n    print(pool.map(f, [1, 2]))\n"
+        "print('runs')\nfrom fe_likelihoods.simulation.local_pool import LocalPool\n"
+        "unused = (i for i in range(3))\nK = 2\ndef f(x): return K * x\nK = 3\n"
+        "with LocalPool(2) as pool:\n    print(pool.map(f, [1, 2]))\n"
     )
     environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
     run = subprocess.run([sys.executable, tmp_path / "script.py"], env=environment, capture_output=True, text=True)
