@@ -26,10 +26,10 @@ class AutoregressiveNoise:
     Parameters
     ----------
     channels : sequence of Channel
-        The measured channels, in the order of the sums of squared residuals.
+        The measured channels, in the order of the model.
     sensor : mapping of channel names to float, or sequence of float, optional
-        Known standard deviations of the sensors, as for `GaussianNoise`. They are a lower bound of the standard
-        deviation of the whole error. The lag-one correlation describes the whole error, not the model error alone.
+        Known standard deviations of the sensor noise, as for `GaussianNoise`: lower bounds for the standard deviation
+        of the whole error. The lag-one correlation describes the whole error, not the model error alone.
 
     Raises
     ------
@@ -39,23 +39,23 @@ class AutoregressiveNoise:
     Notes
     -----
     With e_1 ~ N(0, sigma^2) and e_t = rho e_{t-1} + sqrt(1 - rho^2) sigma z_t, the errors of n samples are normal with
-    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, there with the variance of z)::
+    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, with the innovation variance)::
 
         log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
         Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
 
     with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2
-    (`fe_likelihoods.noise.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written
-    with differences instead of the products r_t r_{t-1}, because for rho near one their sum would cancel against J. The
-    mean of a channel is worth n (1 - rho) / (1 + rho) independent samples.
+    (`fe_likelihoods.noise.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written with differences
+    instead of the products r_t r_{t-1}, whose sum would cancel against J for rho near one. For the mean of a channel,
+    the n samples are worth n (1 - rho) / (1 + rho) independent samples.
 
-    Where samples are missing, the correlation of a sample with the one before it, g steps earlier, is rho^g. The factor
+    Where samples are missing, a sample has the correlation rho^g with the previous sample, g steps earlier. The factor
     of the pair is the normal density of r_t with mean rho^g r_{t-g} and variance sigma^2 (1 - rho^(2 g)), so gaps are
     bridged exactly. The sums are then formed for each distance g that occurs.
 
-    Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one and the
-    likelihood becomes a likelihood of the differences. Decimate the measurements (`Measurements.decimate`) to a step at
-    which rho is well below one.
+    Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one, and the
+    likelihood depends on the differences of successive residuals only. Decimate the measurements
+    (`Measurements.decimate`) to a step at which rho is well below one.
 
     References
     ----------
@@ -122,7 +122,7 @@ class AutoregressiveNoise:
     def _log_likelihood_with_gaps(
         self, statistics: np.ndarray, counts: SampleCounts, parameters: np.ndarray
     ) -> np.ndarray:
-        """`log_likelihood` where samples are missing: the product of the factors of all pairs of neighbours."""
+        """`log_likelihood` where samples are missing: one factor for each pair of neighbouring samples."""
         sigma, rho = self.standard_deviations(parameters), self.lag_one_correlations(parameters)
         sums = statistics.reshape(len(statistics), -1, len(self.channels))
         with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Draws of the errors of measurements, given the parameters of a noise."""
+"""Draws of measurement errors, given the noise parameters."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,22 +12,22 @@ __all__ = ["SampleNoise", "sample_noise"]
 
 
 class SampleNoise(NamedTuple):
-    """Noise of every sample.
+    """Noise of every parameter sample.
 
     Attributes
     ----------
     deviations : ndarray, shape (n, n_channels), or (n, n_events, n_channels)
-        Standard deviations [SI]; the parameters (n, n_noise) of the noise if it depends on the response.
+        Standard deviations [SI]; for a noise that depends on the response, its parameters (n, n_noise).
     lag_one : ndarray, shape (n, n_channels), or None
         Correlation of successive errors [-], None for white noise.
     events : tuple of slice
         Steps of each event, for standard deviations per event. Other steps have no noise.
     of_response : callable or None
-        For a noise that depends on the response: function of the parameters (n_noise,) of one sample and its response
-        (n_channels, n_steps) that returns the standard deviations (n_channels, n_steps) [SI].
+        For a noise that depends on the response: takes the parameters (n_noise,) of one sample and its response
+        (n_channels, n_steps), returns the standard deviations (n_channels, n_steps) [SI].
     errors_of_response : callable or None
-        For such a noise whose errors are correlated in time: function of parameters, response and standard normal
-        numbers (n_channels, n_steps) that returns the errors (n_channels, n_steps) [SI].
+        For such a noise whose errors are correlated in time: takes parameters, response and standard normal numbers
+        (n_channels, n_steps), returns the errors (n_channels, n_steps) [SI].
     """
 
     deviations: np.ndarray
@@ -82,8 +82,8 @@ def sample_noise(
     n_channels : int
         Number of channels.
     dt : float, optional
-        Time step of the responses [s], for a noise whose level depends on the response. Without it, such a noise has
-        the level of the measurements.
+        Time step of the responses [s], for a noise whose level depends on the response. Without it, the standard
+        deviations of the measurements are used (``noise.standard_deviations``).
     at_samples : bool
         Whether responses are given at the measured samples, for a noise that knows the sample times.
 

@@ -1,15 +1,15 @@
-r"""Gaussian noise: levels per channel, event or band of frequency, in SI units or as shares of a signal.
+r"""Gaussian noise: levels per channel, event or frequency band, in SI units or as shares of a signal.
 
 The errors, differences between a measured and a simulated response, are Gaussian and independent between channels. The
 likelihood then needs only a few sums of the residuals per channel (sufficient statistics,
-`fe_likelihoods.noise.groups`) instead of the response, so a change of a noise parameter needs no simulation. All
-combinations of `groups` and `level` have the standard deviation
+`fe_likelihoods.noise.groups`) instead of the response, so a changed noise parameter needs no simulation. The variance
+of a sample (or, with frequency bands, of a cosine transform coefficient) is
 
 .. math:: \sigma^2 = s^2 + (a\, l)^2
 
-of a sample, or of a coefficient of its cosine transform: the known noise :math:`s` of the sensor, an unknown parameter
-:math:`a`, and a reference :math:`l`, which is one (``level="si"``), the level of the measured channel (``"measured"``)
-or the level of the simulated response (``"response"``).
+with the known sensor noise :math:`s`, an unknown parameter :math:`a`, and a reference :math:`l`, which is one
+(``level="si"``), the level of the measured channel (``"measured"``) or the level of the simulated response
+(``"response"``).
 
 Real measurements differ from a model by more than sensor noise, and the differences are correlated in time. White noise
 counts the n samples of a channel as n independent observations, which makes the posterior too narrow:
@@ -44,7 +44,7 @@ from .sample_counts import SampleCounts, samples_per_channel
 __all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
-_PARTS = 3  # parts of a window, in steps of which it moves
+_PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
 _LOCAL, _GROWTH = 0.25, 0.25  # see docs/theory/noise.rst
 _LARGEST_GAP = 0.05  # part of the samples of a channel
@@ -54,45 +54,44 @@ _SHARES = 'level="measured" or "response", without bands'
 
 @dataclass(frozen=True, repr=False)
 class GaussianNoise:
-    r"""Gaussian noise with one unknown level per channel, or per event or band of frequency of each channel.
+    r"""Gaussian noise with one unknown level per channel, or per channel and event or frequency band.
 
     Parameters
     ----------
     channels : sequence of Channel
         The measured channels, in the order of the model.
     groups : {"channel", "all", "event"} or sequence of float
-        What has a level: each channel; all channels together; each channel in each event of a model whose excitation is
-        `fe_likelihoods.Events`; or each channel in each band of frequency, given by the ascending frequencies between
-        the bands [Hz]: ``(1, 5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
+        What has a level: each channel; all channels together; each channel in each event, for a model whose excitation
+        is `fe_likelihoods.Events`; or each channel in each frequency band. Bands are given by the ascending frequencies
+        between them [Hz]: ``(1, 5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
     level : {"si", "measured", "response"}
-        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root
-        mean square; or a share of the level of the simulated response.
+        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root mean square;
+        or a share of the simulated response level.
     window : float, optional
-        Length of a window [s] in which the root mean square of the response is taken: longer than a period of the
-        response, shorter than the strong part of the motion; in a test without time [steps]. Needed for
-        ``level="response"`` without bands. For ``level="measured"`` it is the window of predictions, by default the
-        whole motion; the likelihood always has one level.
+        Length of the moving window for the root mean square of the response [s; steps in a test without time]. Longer
+        than a period of the response, shorter than the strong part of the motion. Needed for ``level="response"``
+        without bands. For ``level="measured"`` it is used in predictions only, by default the whole motion.
     local : float, optional
-        For ``level="response"``: part of the variance that follows the envelope of the response, from 0 to 1 (0.25);
-        the other part follows the whole response.
+        For ``level="response"``: weight of the response envelope in the variance, from 0 to 1 (0.25). The rest is the
+        weight of the mean square over the whole response.
     deformation : float, optional
-        For ``level="response"`` in a test with an imposed deformation: the deformation at which the standard deviation
-        is the share of the level [m; - for a strain], such as 1 % of the height of a column. The standard deviation is
-        then proportional to a power of the largest deformation reached. Give each specimen its own.
+        For ``level="response"`` in a test with an imposed deformation: the deformation [m; - for a strain] at which the
+        standard deviation is the share times the level, such as 1 % of the column height. The standard deviation is
+        then proportional to a power of the largest deformation reached. Choose it for each specimen.
     growth : float, optional
-        This power, 0.25 by default. Only with `deformation`.
+        Exponent of this power, 0.25 by default. Only with `deformation`.
     sensor : mapping of channel names to float, or sequence of float, optional
-        Known standard deviations of the sensors [SI unit of the channel], one per channel; zero for names that are left
-        out. The parameters are then levels of the model error, and may be zero. Needed, and positive, for
-        ``level="response"``: it is the standard deviation of the error where the response is zero.
+        Known standard deviations of the sensor noise [SI unit of the channel], one per channel; zero for names that are
+        left out. The parameters are then levels of the model error, and may be zero. ``level="response"`` needs
+        positive values: they are the standard deviations where the response is zero.
     effective_samples : mapping of channel names to float, or sequence of float, optional
-        Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`); the number of
-        samples where it is smaller or the name is left out.
+        Number of independent samples that each channel is worth (`fe_likelihoods.effective_samples`), at most the
+        number of samples, which is also the default for names that are left out.
     scales : mapping of channel names to float, or sequence of float, optional
-        Positive scales [SI unit of the channel], of which the level of ``groups="all"`` and the shares of
-        ``level="measured"`` are multiples. Default: root mean squares of the measured channels.
+        Positive scales [SI unit of the channel]: the level of ``groups="all"`` and the shares of ``level="measured"``
+        are multiples of them. Default: root mean squares of the measured channels.
     layout, events, measured, excited
-        Times of the samples; events, and which (event, channel) are measured; excitation. Set by the likelihood
+        Sample times; events; the measured (event, channel) pairs; excitation. Set by the likelihood
         (`with_measurements`, `under`) and by predictions.
 
     Raises
@@ -106,7 +105,7 @@ class GaussianNoise:
     groups      level          parameters                  for
     =========== ============== =========================== =======================================================
     "channel"   "si"           ``sigma_<channel>``         synthetic data, thinned measurements
-    "all"       "si"           ``sigma``                   one ratio of noise to signal
+    "all"       "si"           ``sigma``                   one noise-to-signal ratio
     "event"     "si"           ``sigma_<channel>_<event>`` sensors and errors that change from test to test
     "channel"   "measured"     ``share_<channel>``         predictions of weaker or stronger motions
     "channel"   "response"     ``share_<channel>``         the same, and evidences: a normalised density
@@ -116,37 +115,38 @@ class GaussianNoise:
     =========== ============== =========================== =======================================================
 
     **Levels in SI units.** With n samples in channel c (missing samples do not count) and the sum of squared residuals
-    J_c, the log-likelihood is [1]_, eqs. (2) and (3)::
+    J_c, the log-likelihood is ([1]_, eqs. (2) and (3))::
 
         log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
 
     With effective samples, the term of channel c is multiplied by n_eff / n. This has the effect of thinning to n_eff
-    samples without discarding any. The result is not a density of the measurements: only evidences of models with the
-    same n_eff can be compared.
+    samples without discarding any. The result is not a density of the measurements, so evidences can be compared only
+    between models with the same n_eff.
 
-    **Shares of the measured channel.** The likelihood is white noise with other parameters: ``share_top = 0.2``
-    is a standard deviation of 20 % of the measured root mean square. Shares of 1 or more are
-    impossible, since the model would explain nothing. In a prediction, response and error together have the level:
+    **Shares of the measured channel.** The likelihood is white noise with other parameters: ``share_top = 0.2`` is a
+    standard deviation of 20 % of the measured root mean square. Shares of 1 or more are impossible, since the model
+    would explain nothing. In a prediction, the level is the root mean square of response and error together:
     sigma^2 = (sensor^2 + share^2 R^2) / (1 - share^2) with the root mean square R of the simulated response. The level
-    is computed from the measurements, so that evidences compare these shares with other noises approximately only.
+    is computed from the measurements, so evidences compare these shares with other noises only approximately.
 
-    **Shares of the response.** The window moves in steps of a third of its length::
+    **Shares of the response.** The window consists of three equal parts of the time, and moves by one part. In its
+    middle part::
 
         l^2 = ((1 - local) R^2 + local e^2) (d / deformation)^(2 growth)
 
-    with the mean square e^2 of the response in such a part and its two neighbours, the mean square R^2 of the response
-    in the whole motion (each event, and each pause, has its own), and the largest deformation d up to the middle of the
-    part; without `deformation` the last factor is one. A share that was found in a part of a motion, beside a gap or
-    with a long quiet end belongs to another R^2 than the whole motion has: calibrate and predict whole motions, or use
-    ``local=1``. Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local`
-    near 1 may prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
+    where e^2 is the mean square of the response in the window, R^2 its mean square in the whole motion (computed
+    separately for each event and each pause), and d the largest deformation up to the middle of the part. Without
+    `deformation` the last factor is one. A share that was calibrated on a part of a motion, with a gap, or with a long
+    quiet end refers to a different R^2 from the whole motion: calibrate and predict whole motions, or use ``local=1``.
+    Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may
+    prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
     ``level="si"`` (`fit_measures`). The statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
-    **Bands of frequency.** Coefficients of the cosine transform (DCT-II, orthonormal) are independent, with the
-    variance sensor^2 + (share_b u_b)^2 of band b, where u_b is the root mean square of the coefficients of the
-    simulated response in the band, or in SI units sensor^2 + sigma_b^2 n / n_b, where sigma_b is the root mean square
-    of the errors in the band. This is a multivariate normal density of the samples. Missing samples divide a channel
-    into stretches, which are independent; stretches shorter than a period of the lowest edge are refused.
+    **Frequency bands.** The coefficients of the orthonormal cosine transform (DCT-II) are independent. In band b their
+    variance is sensor^2 + (share_b u_b)^2, where u_b is the root mean square of the response coefficients in the band,
+    or in SI units sensor^2 + sigma_b^2 n / n_b, where sigma_b is the root mean square error in the band, which has n_b
+    of the n coefficients. This is a multivariate normal density of the samples. Missing samples divide a channel into
+    independent stretches; stretches shorter than a period of the lowest edge are refused.
 
     References
     ----------
@@ -209,7 +209,7 @@ class GaussianNoise:
         return edges
 
     def _check_options(self) -> None:
-        """Set options as floats, with their defaults; ValueError for one without a meaning here, or a missing one."""
+        """Set options as floats, with their defaults; ValueError if one is missing or has no meaning here."""
         positive, local = lambda x: 0.0 < x < math.inf, "from 0 (one level for the motion) to 1 (the envelope)"
         for name, means, default, where, meaning, possible in (
             ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", positive),
@@ -276,12 +276,12 @@ class GaussianNoise:
 
     @property
     def _in_parts(self) -> bool:
-        """Whether levels follow the response in parts of the time."""
+        """Whether levels follow the response over time."""
         return self.level == "response" and self._kind != "bands"
 
     @property
     def _scaled(self) -> bool:
-        """Whether parameters are multiples of scales of the channels."""
+        """Whether parameters are multiples of channel scales."""
         return self.level == "measured" or (self.level == "si" and self._kind == "all")
 
     @property
@@ -291,7 +291,7 @@ class GaussianNoise:
 
     @property
     def n_bands(self) -> int:
-        """Number of bands of frequency; one without bands."""
+        """Number of frequency bands; one without bands."""
         return 1 if isinstance(self.groups, str) else len(self.groups) + 1
 
     @property
@@ -301,7 +301,7 @@ class GaussianNoise:
         return type(self).__name__ + (f"({options})" if options else "")
 
     def __repr__(self) -> str:
-        # the layout and the excitation, which measurements and model determine, change no value of the likelihood
+        # measurements and model determine the fields left out, so fingerprints need not contain them
         bound = ("channels", "layout", "events", "measured", "excited")
         names = [field.name for field in fields(self) if field.name not in bound]
         return f"{type(self).__name__}({shown(self.channels, self._options(names))})"
@@ -314,7 +314,7 @@ class GaussianNoise:
     def parameter_names(self) -> tuple[str, ...]:
         """``sigma_...`` [SI unit of the channel] or ``share_...`` [-], see the table of the class.
 
-        Bands of each channel follow each other from low to high, channel by channel.
+        With bands: channel by channel, bands from low to high.
 
         Raises
         ------
@@ -333,7 +333,7 @@ class GaussianNoise:
 
     @property
     def parameter_channels(self) -> dict[str, Channel]:
-        """Channel of each parameter that is a standard deviation in the unit of this channel, by name."""
+        """Channels by the names of parameters that are standard deviations in the channel's unit."""
         if self.level != "si" or self._kind == "all":
             return {}
         rows = [row for _, row in self.measured]
@@ -343,11 +343,11 @@ class GaussianNoise:
 
     @property
     def statistic(self) -> GroupSums | None:
-        """Sufficient statistic of the residuals; None for the sums of squares of all samples."""
+        """Sufficient statistic of the residuals; None if the sums of squares over all samples are sufficient."""
         return None if self._whole else self._sums()
 
     def _sums(self, dt: float | Sequence[float] | None = None) -> Any:
-        """Sums in groups of the measured samples; of a response from the time zero with the step `dt`."""
+        """Sums in groups of the measured samples, or of a response with the step `dt` from time zero."""
         if dt is not None:
             steps = tuple(np.broadcast_to(np.asarray(dt, dtype=float), len(self.channels)).tolist())
             layout = Layout(steps, (0.0,) * len(steps), ())
@@ -381,9 +381,9 @@ class GaussianNoise:
         Raises
         ------
         ValueError
-            If the noise has levels per event, and the excitation is not `fe_likelihoods.Events`; if it grows with a
-            deformation, and none is imposed on the model; if the window is shorter than three time steps of the model,
-            or longer than one of its events.
+            If the noise has levels per event and the excitation is not `fe_likelihoods.Events`; if the noise grows with
+            a deformation and none is imposed on the model; if the window is shorter than three time steps of the model
+            or longer than an event.
         """
         if self._kind == "event" and not self.events:
             return replace(self, events=events_of(model).windows)
@@ -407,14 +407,14 @@ class GaussianNoise:
         return replace(self, excited=excited)
 
     def with_measurements(self, measurements: Measurements) -> "GaussianNoise":
-        """The same noise, with the same parameters, for these measurements: their scales, if none are set, and times.
+        """The same noise with the sample times of these measurements, and their scales if none are set.
 
         Raises
         ------
         ValueError
-            If the channels are others; the window is shorter than three time steps; a band is above half the sampling
-            frequency; gaps leave a stretch that is shorter than a period of the lowest edge; or with events, if
-            channels have times of their own or a sample is outside of every event.
+            If the channels are different; the window is shorter than three time steps; a band is above half the
+            sampling frequency; gaps leave a stretch that is shorter than a period of the lowest edge; or with events,
+            if channels have different times or a sample is outside of every event.
         """
         names, got = ([channel.name for channel in each.channels] for each in (self, measurements))
         if names != got:
@@ -487,18 +487,18 @@ class GaussianNoise:
                 )
 
     def remark_on_gaps(self) -> str:
-        """What to say where samples are missing, so that shares refer to the level of a part of the motion.
+        """Warning text on gaps, which make shares refer to the level of the measured part of a motion only.
 
-        Empty for a noise without parts of the time or without measurements, for ``local=1``, and if at most 5 % of the
-        samples are missing within the measured motion. An event without any sample of a channel is no gap, since each
-        event has a mean square of its own.
+        Empty for a noise whose levels do not follow the response over time, without measurements, for ``local=1``, and
+        if at most 5 % of the samples are missing within the measured motion. An event without any sample of a channel
+        is no gap, since mean squares are computed per event.
         """
         if not self._in_parts or self.layout is None or self.local == 1.0:
             return ""
         named, counts, events = [], np.array(self.layout.counts), self.excited.events
         for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
             known = np.flatnonzero(row)
-            inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # whole parts
+            inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # without the first and last part
             if events:  # odd numbers; nothing needs to be measured in the pauses
                 of_parts = np.array(events)[np.minimum(np.arange(len(row)), len(events) - 1)]
                 measured = np.unique(of_parts[row > 0])  # each event has its own mean square
@@ -517,8 +517,7 @@ class GaussianNoise:
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
         """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.
 
-        With events, the level of a channel in an event is the mean of the levels of channels with a weight that were
-        measured in this event.
+        With events, a channel's level in an event is the weighted mean level of the channels measured in this event.
         """
         others = replace(
             self,
@@ -594,7 +593,8 @@ class GaussianNoise:
     def _deviations(self, parameters: np.ndarray, counts: np.ndarray, power: np.ndarray | None = None) -> np.ndarray:
         """Standard deviations (n, n_groups, n_channels) of the coordinates; NaN for impossible parameters.
 
-        `counts` (n_groups, n_channels), and `power` (n, n_groups, n_channels), the sums of squares of the response.
+        `counts` (n_groups, n_channels) are the numbers of coordinates, `power` (n, n_groups, n_channels) is the
+        response's sums of squares.
         """
         values, levels = self._values(parameters, 1.0), np.ones(1)
         if self._scaled:
@@ -652,8 +652,8 @@ class GaussianNoise:
         Returns
         -------
         (n, n_channels) float
-            [SI unit of the channel]; NaN for impossible parameters. With shares of the response: where the response is
-            zero; elsewhere they depend on it, see `response_deviations`.
+            [SI unit of the channel]; NaN for impossible parameters. With shares of the response, this is the sensor
+            noise alone; `response_deviations` returns the standard deviations for a response.
         """
         values, levels = self._values(parameters, 1.0), np.ones(1)
         if self.level == "response":
@@ -670,7 +670,7 @@ class GaussianNoise:
     def deviations_per_event(self, parameters: np.ndarray) -> np.ndarray:
         """Standard deviations (n, n_events, n_channels) of the errors [SI]; NaN where there is no level.
 
-        Impossible parameters are returned as they are, negative.
+        Negative parameters, which are impossible, are returned unchanged.
         """
         values = self._values(parameters, np.nan)
         return np.where(values < 0.0, values, np.hypot(self._floor, values))
@@ -688,13 +688,13 @@ class GaussianNoise:
         response : (n_channels, n_steps) float
             Response [SI unit of each channel]; NaN where a sample is missing.
         dt : float or sequence of float, optional
-            Its time step [s], of a response from the time zero. Default: the response is at the measured samples.
+            Time step [s] of a response that begins at time zero. Default: the response is at the measured samples.
             Shares of the measured channel need it.
 
         Returns
         -------
         (n_channels, n_steps) float
-            [SI unit of each channel]; NaN where the response is.
+            [SI unit of each channel]; NaN where the response is NaN.
         """
         if self.level == "measured":
             level = local_level(response, None if self.window is None else self.window / dt)
@@ -730,7 +730,7 @@ class GaussianNoise:
         normal : (n_channels, n_steps) float
             The standard normal numbers.
         sensor : bool
-            Whether the errors contain sensor noise. Without it they are errors of the model.
+            Whether the errors contain sensor noise. Without it they are model errors.
         """
         response = np.asarray(response, dtype=float)
         sums, deviations = self._of_response(parameters, response, dt)
@@ -760,10 +760,10 @@ class GaussianNoise:
 
     @only_if(lambda noise: noise.level == "response" or noise._kind == "bands")
     def log_densities(self, residuals: np.ndarray, response: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Terms (n_channels, n_samples) of the log-likelihood, of which each belongs to one sample.
+        """Terms (n_channels, n_samples) of the log-likelihood, one per sample; zero where a sample is missing.
 
-        Arguments as for `whitened`. With bands, a term is the density of the whitened residual and an equal part of the
-        logarithm of the determinant. Zero where a sample is missing.
+        Arguments as for `whitened`. With bands, a term is the log-density of the whitened residual minus the mean
+        logarithm of the coefficients' standard deviations.
         """
         white, logarithms = self._whitened(residuals, response, parameters)
         return np.nan_to_num(-HALF_LOG_TWO_PI - logarithms - 0.5 * np.square(white), nan=0.0)

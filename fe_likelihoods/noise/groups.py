@@ -1,10 +1,10 @@
 """Squared residuals summed in groups of orthonormal coordinates: sufficient statistics of Gaussian noise.
 
 Errors are independent in the coordinates, with one variance for each group. The coordinates are the samples (groups are
-the samples of an event, or parts of the time) or the coefficients of an orthonormal cosine transform (groups are bands
-of frequency). An orthonormal transform keeps sums of squares and has a Jacobian of one, so the density of the
-coefficients is the density of the samples. Sufficient are, for each group, the number of coordinates, the sum of
-squared residuals and, for a variance that depends on the response, the sum of squares of the response.
+events, or parts of the time) or the coefficients of an orthonormal cosine transform (groups are frequency bands). An
+orthonormal transform preserves sums of squares and has a Jacobian of one, so the density of the coefficients is the
+density of the samples. The sufficient statistics of a group are the number of coordinates, the sum of squared residuals
+and, for a variance that depends on the response, the sum of squared response coordinates.
 """
 
 from abc import ABC, abstractmethod
@@ -27,9 +27,9 @@ class Layout(NamedTuple):
     Attributes
     ----------
     steps, starts : tuple of float
-        Time step and time of the first sample of each channel [s].
+        Time step and first sample time of each channel [s].
     counts : tuple of tuple of int, (n_groups, n_channels)
-        Number of coordinates of each channel in each group.
+        Number of coordinates in each group, per channel.
     """
 
     steps: tuple[float, ...]
@@ -45,8 +45,8 @@ class GroupSums(ABC):
     def __call__(self, residuals: np.ndarray, response: np.ndarray | None = None) -> np.ndarray:
         """Return the sums (n_numbers,) [SI unit of the channel, squared]; samples with residuals of NaN are left out.
 
-        Sums of the squared residuals of all samples, then of the residuals in each group, then of the response in each
-        group; (n_channels,) each.
+        Sums of squares (n_channels,): of all residuals, then of the residuals in each group, then of the response in
+        each group.
         """
         there = ~np.isnan(residuals)
         histories = [residuals] if response is None else [residuals, response]
@@ -55,11 +55,11 @@ class GroupSums(ABC):
 
     @abstractmethod
     def powers(self, histories: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Sums of squared coordinates (n_groups, n_channels) of histories (n_channels, n_steps)."""
+        """Sums of squared coordinates (n_groups, n_channels) for histories (n_channels, n_steps)."""
 
     @abstractmethod
     def counts(self, there: np.ndarray) -> np.ndarray:
-        """Number of coordinates (n_groups, n_channels), from whether samples are there (n_channels, n_steps)."""
+        """Number of coordinates (n_groups, n_channels), from whether samples are present (n_channels, n_steps)."""
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ class EventSums(GroupSums):
 
 @dataclass(frozen=True)
 class PartSums(GroupSums):
-    """Groups are the samples in equal parts of the time, from the time zero on.
+    """Groups are the samples in equal parts of the time, from time zero on.
 
     Parameters
     ----------
     part : float
         Length of a part [s].
     steps, starts : tuple of float
-        Time step and time of the first sample of each channel [s].
+        Time step and first sample time of each channel [s].
     """
 
     part: float
@@ -123,7 +123,7 @@ class PartSums(GroupSums):
         return np.where(there, found, np.nan)
 
     def whitened(self, residuals: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals divided by their standard deviations, and the logarithms of these, at each sample."""
+        """Residuals divided by their standard deviations, and the log standard deviations, at each sample."""
         levels = self.in_time(deviations, ~np.isnan(residuals))
         return residuals / levels, np.log(levels)
 
@@ -139,10 +139,10 @@ def _places(sums: PartSums, n_steps: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BandSums(GroupSums):
-    """Groups are coefficients of the cosine transform (DCT-II, orthonormal) in bands of frequency.
+    """Groups are coefficients of the orthonormal cosine transform (DCT-II) in frequency bands.
 
-    Samples without a gap between them are a stretch, which is transformed by itself; groups are the bands of the first
-    stretch from low to high, then of the next.
+    A stretch is a run of samples without a gap; each stretch is transformed separately. Groups are the bands of the
+    first stretch from low to high, then the bands of the next one.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class BandSums(GroupSums):
         return self._filled(there, deviations, lambda c, samples, spectrum: np.sqrt(_variances_in_time(spectrum**2)))
 
     def errors(self, normal: np.ndarray, deviations: np.ndarray, there: np.ndarray) -> np.ndarray:
-        """Errors (n_channels, n_steps) made of standard normal numbers, NaN where a sample is missing."""
+        """Errors (n_channels, n_steps) from standard normal numbers; NaN where a sample is missing."""
         from scipy.fft import idct
 
         return self._filled(
@@ -188,9 +188,9 @@ class BandSums(GroupSums):
         )
 
     def whitened(self, residuals: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals with divided coefficients, and the mean logarithm of the standard deviations, at each sample.
+        """Whitened residuals, and the mean log standard deviation of the coefficients, at each sample.
 
-        The matrix is the symmetric inverse square root of the covariance, so that whitened residuals have no delay.
+        Multiplication with the symmetric inverse square root of the covariance gives whitened residuals without delay.
         """
         from scipy.fft import dct, idct
 
@@ -205,7 +205,7 @@ class BandSums(GroupSums):
     def _filled(
         self, there: np.ndarray, deviations: np.ndarray, values_of: Callable[[int, slice, np.ndarray], np.ndarray]
     ) -> np.ndarray:
-        """Values (n_channels, n_steps) of stretches, from the standard deviations of the coefficients of each."""
+        """Values (n_channels, n_steps), computed stretch by stretch from the coefficients' standard deviations."""
         found, deviations = np.full(there.shape, np.nan), deviations.reshape(-1, len(self.edges) + 1, len(there))
         for c, k, samples, bands in self._stretches(there):
             found[c, samples] = values_of(c, samples, deviations[k, bands, c])
@@ -239,16 +239,16 @@ def _variances_in_time(spectrum: np.ndarray) -> np.ndarray:
 
 
 def stretches(there: np.ndarray) -> Iterator[slice]:
-    """Samples of each stretch without a gap, from whether each sample is there (n_steps,)."""
+    """Samples of each stretch without a gap, from whether each sample is present (n_steps,)."""
     edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         yield slice(int(first), int(stop))
 
 
 def split_sums(statistics: np.ndarray, n_channels: int, n_groups: int) -> list[np.ndarray]:
-    """Sums (n, n_groups, n_channels) from statistics (n, n_numbers): of the residuals, then of the response.
+    """Sums (n, n_groups, n_channels) of the residuals, then of the response, from statistics (n, n_numbers).
 
-    The first numbers, the sums of squared residuals over all samples, are left out: sums of groups add up to them.
+    The sums over all samples, which come first, are left out: they are the totals of the group sums.
     """
     rows = statistics.reshape(len(statistics), statistics.shape[1] // n_channels, n_channels)[:, 1:]
     return [rows[:, first : first + n_groups] for first in range(0, rows.shape[1], n_groups)]

@@ -1,12 +1,12 @@
-r"""Level of a response in time, of which the error of a model is a share.
+r"""Level of a response over time; the model error is a share of this level.
 
-The squared level in part p of the time is a mean of the squared envelope and of the mean square of the whole response,
+The squared level in part p of the time is the weighted mean of the squared envelope :math:`e_p^2` and the mean square
+:math:`R^2` of the whole response,
 
 .. math:: l_p^2 = \left(\frac{d_p}{d_0}\right)^{2 \gamma} \left[ (1 - w)\, R^2 + w\, e_p^2 \right],
 
-because errors of a model last longer than the strong response that causes them. The first factor is for tests with an
-imposed deformation: the error grows with the largest deformation :math:`d_p` reached so far. See
-``docs/theory/noise.rst``.
+because model errors last longer than the strong response that causes them. The first factor is for tests with an
+imposed deformation: the error grows with the largest deformation :math:`d_p` so far. See ``docs/theory/noise.rst``.
 """
 
 from typing import Any, NamedTuple
@@ -21,12 +21,13 @@ _ROUND_OFF = 1e-6  # of a part
 
 
 class Excited(NamedTuple):
-    """What the level needs of the excitation of a model, for equal parts of the time from the time zero on.
+    """Excitation data that the level needs, for equal parts of the time from time zero on.
 
     Attributes
     ----------
     events : tuple of int
-        Number of the event, or of the pause, of each part: each has a mean square of its own. Empty for one event.
+        Number of the event (odd) or pause (even) in the middle of each part. Mean squares are computed separately for
+        each. Empty for one event.
     reached : tuple of float
         Largest deformation up to the middle of each part [m, or - for a strain]. Empty for no imposed deformation.
     """
@@ -38,9 +39,9 @@ class Excited(NamedTuple):
 def imposed_deformation(model: Any) -> np.ndarray | None:
     """Deformation (n_steps,) [m, or - for a strain] that a test imposes on a model; None for other excitations.
 
-    That of the attribute ``deformation``, else of ``loading.displacement`` or ``record.displacement``
-    (`fe_likelihoods.DisplacementHistory`), else of ``strain`` (`fe_likelihoods.SteelCoupon`). It must be part of the
-    fingerprint of the model, as the excitation is.
+    The first of these attributes with shape (n_steps,): ``deformation``, ``loading.displacement`` or
+    ``record.displacement`` (`fe_likelihoods.DisplacementHistory`), ``strain`` (`fe_likelihoods.SteelCoupon`). The
+    model's fingerprint must depend on it, as on the excitation.
     """
     histories = (getattr(getattr(model, name, None), "displacement", None) for name in ("loading", "record"))
     for found in (getattr(model, "deformation", None), *histories, getattr(model, "strain", None)):
@@ -59,7 +60,7 @@ def excited_parts(model: Any, part: float, first: int = 0) -> Excited:
     part : float
         Length of a part [s].
     first : int
-        Step of the response that is the time zero.
+        Step of the response at time zero.
 
     Returns
     -------
@@ -84,16 +85,16 @@ def squared_levels(
     Parameters
     ----------
     sums : (n, n_parts, n_channels) float
-        Sums of squares of n responses [SI unit of the channel, squared].
+        Sums of squared samples, for n responses [SI unit of the channel, squared].
     counts : (n_parts, n_channels) int
         Number of samples.
     local : float
-        Weight w of the envelope, the mean square of a part and its two neighbours; 1 - w is the weight of the event's
-        mean square.
+        Weight w of the squared envelope, which is the mean square of a part and its two neighbours; 1 - w is the weight
+        of the event's mean square.
     excited : Excited
         Events and deformations of the parts.
     reference : float or None
-        Deformation at which the factor of the growth is one; None for no growth.
+        Deformation at which the growth factor is one; None for no growth.
     growth : float or None
         Exponent of the deformation reached.
 
@@ -116,7 +117,7 @@ def squared_levels(
 
 
 def _of_parts(values: tuple[float, ...], n_parts: int) -> np.ndarray:
-    """Values (n_parts,) of the parts; the last one also for later parts, in which nothing is measured."""
+    """Values (n_parts,) of the parts; the last value also for later parts, in which nothing is measured."""
     return np.array(values)[np.minimum(np.arange(n_parts), len(values) - 1)]
 
 
@@ -136,8 +137,8 @@ def local_level(response: np.ndarray, steps: float | None) -> np.ndarray:
     response : (n_channels, n_steps) float
         Histories.
     steps : float or None
-        Length of the window in steps, rounded to an odd number; None for all steps. At the ends of the histories the
-        window contains the steps that are there.
+        Length of the window in steps, rounded to an odd number; None for all steps. The window is cut at the ends of
+        the histories.
 
     Returns
     -------

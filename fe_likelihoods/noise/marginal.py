@@ -4,13 +4,13 @@ Given the sum of squared residuals J of n samples, the likelihood is one integra
 
     L(J) = integral of (2 pi)^(-n/2) sigma^-n exp(-J / (2 sigma^2)) p(sigma) d sigma
 
-under its prior p. A sampler then searches fewer dimensions, with the same evidence and the same posterior of the
-structural parameters. The standard deviations are drawn afterwards, given the structural parameters.
+under its prior p. A sampler then searches fewer dimensions; the evidence and the posterior of the structural parameters
+are the same. The standard deviations are drawn afterwards, given the structural parameters.
 
-In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood dominates. The
-maximum is found by a grid that is refined around it, the limits by bisection for a decrease by the factor exp(-36), and
-the integral between them by Gauss-Legendre quadrature, which also holds for a prior with bounds of its own. The
-equations are on the page ``docs/theory/likelihood.rst``.
+In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood dominates. A refined
+grid finds the maximum, bisection finds the integration limits, where the integrand has decreased by the factor
+exp(-36), and Gauss-Legendre quadrature gives the integral between them. Priors may be bounded. The equations are on the
+page ``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -32,7 +32,7 @@ _FALL = 36.0  # decrease of the logarithm at which the integrand is negligible i
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 _GRID = np.linspace(0.0, 1.0, 17)
 _MAX_ITERATIONS = 40
-_CELLS = 512  # intervals of the distribution function that is inverted for draws
+_CELLS = 512  # intervals of the tabulated distribution function, which is inverted for draws
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class MarginalNoise:
     Raises
     ------
     ValueError
-        For another noise, or priors of other parameters.
+        For any other noise, or for priors of other parameters.
 
     Notes
     -----
     If the integrand has one maximum, the likelihood is accurate to eight digits for a hundred samples or more and to
-    six digits for ten. It has one maximum for half-normal, uniform and lognormal priors, for which it is log-concave
-    in log sigma. It can have two if few effective samples contradict an informative `TruncatedNormal` prior by many of
-    its standard deviations; the lower one is then left out.
+    six digits for ten. Half-normal, uniform and lognormal priors make the integrand log-concave in log sigma, so it has
+    one maximum. It can have two if an informative `TruncatedNormal` prior is many of its standard deviations away from
+    a likelihood with few effective samples; the lower maximum is then left out.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class MarginalNoise:
 
     @property
     def title(self) -> str:
-        """The noise, and that its levels are integrated out."""
+        """Title of the noise, with the remark that its levels are integrated out."""
         return f"{noise_title(self.noise)}, its levels integrated out"
 
     @property
@@ -162,7 +162,7 @@ class MarginalNoise:
         return np.stack(columns, axis=1)
 
     def _sums(self, misfit: np.ndarray, n_samples: int | SampleCounts) -> tuple[np.ndarray, np.ndarray, float]:
-        """Sums of squares (n, n_noise) and numbers of samples (n_noise,) per sigma, and a constant of the logarithm."""
+        """Sums of squares (n, n_noise) and sample counts (n_noise,) per sigma, and a constant of the log-likelihood."""
         n = samples_per_channel(n_samples)
         counts = np.full(misfit.shape[1], n, dtype=float)
         if self.noise.effective_samples is not None:
@@ -175,7 +175,7 @@ class MarginalNoise:
 
 
 def sampled_noise(noise: Noise) -> Noise:
-    """Noise whose parameters are in a complete sample: for a `MarginalNoise` the one that was integrated out."""
+    """Noise whose parameters are in a complete sample: for a `MarginalNoise`, the noise inside it."""
     return noise.noise if isinstance(noise, MarginalNoise) else noise
 
 
@@ -198,8 +198,7 @@ def _find(fit: np.ndarray, count: float, prior: Any) -> _Peak:
     """Peak of the integrand for every row of `fit` (n, 1)."""
     least, most = _logarithms(prior)
     middle, far = np.log(prior.ppf(np.array([0.5, 1.0 - 1e-15])))
-    # the maximum is between the maxima of likelihood and prior; refine until the neighbours on the grid are almost as
-    # high
+    # the maximum is between the maxima of likelihood and prior; refine until grid neighbours are almost as high
     low, high = np.clip(np.minimum(fit, middle - 5.0), least, most), np.clip(np.maximum(fit, far), least, most)
     for _ in range(_MAX_ITERATIONS):
         t = low + (high - low) * _GRID
@@ -213,7 +212,7 @@ def _find(fit: np.ndarray, count: float, prior: Any) -> _Peak:
         if (highest - np.minimum(left, right)).max() < 1.0:
             break
     floor = highest - _FALL
-    # at three below the maximum the exponent of the likelihood is 400 times as large
+    # three below the likelihood's maximum, its exponent is exp(2 * 3) = 400 times as large
     below = np.maximum(np.minimum(top, fit) - 3.0, least)
     above = np.minimum(top + (far - middle) + 3.0, most)
     bounds = []

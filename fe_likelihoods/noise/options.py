@@ -1,4 +1,4 @@
-"""Options of noises: numbers per channel that a user gives, checked, and how they are shown."""
+"""Options of noises: checks and `repr` of the numbers per channel that a user gives."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -25,9 +25,9 @@ PerChannel = Mapping[str, float] | Sequence[float] | None
 
 
 class only_if:  # noqa: N801, a decorator
-    """Make a method an attribute only of objects for which a condition holds, so that ``hasattr`` tells.
+    """Decorator: a method exists only for objects that meet a condition, so ``hasattr`` is False for other objects.
 
-    The condition is a function of the object. Other objects raise AttributeError. (`available_if` of scikit-learn.)
+    The condition is a function of the object. See also scikit-learn's `available_if`.
     """
 
     def __init__(self, condition: Callable[[Any], bool]) -> None:
@@ -49,7 +49,7 @@ class only_if:  # noqa: N801, a decorator
 def as_number(
     noise: Any, what: str, value: Any, meaning: str, possible: Callable[[float], bool] = lambda number: True
 ) -> float:
-    """A possible number that a user gave for a noise; ValueError in words for anything else, such as a text."""
+    """A user's number for a noise, as a float; ValueError if it is not a number or not possible."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -63,7 +63,7 @@ def as_number(
 
 
 def numbers(noise: Any, what: str, given: Any, unit: str) -> tuple[float, ...]:
-    """Numbers that a user gave for a noise, in any sequence; see `as_number`."""
+    """A user's numbers for a noise, given in any sequence; see `as_number`."""
     listed = [given] if isinstance(given, str) else np.ravel(np.asarray(given, dtype=object))
     return tuple(as_number(noise, what, value, unit) for value in listed)
 
@@ -73,7 +73,7 @@ def per_channel(
 ) -> tuple[float, ...] | None:
     """One number per channel, or None if none are given.
 
-    Names that a mapping leaves out have the `default`; without one they are refused.
+    Names that a mapping leaves out get the `default`; without a default they are refused.
     """
     if given is None:
         return None
@@ -96,7 +96,7 @@ def checked_channels(noise: Any, channels: Sequence[Channel]) -> tuple[Channel, 
 
 
 def sensor_levels(noise: Any, channels: Sequence[Channel], given: PerChannel) -> tuple[float, ...] | None:
-    """Known standard deviations of the sensors, one per channel [SI]; zero for names that are left out."""
+    """Known standard deviations of the sensor noise, one per channel [SI]; zero for names that are left out."""
     values = per_channel(noise, channels, "sensor", given, 0.0, "in the SI unit of the channel")
     if values is not None and not all(0.0 <= value < math.inf for value in values):
         raise ValueError(
@@ -106,7 +106,7 @@ def sensor_levels(noise: Any, channels: Sequence[Channel], given: PerChannel) ->
 
 
 def shown(channels: Sequence[Channel], options: Mapping[str, Any]) -> str:
-    """Channels and given options for the `repr` of a noise, of which fingerprints are made."""
+    """Channels and given options for the `repr` of a noise, which enters fingerprints."""
     # display units change no value, so they are left out
     named = [f"{channel.name}: {channel.quantity}" for channel in channels]
     return ", ".join(named + [f"{name}={value!r}" for name, value in options.items() if value is not None])

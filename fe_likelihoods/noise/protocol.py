@@ -1,4 +1,4 @@
-"""What a likelihood and a prediction need of a noise, and the optional members with their defaults."""
+"""The members that likelihoods and predictions need of a noise: required, and optional with defaults."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
@@ -27,45 +27,45 @@ class Noise(Protocol):
     Two members are required, `parameter_names` and `log_likelihood`. A noise may also have:
 
     * ``channels``, the measured channels in the order of the statistics; checked against the channels of the model.
-    * ``statistic``, a function of a module that takes the residuals (n_channels, n_steps) and returns the numbers
-      (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Without it the sums of squares
-      are all. Residuals of missing samples are NaN; a statistic without a rule for them is refused with such
-      measurements. A statistic with an attribute ``of_response`` that is true also takes the response at the samples,
-      as a second argument.
-    * ``title``, a short text that names the noise in reports and messages; the name of its class by default.
+    * ``statistic``, a module-level function that takes the residuals (n_channels, n_steps) and returns the numbers
+      (n_numbers,) which `log_likelihood` needs, the sums of squares (n_channels,) first. Default: the sums of squares
+      alone. Residuals of missing samples are NaN; a statistic that does not handle them is refused for measurements
+      with gaps. If the statistic has a true attribute ``of_response``, it also takes the response at the samples, as
+      second argument.
+    * ``title``, a short text that names the noise in reports and messages; the class name by default.
     * ``standard_deviations(parameters)`` with parameters (n, n_noise), which returns the standard deviation of the
       errors (n, n_channels) [SI]; needed for predictions with noise.
     * ``response_deviations(parameters, response, dt)`` with the parameters (n_noise,) of one sample, which returns the
-      standard deviations (n_channels, n_steps) of the errors of a simulated response; used in predictions in place of
-      ``standard_deviations`` where the noise depends on the response.
-    * ``response_errors(parameters, response, normal, dt, sensor)``, which returns the errors (n_channels, n_steps) made
-      of standard normal numbers of that shape, with ``sensor=False`` without sensor noise; for errors that are
-      correlated in time and depend on the response.
+      standard deviations (n_channels, n_steps) of the errors, given a simulated response; used in predictions instead
+      of ``standard_deviations`` where the noise depends on the response.
+    * ``response_errors(parameters, response, normal, dt, sensor)``, which returns the errors (n_channels, n_steps)
+      computed from standard normal numbers ``normal`` of the same shape, without sensor noise if ``sensor=False``; for
+      errors that are correlated in time and depend on the response.
     * ``whitened(residuals, response, parameters)`` and ``log_densities(residuals, response, parameters)`` at the
       measured samples, for checks of residuals and for the log-likelihood in blocks of time.
     * ``under(model, first)``, which returns the noise under the excitation of a model whose response begins at the step
       ``first``; called by a likelihood with its model, and by a prediction with the model under the predicted record.
-    * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed where it
-      depends on their number or times. A likelihood calls it with its own measurements, after ``under``.
+    * ``with_measurements(measurements)``, which returns the noise for a part of the measurements; needed if the noise
+      depends on their number or times. A likelihood calls it with all its measurements, after ``under``.
     * ``lag_one_correlations(parameters)``, which returns the correlation of successive errors (n, n_channels); for
       predictions with autoregressive noise.
-    * ``with_channels(channels, weights)`` with the weights (n_others, n_channels) of its channels in each of other
-      channels, which returns the noise of the other channels for predictions, and the weights (n_others_noise, n_noise)
-      of its parameters in the parameters of that noise; for predictions of channels that were not measured.
-    * ``remark_on_gaps()``, which returns a sentence on gaps in the measurements that make predictions doubtful, empty
-      if there are none. A likelihood warns with it, and predictions with noise have it among their remarks.
+    * ``with_channels(channels, weights)``, for predictions of channels that were not measured. ``weights`` (n_others,
+      n_channels) expresses each new channel by the noise's channels. It returns the noise of the new channels, and the
+      weights (n_others_noise, n_noise) that express the new noise's parameters by the parameters of this noise.
+    * ``remark_on_gaps()``, which returns a sentence on measurement gaps that make predictions doubtful, empty if there
+      are none. A likelihood warns with this sentence, and predictions with noise list it among their remarks.
     """
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters of the noise."""
+        """Names of the noise parameters."""
 
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
     ) -> np.ndarray:
-        """Log-likelihood (n,) of statistics (n, n_numbers) of the residuals at parameters (n, n_noise).
+        """Log-likelihood (n,) for residual statistics (n, n_numbers) at parameters (n, n_noise).
 
-        `n_samples` is the number of samples of every channel; `SampleCounts` for measurements with missing samples. The
+        `n_samples` is the number of samples per channel; `SampleCounts` for measurements with missing samples. The
         value is -inf where a parameter is impossible, also for statistics of zero.
         """
 
@@ -81,7 +81,7 @@ def noise_statistic(noise: Noise) -> Callable[..., np.ndarray] | None:
 
 
 def noise_time_shifts(noise: Noise | None) -> Mapping[str, float]:
-    """Largest unknown time shifts of channels [s] of the noise of a likelihood, by name; empty without any."""
+    """Largest unknown time shifts [s] by channel name; empty for a noise without unknown time shifts."""
     return getattr(noise, "time_shifts", None) or {}
 
 
@@ -91,20 +91,20 @@ def noise_title(noise: Noise) -> str:
 
 
 def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
-    """Noise of a part of the measurements: the same, unless it has a method ``with_measurements``."""
+    """Noise for a part of the measurements: unchanged unless it has a method ``with_measurements``."""
     return noise.with_measurements(measurements) if hasattr(noise, "with_measurements") else noise
 
 
 def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
-    """Noise under the excitation of a model: the same, unless it has a method ``under``."""
+    """Noise under the excitation of a model: unchanged unless it has a method ``under``."""
     return noise.under(model, first) if hasattr(noise, "under") else noise
 
 
 def remark_on_gaps(noise: Noise) -> str:
-    """What a noise says of gaps in its measurements; empty if nothing, or without a method ``remark_on_gaps``."""
+    """A noise's warning text on gaps in its measurements; empty without a method ``remark_on_gaps``."""
     return noise.remark_on_gaps() if hasattr(noise, "remark_on_gaps") else ""
 
 
 def follows_response(noise: Any) -> bool:
-    """Return whether the standard deviation of a noise is a share of the response, which holds for other motions."""
+    """Whether the standard deviation of a noise is a share of the response, and so is valid for other motions."""
     return hasattr(noise, "response_deviations") and getattr(noise, "level", "") != "si"

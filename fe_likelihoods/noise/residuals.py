@@ -1,10 +1,10 @@
 """Checks of residuals: are they white, and how many independent samples are they worth?
 
 A residual is the measured minus the simulated response at parameters that fit. White noise treats the n samples of a
-channel as independent. Residuals of real measurements are not, because the error of a model changes slowly and repeats
+channel as independent. Residuals of real measurements are correlated, because model errors change slowly and repeat
 from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
 of independent samples for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
-`fe_likelihoods.AutoregressiveNoise` explains them::
+`fe_likelihoods.AutoregressiveNoise` explains the correlation::
 
     residuals = posterior.likelihood.residuals(best)
     print(residual_checks(residuals, model.channels))
@@ -36,13 +36,13 @@ __all__ = [
 ]
 
 _UNLIKELY = 0.01  # probability below which residuals are not called white, or normal
-_WEAK = 0.2  # lag-one correlation of which intervals hardly depend: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
-_FEWEST = 10  # samples, below which nothing is said about their correlation and distribution
+_WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
+_FEWEST = 10  # samples that checks of correlation and distribution need
 _WINDOW = 5.0  # length of the sums over lags, in correlation times
 
 
 class ResidualChecks(NamedTuple):
-    """Checks of the residuals of each channel; all arrays are (n_channels,). ``str`` gives a table and sentences.
+    """Checks of the residuals per channel; all arrays are (n_channels,). ``str`` gives a table and sentences.
 
     Attributes
     ----------
@@ -53,14 +53,13 @@ class ResidualChecks(NamedTuple):
     n_effective : ndarray
         Number of independent samples (`effective_samples`).
     white : ndarray
-        Probability that white noise has a lag-one correlation at least as far from zero.
+        p-value of white noise: probability of a lag-one correlation at least as far from zero.
     normal : ndarray
-        Probability that normal residuals have a skewness and kurtosis at least as far from a normal
-        distribution.
+        p-value of normal residuals: probability of a skewness and kurtosis at least as far from the normal values.
     n_samples : ndarray
-        Number of samples that are there.
+        Number of samples, without missing ones.
     channels : tuple of Channel
-        The channels, for names and units of the table; empty if they were not given.
+        The channels, for names and units in the table; empty if they were not given.
     whitened : bool
         Whether a noise model with correlation was already applied, so that the advice must not be to use one.
     """
@@ -91,7 +90,7 @@ class ResidualChecks(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the checks of each channel say, and what to do, in words."""
+        """Result of the checks and advice in words, one text per channel."""
         return tuple(_sentence(*numbers, self.whitened) for numbers in zip(*self[2:7], strict=True))
 
 
@@ -131,11 +130,11 @@ def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
     Returns
     -------
     (3 n_channels,) float, or (2 n_channels + 3 n_gaps n_channels,) float where samples are missing
-        Sums of squares of all channels, then sums of squared differences of successive residuals, then the square of
-        the first plus the square of the last residual [SI unit of the channel, squared]. Where samples are missing:
-        sums of squares of all channels, then the squares of the first residuals, then for each distance of
-        `SampleCounts.gaps` three numbers per channel: over the pairs of neighbours with this distance, the sums of the
-        squares of the later residuals, of the earlier ones, and of their differences.
+        Each for all channels: the sum of squares, the sum of squared differences between successive residuals, and the
+        square of the first plus the square of the last residual [SI unit of the channel, squared]. Where samples are
+        missing, each for all channels: the sum of squares and the square of the first residual; then, for each distance
+        in `SampleCounts.gaps`, three sums over the neighbouring pairs at this distance: squared later residuals,
+        squared earlier residuals, and squared differences.
     """
     if np.isnan(residuals).any():
         return _sums_with_gaps(residuals)
@@ -159,7 +158,7 @@ def _sums_with_gaps(residuals: np.ndarray) -> np.ndarray:
 
 
 def autocorrelation(residuals: np.ndarray) -> np.ndarray:
-    """Autocorrelation at lags of 0, 1, ... samples about a mean of zero, which is the mean of an error.
+    """Autocorrelation at lags of 0, 1, ... samples, about a mean of zero (the mean of an error).
 
     Parameters
     ----------
@@ -169,8 +168,8 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
     Returns
     -------
     (n_channels, n_steps) float
-        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero. Where samples are missing, the mean product of the pairs that
-        are there takes the place of the mean over all pairs; zero at lags without a pair.
+        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero. Where samples are missing, products are averaged over the
+        complete pairs; zero at lags without a pair.
 
     Raises
     ------
@@ -188,7 +187,7 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
 
 
 def _lagged_products(residuals: np.ndarray) -> np.ndarray:
-    """Sums of r_t r_{t+k} divided by the sum of lag zero, (n_channels, n_steps)."""
+    """Sums of r_t r_{t+k} divided by the sum at lag zero, (n_channels, n_steps)."""
     n = residuals.shape[1]
     size = 2 ** (2 * n - 1).bit_length()  # zero padding, so that no lag wraps around
     spectrum = np.fft.rfft(residuals / np.abs(residuals).max(axis=1, keepdims=True), size, axis=1)
@@ -197,13 +196,13 @@ def _lagged_products(residuals: np.ndarray) -> np.ndarray:
 
 
 def _pair_counts(missing: np.ndarray) -> np.ndarray:
-    """Number of pairs of samples at each lag (n_channels, n_steps)."""
+    """Number of complete sample pairs at each lag (n_channels, n_steps)."""
     there = (~missing).astype(float)
     return np.rint(_lagged_products(there) * there.sum(axis=1, keepdims=True))
 
 
 def _pair_shares(missing: np.ndarray) -> np.ndarray:
-    """Number of pairs at each lag, over n (1 - k / s) for n samples in a span of s steps: one if none is missing."""
+    """Complete pairs at each lag, divided by n (1 - k / s) for n samples in a span of s steps; one without gaps."""
     n = missing.shape[1]
     span = n - np.argmax(~missing[:, ::-1], axis=1) - np.argmax(~missing, axis=1)
     inside = np.maximum(1.0 - np.arange(n) / span[:, None], 0.0)
@@ -223,7 +222,7 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
     Returns
     -------
     (n_channels,) float
-        Between one and the number of samples of the channel.
+        Between one and the channel's number of samples.
 
     Raises
     ------
@@ -236,18 +235,18 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
         n_eff = n / (1 + 2 sum_k rho_k^2)
 
-    This is the number for the variance of a mean square, that is for sigma [1]_. It also holds for a parameter whose
-    sensitivity has the same spectrum as the errors; in general, one factor rho_k is the autocorrelation of the
-    sensitivity (compare [2]_). Intervals are therefore too wide for a parameter whose sensitivity varies faster than
-    the errors, and too narrow for one whose sensitivity varies more slowly, such as an offset.
-    `fe_likelihoods.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1)
-    errors the number is n (1 - rho^2) / (1 + rho^2).
+    This is the number for the variance of a mean square, that is for sigma [1]_. It is also valid for a parameter whose
+    sensitivity has the same spectrum as the errors; for other parameters, one factor rho_k must be replaced by the
+    autocorrelation of the sensitivity (compare [2]_). Intervals are therefore too wide for a parameter whose
+    sensitivity varies faster than the errors, and too narrow for a parameter whose sensitivity varies more slowly, such
+    as an offset. `fe_likelihoods.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1) errors
+    the number is n (1 - rho^2) / (1 + rho^2).
 
     The integrated autocorrelation time of a mean, which samplers report, is not suitable: it is less than one for
     oscillating residuals, which are typical of structures.
 
-    Where samples are missing, n is the number of those that are there, and a lag counts by the share of its pairs that
-    are there: n_eff = n / (1 + 2 sum_k s_k rho_k^2), with s_k = 1 where no sample is missing.
+    Where samples are missing, n is the number of samples without them, and each lag is weighted by the share s_k of
+    complete pairs: n_eff = n / (1 + 2 sum_k s_k rho_k^2), with s_k = 1 where no sample is missing.
 
     The sum ends at the first lag of at least five correlation times 1 + 2 sum_k rho_k^2 (Sokal's window), because later
     terms are dominated by estimation errors.
@@ -272,7 +271,7 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
 
 def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
-    """Innovations of an AR(1) process: white, with the standard deviation of the residuals, if they are AR(1).
+    """Innovations of an AR(1) process: if the residuals are AR(1), white with the standard deviation of the residuals.
 
     Parameters
     ----------
@@ -284,8 +283,8 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     Returns
     -------
     (n_channels, n_steps - 1) float
-        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel]. After a gap, with the last sample before it:
-        (r_t - rho^g r_{t-g}) / sqrt(1 - rho^(2 g)); NaN where a sample is missing and for the first one.
+        (r_t - rho r_{t-1}) / sqrt(1 - rho^2) [SI unit of the channel]. After a gap, with the last sample before the
+        gap: (r_t - rho^g r_{t-g}) / sqrt(1 - rho^(2 g)). NaN where r_t is missing or is the channel's first sample.
 
     Raises
     ------
@@ -322,8 +321,8 @@ def residual_checks(
     channels : sequence of Channel, optional
         The channels, one per row: their names and display units are printed in the table.
     whitened : bool
-        True if the rows are what a noise with correlation does not predict: `innovations` of `AutoregressiveNoise`, or
-        the result of ``GaussianNoise.whitened``. The numbers are the same, the sentences advise otherwise.
+        True if the rows were whitened by a noise model: `innovations` for `AutoregressiveNoise`, or the result of
+        ``GaussianNoise.whitened``. The numbers are the same; the advice in the sentences differs.
 
     Returns
     -------
@@ -339,7 +338,7 @@ def residual_checks(
     -----
     The lag-one correlation of n white residuals is approximately normal with standard deviation 1 / sqrt(n). Normality
     is tested with the statistic of Jarque and Bera [1]_, with the effective number of samples instead of n, so that
-    correlation alone does not make the test significant. If `white` or `normal` is below 0.01, look at the figure of
+    correlation alone does not make the test significant. If `white` or `normal` is below 0.01, look at the plots of
     `fe_likelihoods.plot_residuals`.
 
     References
@@ -384,8 +383,8 @@ def plot_residuals(
 ) -> "Figure":
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
 
-    The shaded band holds 95 % of the autocorrelation coefficients of white residuals. The quantiles of normal
-    residuals follow the straight line. Above each row is the verdict of `residual_checks` in words.
+    For white residuals, 95 % of the autocorrelation coefficients are in the shaded band. The quantiles of normal
+    residuals follow the straight line. The text above each row is the verdict of `residual_checks`.
 
     Parameters
     ----------
@@ -437,7 +436,7 @@ def _checked(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> np.ndar
 
 
 def _listed(chosen: np.ndarray, channels: Sequence[Channel]) -> str:
-    """Names of the chosen channels (n_channels,) bool, or their numbers where they are not known."""
+    """Names of the chosen channels (n_channels,) bool, or their numbers if the names are not known."""
     places = np.flatnonzero(chosen).tolist()
     if len(channels) == len(chosen):
         return ", ".join(channels[place].name for place in places)

@@ -1,4 +1,4 @@
-"""Numbers of samples of measurements with missing samples, as the noises need them."""
+"""Sample counts for measurements with missing samples, as the noises need them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,15 +9,15 @@ __all__ = ["SampleCounts", "count_samples", "distinct_gaps", "samples_per_channe
 
 
 class SampleCounts(NamedTuple):
-    """Which samples of measurements are there, in numbers.
+    """Numbers of samples and of the distances between them, for measurements with missing samples.
 
     Attributes
     ----------
     samples : ndarray of int, shape (n_channels,)
-        Number of samples of each channel.
+        Number of samples per channel, without missing ones.
     gaps : ndarray of int, shape (n_gaps,)
-        Distances from one sample to the next that is there, in steps: one where no sample is missing between them. The
-        distances of all channels, each once, ascending.
+        Distances from one sample to the next, in steps: one if no sample is missing between them. The distinct
+        distances in all channels, ascending.
     transitions : ndarray of int, shape (n_gaps, n_channels)
         How often each distance occurs in each channel.
     """
@@ -28,7 +28,7 @@ class SampleCounts(NamedTuple):
 
 
 def count_samples(values: np.ndarray) -> int | SampleCounts:
-    """Numbers of samples of measurements.
+    """Count the samples of measurements.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def count_samples(values: np.ndarray) -> int | SampleCounts:
     Returns
     -------
     int or SampleCounts
-        The number of steps if no sample is missing.
+        The number of steps if no sample is missing, else `SampleCounts`.
     """
     if not np.isnan(values).any():
         return values.shape[1]
@@ -49,10 +49,10 @@ def count_samples(values: np.ndarray) -> int | SampleCounts:
 
 
 def distinct_gaps(places: Sequence[np.ndarray]) -> np.ndarray:
-    """The field `gaps` of `SampleCounts`, shape (n_gaps,), from the places of the samples of each channel."""
+    """The field `gaps` of `SampleCounts`, shape (n_gaps,), from the sample places in each channel."""
     return np.flatnonzero(np.bincount(np.concatenate([np.diff(one) for one in places])))
 
 
 def samples_per_channel(n_samples: int | SampleCounts) -> int | np.ndarray:
-    """Number of samples: of all channels, or (n_channels,) of each."""
+    """Number of samples per channel: one number for all channels, or (n_channels,) where samples are missing."""
     return n_samples.samples if isinstance(n_samples, SampleCounts) else n_samples

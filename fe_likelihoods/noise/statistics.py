@@ -1,4 +1,4 @@
-"""Statistics of the residuals of a simulation: the few numbers that a likelihood needs of a response."""
+"""Statistics of simulation residuals: the few numbers that a likelihood needs instead of the response."""
 
 from collections.abc import Callable
 
@@ -12,24 +12,24 @@ __all__ = ["Statistic", "apply_statistic", "needs_response", "reduce_response", 
 Statistic = Callable[..., np.ndarray]
 """Function of residuals (n_channels, n_samples) that returns (n_numbers,), the sums of squares (n_channels,) first.
 
-Residuals of missing samples are NaN. Which samples are missing is the same for all residuals of a likelihood. With an
-attribute ``of_response`` that is true, it has a second argument, the response at the samples (n_channels, n_samples),
-NaN where one is missing. It must be defined at the top level of a module, so that it can be sent to workers.
+Residuals of missing samples are NaN; the same samples are missing for all residuals of a likelihood. A function with a
+true attribute ``of_response`` also takes the response at the samples (n_channels, n_samples), NaN where one is missing,
+as second argument. It must be defined at the top level of a module, so that it can be sent to workers.
 """
 
 
 def needs_response(statistic: Statistic | None) -> bool:
-    """Whether a statistic is one of the residuals and of the response."""
+    """Whether a statistic takes the response as well as the residuals."""
     return bool(getattr(statistic, "of_response", False))
 
 
 def apply_statistic(statistic: Statistic, residuals: np.ndarray, response: np.ndarray) -> np.ndarray:
-    """Numbers (n_numbers,) of a statistic; residuals and response (n_channels, n_samples) are NaN where missing."""
+    """Numbers (n_numbers,) from a statistic; residuals and response (n_channels, n_samples) are NaN where missing."""
     return statistic(residuals, response) if needs_response(statistic) else statistic(residuals)
 
 
 def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
-    """Number of numbers that a statistic of the residuals has, by default the sums of squares."""
+    """How many numbers a statistic returns; by default for the sums of squares."""
     if isinstance(measured, Comparison) and measured.lags is not None:
         return len(measured.values) * (1 + POINTS * (2 * measured.lags.count + 1))
     values = measured.values if isinstance(measured, Comparison) else measured
@@ -42,7 +42,7 @@ def sums_of_squares(residuals: np.ndarray) -> np.ndarray:
 
 
 def reduce_response(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
-    """Statistic `reduce` (n_numbers,) of a response (n_channels, n_steps) [SI]; NaN for a failed simulation."""
+    """Statistic `reduce` (n_numbers,) for a response (n_channels, n_steps) [SI]; NaN for a failed simulation."""
     with np.errstate(over="ignore", invalid="ignore"):
         if isinstance(measured, Comparison):
             if not np.isfinite(response).all():  # also where no sample is affected

@@ -1,4 +1,4 @@
-"""Unknown time shifts of channels: the clock of a logger differs from the clock of the excitation.
+"""Unknown time shifts of channels, for a data logger whose clock differs from the excitation's clock.
 
 The equations are on the page ``docs/theory/noise.rst``.
 """
@@ -38,13 +38,13 @@ class ShiftedNoise:
 
     Notes
     -----
-    The shift needs no simulation: the statistics of a simulation are sums over all lags of interest. With the residuals
-    e_k at a lag of k steps, the residual at a shift between two lags is sum_i w_i e_(k+i), with the weights w_i of the
-    polynomial of fifth degree through six lags, and its sum of squares is sum_ij w_i w_j G_(k+i, k+j) with
+    A changed shift needs no simulation: the statistics of a simulation are sums over all lags of interest. With the
+    residuals e_k at a lag of k steps, the residual at a shift between two lags is sum_i w_i e_(k+i), with the weights
+    w_i of fifth-degree interpolation between six lags. Its sum of squares is sum_ij w_i w_j G_(k+i, k+j) with
     G_kl = sum_t e_k e_l. The sums G of neighbouring lags are sufficient.
 
-    So that every shift compares the same samples, those within the largest shift of all channels, and three further
-    steps, of an end of the response are left out of the shifted channels.
+    Every shift must compare the same samples. The shifted channels therefore leave out all samples nearer to an end of
+    the response than the largest shift in any channel plus three steps.
     """
 
     noise: GaussianNoise
@@ -53,7 +53,7 @@ class ShiftedNoise:
 
     @property
     def title(self) -> str:
-        """The noise, and the channels with time shifts."""
+        """Title of the noise, and the channels with time shifts."""
         return f"{self.noise.title} with time shifts of {', '.join(self.time_shifts)}"
 
     @property
@@ -78,7 +78,7 @@ class ShiftedNoise:
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> tuple[Noise, np.ndarray]:
         """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.
 
-        A measured channel keeps its unknown shift, another one has none.
+        Measured channels keep their unknown shifts; other channels have none.
         """
         noise, of_noise = self.noise.with_channels(channels, weights)
         names = [channel.name for channel in channels]
@@ -105,7 +105,7 @@ class ShiftedNoise:
         Returns
         -------
         (n,) float
-            As the noise; -inf also where a shift is larger than the largest one.
+            Log-likelihood of the noise; -inf also where a shift exceeds its limit.
         """
         parameters = np.asarray(parameters, dtype=float)
         largest = np.array([shift for _, shift in self.shifts])
@@ -116,7 +116,7 @@ class ShiftedNoise:
         return np.where(possible, values, -np.inf)
 
     def misfit(self, statistics: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """Squared residuals summed (n, n_channels) at the shifts of `parameters`, both as for `log_likelihood`."""
+        """Sums of squared residuals (n, n_channels) at the shifts in `parameters`; arguments: see `log_likelihood`."""
         statistics, parameters = np.asarray(statistics, dtype=float), np.asarray(parameters, dtype=float)
         n_channels = len(self.channels)
         misfit = statistics[:, :n_channels].copy()
@@ -133,13 +133,13 @@ class ShiftedNoise:
 
 
 def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: float) -> Noise:
-    """The noise of a likelihood with unknown time shifts of channels.
+    """A likelihood's noise with unknown time shifts of channels.
 
     Parameters
     ----------
     noise : Noise
     time_shifts : mapping of str to float, or None
-        Largest shifts in both directions [s] by the names of channels; None for those that the noise already has.
+        Largest shifts in both directions [s] by channel name; None keeps the shifts that the noise already has.
     dt : float
         Time step of the model's response [s].
 
@@ -174,7 +174,7 @@ def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: 
 
 
 def _misfit_at(sums: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Sum of squares (n,) at shifts `steps` (n,), in steps, of sums (n, n_lags, POINTS) of products."""
+    """Sum of squared residuals (n,) at shifts `steps` (n,) [steps], from lag products `sums` (n, n_lags, POINTS)."""
     n_lags = sums.shape[1]
     position = steps + n_lags // 2
     first = np.clip(np.floor(position).astype(int) - (POINTS // 2 - 1), 0, n_lags - POINTS)
