@@ -262,7 +262,7 @@ class _Uses:
                 objects += [namespace.get(name, _ABSENT) for name in names]
         for cls in self.classes.values():
             objects += cls.__bases__
-            for name, value in vars(cls).items():
+            for name, value in vars(cls).copy().items():  # other threads may change it
                 if name not in _OF_A_CLASS:
                     objects += name, value
         return objects
@@ -350,15 +350,16 @@ class _Pickler(cloudpickle.Pickler):
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
         name, values = module.__name__, vars(module)
+        present = values.copy()  # other threads may change it
         if name in SCRIPTS:
-            values = {name: values[name] for name in ("__file__", "__package__") if name in values}
+            present = {key: present[key] for key in ("__file__", "__package__") if key in present}
         else:
             self.uses.namespaces[id(values)] = values, None
-            self.uses.unsent |= {id(values[key]): values[key] for key in _OF_THE_IMPORT & values.keys()}
+            self.uses.unsent |= {id(present[key]): present[key] for key in _OF_THE_IMPORT & present.keys()}
             # modules of a package are sent where a function names them
-            values = {key: value for key, value in values.items() if self._module(f"{name}.{key}") is None}
+            present = {key: value for key, value in present.items() if self._module(f"{name}.{key}") is None}
         parent = self._module(name.rpartition(".")[0])
-        sent = {key: self._sendable(key, value) for key, value in values.items() if key not in _OF_THE_IMPORT}
+        sent = {key: self._sendable(key, value) for key, value in present.items() if key not in _OF_THE_IMPORT}
         return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
@@ -376,7 +377,7 @@ class _Pickler(cloudpickle.Pickler):
         used = {}
         if module.__name__ in SCRIPTS:
             self.uses.add_names(vars(module), names.all)
-            used = {name: _new_lock(value) for name, value in vars(module).items() if name in names.all}
+            used = {name: _new_lock(value) for name, value in vars(module).copy().items() if name in names.all}
         imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
         self.uses.modules |= imported
         state = (
