@@ -389,13 +389,12 @@ class SimulationCache:
         """Store the attribute `range_remark` of a model, if it has one and none is stored: a law beyond its range."""
         if text := getattr(model, "range_remark", ""):
             source = source_number(model.fingerprint)
-            row = _remark_key(source), source, text.encode("utf-8", "backslashreplace")
-            self.file.write(STORE_REMARK, [row])
+            key = source.to_bytes(8, "little", signed=True)
+            self.file.write(STORE_REMARK, [(key, source, text.encode("utf-8", "backslashreplace"))])
 
     def look_up_remark(self, model: Model) -> str:
         """Remark of a model; empty if there is none."""
-        key = _remark_key(source_number(model.fingerprint))
-        rows = self.file.select("SELECT text FROM remarks WHERE key = ?", (key,))
+        rows = self.file.select("SELECT text FROM remarks WHERE source = ?", (source_number(model.fingerprint),))
         return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
 
     def repeat_remark(self, model: Model) -> None:
@@ -661,8 +660,3 @@ def _delete_rows(connection: sqlite3.Connection, condition: str, rows: Collectio
     with transaction(connection):
         statements = [f"DELETE FROM {table} WHERE {condition}" for table in TABLES]
         return sum(connection.executemany(statement, rows).rowcount for statement in statements)
-
-
-def _remark_key(source: int) -> bytes:
-    """Key of the remark of a model."""
-    return source.to_bytes(8, "little", signed=True)
