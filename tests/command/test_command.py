@@ -51,9 +51,8 @@ draws = 10
 """
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder with the test of an oscillator, which is the current one."""
+def write_oscillator(folder: Path) -> None:
+    """Record, measurements and settings of the test of an oscillator."""
     from fe_likelihoods import LinearOscillator, table_motion
 
     record = table_motion().trim(0.0, 6.0).resample(0.02)
@@ -61,9 +60,15 @@ def folder(tmp_path, monkeypatch):
     base = [f"{t:.2f},{a!r}" for t, a in zip(record.time, record.acceleration.tolist(), strict=True)]
     rows = enumerate(zip(record.time, *response, strict=True))
     top = [f"{t:.2f},{a + 0.01 * (-1) ** (k // 2):.6f},{d + (-1) ** k:.4f}" for k, (t, a, d) in rows]
-    (tmp_path / "base.csv").write_text("\n".join(["time_s,base_m_s2", *base]))
-    (tmp_path / "top.csv").write_text("\n".join(["time_s,top [g],top [mm]", *top]))
-    (tmp_path / "oscillator.toml").write_text(OSCILLATOR)
+    (folder / "base.csv").write_text("\n".join(["time_s,base_m_s2", *base]))
+    (folder / "top.csv").write_text("\n".join(["time_s,top [g],top [mm]", *top]))
+    (folder / "oscillator.toml").write_text(OSCILLATOR)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the test of an oscillator, which is the current one."""
+    write_oscillator(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,7 +1,9 @@
 """Other events in the TOML file: their predictions, their scores, their errors."""
 
+import contextlib
 import csv
 import re
+import shutil
 import warnings
 
 import numpy as np
@@ -21,7 +23,7 @@ from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
 from fe_likelihoods.prediction.prediction import Prediction
-from tests.command.test_command import OSCILLATOR, call, folder  # noqa: F401
+from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
 
 SETTINGS = OSCILLATOR.replace("draws = 10", "draws = 20")
@@ -37,18 +39,40 @@ rest = "1 s"
 """
 
 
-@pytest.fixture
-def events(folder):  # noqa: F811
-    record = read_csv("base.csv")
+def write_events(folder):  # noqa: F811
+    """Beside the files of the oscillator: measurements of another event, and settings with two events."""
+    record = read_csv(folder / "base.csv")
     response = LinearOscillator(record.scale(0.5), 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
     rows = [f"{t!r},{a!r},{d!r}" for t, a, d in zip(record.time.tolist(), *response.tolist(), strict=True)]
     (folder / "weaker.csv").write_text("\n".join(["time_s,top [g],top [mm]", *rows]))
     (folder / "oscillator.toml").write_text(SETTINGS + EVENTS)
+
+
+@pytest.fixture
+def events(folder):  # noqa: F811
+    write_events(folder)
     return folder
 
 
-def test_events_are_predicted_and_scored(events):
-    said = call("run", "oscillator.toml", "--out", "r", "--quiet")
+@pytest.fixture(scope="module")
+def run_once(tmp_path_factory):
+    """A folder with the files of a run with events, and what the run said."""
+    path = tmp_path_factory.mktemp("events")
+    write_oscillator(path)
+    write_events(path)
+    with contextlib.chdir(path):
+        return path, call("run", "oscillator.toml", "--out", "r", "--quiet")
+
+
+@pytest.fixture
+def finished(run_once, folder):  # noqa: F811
+    """A copy of these files in the current folder."""
+    shutil.copytree(run_once[0], folder, dirs_exist_ok=True)
+    return folder
+
+
+def test_events_are_predicted_and_scored(finished, run_once):
+    events, said = finished, run_once[1]
     assert "event-weaker.txt, event-weaker.csv, event-weaker.png, event-after.txt" in said
     with open("r/event-weaker.csv", newline="") as file:
         rows = {row["channel"]: row for row in csv.DictReader(file)}
@@ -84,14 +108,13 @@ def test_events_are_predicted_and_scored(events):
     assert "The motion meets the structure before any other event" in text
 
 
-def test_report_makes_events_again_without_simulations(events, monkeypatch):
-    call("run", "oscillator.toml", "--out", "r", "--quiet")
-    first = (events / "r" / "event-after.csv").read_text()
+def test_report_makes_events_again_without_simulations(finished, monkeypatch):
+    first = (finished / "r" / "event-after.csv").read_text()
     simulated, one = [], linear_oscillator.respond
     monkeypatch.setattr(linear_oscillator, "respond", lambda *args: simulated.append(args) or one(*args))
-    (events / "r" / "event-after.csv").unlink()
+    (finished / "r" / "event-after.csv").unlink()
     said = call("report", "r")
-    assert "event-after.csv" in said and (events / "r" / "event-after.csv").read_text() == first
+    assert "event-after.csv" in said and (finished / "r" / "event-after.csv").read_text() == first
     assert 0 < len(simulated) <= 8  # verification of a few responses of each excitation, not 20 of each
 
 
@@ -150,8 +173,8 @@ def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monk
     assert {row[0] for row in numbers} == {"after"}
 
 
-def test_remarks_are_in_words_of_the_file_also_in_the_report(events):
-    call("run", "oscillator.toml", "--out", "r", "--quiet")
+def test_remarks_are_in_words_of_the_file_also_in_the_report(run_once):
+    events, _ = run_once
     page = (events / "r" / "report.html").read_text().split('<section id="events">')[1].split("</section>")[0]
     for text in (page, (events / "r" / "event-weaker.txt").read_text()):
         assert "residuals of the calibration are not independent" in text and "effective_samples=" not in text

@@ -1,6 +1,8 @@
 """Kinds of the noise and emcee's sampler in the TOML file."""
 
+import contextlib
 import csv
+import shutil
 
 import emcee
 import numpy as np
@@ -10,7 +12,7 @@ from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
-from tests.command.test_command import OSCILLATOR, ROOT, call, folder  # noqa: F401
+from tests.command.test_command import OSCILLATOR, ROOT, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
 
 SIGMAS = 'sigma_acceleration = "half-normal(0.1 g)"\nsigma_displacement = "half-normal(5 mm)"\n'
@@ -177,19 +179,30 @@ def test_emcee_and_smc_find_the_same_posterior(folder):  # noqa: F811
     assert (np.abs(np.log(ours["sd"] / theirs["sd"])) < 0.25).all()
 
 
+@pytest.fixture(scope="module")
+def two_steps(tmp_path_factory):
+    """A folder with the files in `r` of a run of two steps, and what the run said; tests copy it."""
+    path = tmp_path_factory.mktemp("two_steps")
+    write_oscillator(path)
+    (path / "oscillator.toml").write_text(EMCEE.replace("steps = 60", "steps = 2"))
+    with contextlib.chdir(path):
+        return path, call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
+
+
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps):  # noqa: F811
+def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps, two_steps):  # noqa: F811
     """The autocorrelation time of so few steps is not a number."""
-    (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", f"steps = {steps}"))
-    said = call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
+    folder, said = two_steps if steps == 2 else (folder, "")
+    if steps == 1:
+        (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", "steps = 1"))
+        said = call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
     assert "too few to estimate the autocorrelation time" in said and "Give more `steps`" in said
     assert "nan" not in said and (folder / "r" / "report.html").is_file()
 
 
 @pytest.mark.parametrize("name", ["run.h5", "origin.json", "settings.toml"])
-def test_a_damaged_file_of_a_run_is_named(folder, name):  # noqa: F811
-    (folder / "oscillator.toml").write_text(EMCEE.replace("steps = 60", "steps = 2"))
-    call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
+def test_a_damaged_file_of_a_run_is_named(folder, name, two_steps):  # noqa: F811
+    shutil.copytree(two_steps[0], folder, dirs_exist_ok=True)
     path = folder / "r" / name
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     before = path.read_bytes()
