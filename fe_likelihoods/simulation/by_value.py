@@ -1,14 +1,14 @@
-"""Code and values that travel to other processes by value: a worker computes with what this process has in memory.
+"""User code and its values, sent to other processes by value: a worker computes with what this process has in memory.
 
-Functions, classes and modules of the user are sent as they are now, with the values of their module (`cloudpickle`).
-So a worker has the same globals as this process, whatever its files say, and functions of a notebook and lambdas work.
-The library, installed packages and the standard library are imported by the worker.
+Functions, classes and modules of the user are sent in their present state, with the values of their module
+(`cloudpickle`). So a worker has the same globals as this process, whatever the source files contain, and lambdas and
+notebook functions work. The worker imports this library, installed packages and the standard library.
 
-* A module is sent once, with all of its values, and is found in the worker under its name by functions that import it
-  while they run. Of the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* A value of a module or class that cannot be sent, such as an open file, does not prevent the others from being sent.
-  A simulation that uses it ends the run. A lock becomes a new lock.
-* A worker whose version of this library has other source code refuses everything.
+* A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
+  the script or notebook (``__main__``), only the values that the sent functions use are sent.
+* If a value in a module or class cannot be sent, such as an open file, the other values are sent; a simulation that
+  uses the missing value ends the run. A lock becomes a new lock.
+* A worker refuses everything if its version of this library has different source code.
 """
 
 import builtins
@@ -43,7 +43,8 @@ _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _OF_A_CLASS = {"__dict__", "__weakref__", "_abc_impl", "__abstractmethods__"}
 _DESCRIPTORS = {property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType}
-_CONSTANT = {*_PLAIN, *_LOCKS, types.FunctionType, types.CodeType} | _DESCRIPTORS  # or their contents are seen apart
+# constant, or with contents that are compared separately
+_CONSTANT = {*_PLAIN, *_LOCKS, types.FunctionType, types.CodeType} | _DESCRIPTORS
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _ABSENT = type("Absent", (), {})  # in place of the value of a name that is not defined
 _lock = threading.RLock()
@@ -62,30 +63,30 @@ if hasattr(os, "register_at_fork"):
 
 
 def without_addresses(message: str) -> str:
-    """A message without the addresses of objects, which differ between runs."""
+    """A message without object addresses, which differ between runs."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", message)
 
 
 def is_arriving() -> bool:
-    """Whether an object is being loaded that another process has sent."""
+    """Whether an object from another process is being loaded."""
     return _arriving is not None
 
 
 class Recent(OrderedDict):
-    """The values that were used last, by key: at most 8, and of 256 MiB if there are several."""
+    """The most recently used values, by key: at most 8, with a total of 256 MiB (or one larger value)."""
 
     def __init__(self) -> None:
         super().__init__()
         self._sizes: dict[Any, int] = {}
 
     def use(self, key: Any) -> Any:
-        """The value of a key, which is then the one that was used last; None if it is not kept."""
+        """The value of a key, which becomes the most recently used value; None if it is not kept."""
         if key in self:
             self.move_to_end(key)
         return self.get(key)
 
     def keep(self, key: Any, value: Any, size: int) -> None:
-        """Keep a value of a size [bytes]."""
+        """Keep a value; `size` is in bytes."""
         self[key], self._sizes[key] = value, size
         self.move_to_end(key)
         while len(self) > 8 or (len(self) > 1 and sum(self._sizes[key] for key in self) > 2**28):
@@ -98,9 +99,9 @@ class Pickled(NamedTuple):
     Attributes
     ----------
     payload : bytes
-        Digest of the library, name of the process that sends it, and the pickled function.
+        Digest of the library, name of the sending process, and the pickled function.
     key : bytes
-        Digest of the payload: another function, or other values.
+        Digest of the payload; differs between functions, and after a change of their values.
     """
 
     payload: bytes
@@ -108,9 +109,9 @@ class Pickled(NamedTuple):
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
-        """Pickle a function with everything that it uses, as it is now; ValueError if that is impossible.
+        """Pickle a function with everything that it uses at present; ValueError if that is impossible.
 
-        The pickle of an earlier call is returned if nothing that it depends on has changed.
+        The pickle of an earlier call is returned if nothing that the function depends on has changed.
         """
         try:
             with _lock:
@@ -132,7 +133,7 @@ class Pickled(NamedTuple):
         Raises
         ------
         ValueError
-            If the payload does not match its digest, in which case nothing is unpickled, or cannot be unpickled.
+            If the payload cannot be unpickled, or does not match its digest (then nothing is unpickled).
         ChangedModel
             If this process has imported another version of this library, or a file that the model depends on differs.
         """
@@ -145,7 +146,7 @@ class Pickled(NamedTuple):
                 "install the same version everywhere, and start a new pool"
             )
         with _lock:
-            # a pool may run it in the process that has sent it, whose modules stay as they are
+            # a pool may run the function in the sending process, whose modules must not be replaced
             _arriving = None if self.payload[16:32] == _this_process(os.getpid()) else {}
             try:
                 return Arrived(pickle.loads(memoryview(self.payload)[32:]), _arriving or {})
@@ -164,18 +165,18 @@ def _digest(payload: bytes) -> bytes:
 
 @functools.cache
 def _this_process(pid: int) -> bytes:
-    """Random name of this process; a forked process has another one."""
+    """Random name of this process; a forked process has a different name."""
     return os.urandom(16)
 
 
 class Arrived:
-    """A function that was sent, with the modules of the user that belong to it."""
+    """A function that was sent, with its user modules."""
 
     def __init__(self, function: Any, modules: dict[str, types.ModuleType]) -> None:
         self._function, self._modules = function, modules
 
     def prepare(self) -> None:
-        """Let the modules be found under their names, by functions that import them while they run."""
+        """Put the modules into `sys.modules`, for functions that import them while they run."""
         global _present
         if _present is not self._modules:
             sys.modules.update(self._modules)
@@ -187,7 +188,7 @@ class Arrived:
 
 
 def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
-    """Pickle an object, with code and values of the user by value; `uses` receives what these are."""
+    """Pickle an object, with user code and its values by value; `uses` receives this code and these values."""
     with _lock:
         pickler = _Pickler(file := io.BytesIO(), _Uses() if uses is None else uses)
         try:
@@ -199,7 +200,7 @@ def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
 
 
 def _pickled(function: Any) -> Pickled:
-    """Pickle a function, or find the pickle of an earlier call that has used the same; the lock is held."""
+    """Pickle a function, or find an earlier pickle with the same code and values; the lock is held."""
     seen, header = _snapshot(function), sources_digest() + _this_process(os.getpid())
     known = [each for each in reversed(_sent.values()) if seen[0] is not None and each.seen[0] == seen[0]]
     sent = next((each for each in known if each.pickled.payload.startswith(header) and each.is_unchanged()), None)
@@ -208,7 +209,7 @@ def _pickled(function: Any) -> Pickled:
     uses = _Uses()
     payload = header + dumps(function, uses)
     pickled = Pickled(payload, _digest(payload))
-    # another thread may have changed a value meanwhile, so the first pickle counts when a second one equals it
+    # another thread may have changed a value meanwhile, so a pickle is reused only after a second one was equal
     _sent.keep(pickled.key, _Sent(pickled, seen, uses, sent is not None and sent.pickled == pickled), 3 * len(payload))
     return pickled
 
@@ -218,13 +219,13 @@ class _Sent:
 
     def __init__(self, pickled: Pickled, seen: tuple, uses: "_Uses", is_confirmed: bool) -> None:
         self.pickled, self.seen, self.uses, self.is_confirmed = pickled, seen, uses, is_confirmed
-        self._objects = uses.objects()  # kept, so that no other object has the identities of these
+        self._objects = uses.objects()  # kept, so that no other object gets the same identity
         self._identities = list(map(id, self._objects))
         self._mutable = [x for x in self._objects if type(x) not in _CONSTANT and id(x) not in uses.unsent]
         self._content = _snapshot(self._mutable)
 
     def is_unchanged(self) -> bool:
-        """Whether the code and values that the function uses are those that were pickled."""
+        """Whether the code and values that the function uses are unchanged since they were pickled."""
         if self._content[0] is None or list(map(id, self.uses.objects())) != self._identities:
             return False
         return _snapshot(self._mutable)[0] == self._content[0]
@@ -234,11 +235,11 @@ _sent: "Recent" = Recent()  # by key
 
 
 class _Uses:
-    """Code and values of the user that the pickle of an object contains: to notice that they have changed."""
+    """User code and values that a pickle contains, to notice when they have changed."""
 
     def __init__(self) -> None:
         self.modules: set[str] = set()  # names that were looked up
-        self.namespaces: dict[int, tuple[dict, set[str] | None]] = {}  # of which all values were used, or those named
+        self.namespaces: dict[int, tuple[dict, set[str] | None]] = {}  # with the names in use; None for all names
         self.functions: dict[int, types.FunctionType] = {}
         self.classes: dict[int, type] = {}
         self.unsent: dict[int, Any] = {}  # values that are not, or cannot be, sent
@@ -250,7 +251,7 @@ class _Uses:
             known.update(names)
 
     def objects(self) -> list:
-        """All names, code and values at present."""
+        """The names, code and values in their present state."""
         objects = [sys.modules.get(name) for name in self.modules]
         for function in self.functions.values():
             objects += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
@@ -269,10 +270,10 @@ class _Uses:
 
 
 def _snapshot(thing: Any) -> tuple[bytes | None, list]:
-    """Bytes that differ when an object has changed; functions, classes and modules count by identity.
+    """Bytes that differ when an object has changed; functions, classes and modules are compared by identity.
 
-    Much faster than a pickle by value. The objects whose identities are in the bytes are returned as well: as long as
-    they are kept, no other object has these identities. None for an object that cannot be pickled.
+    Much faster than a pickle by value. The objects compared by identity are returned as well: as long as they are kept,
+    no other object can have the same identity. The bytes are None for an object that cannot be pickled.
     """
     pickler = _Snapshot(file := io.BytesIO())
     try:
@@ -283,7 +284,7 @@ def _snapshot(thing: Any) -> tuple[bytes | None, list]:
 
 
 class _Snapshot(cloudpickle.Pickler):
-    """Pickler in which functions, classes and modules count by identity; it fails for what cannot be sent."""
+    """Pickler that replaces functions, classes and modules by their identity; fails for objects that cannot be sent."""
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
@@ -302,7 +303,7 @@ class _Snapshot(cloudpickle.Pickler):
 
 
 class _Pickler(cloudpickle.Pickler):
-    """Pickler whose functions keep their module: its values and its functions are those of one namespace."""
+    """Pickler whose functions keep their module: all functions of a module share one namespace with its values."""
 
     def __init__(self, file: io.BytesIO, uses: _Uses) -> None:
         super().__init__(file, protocol=5)
@@ -312,7 +313,7 @@ class _Pickler(cloudpickle.Pickler):
         self._of_user: dict[Any, types.ModuleType | None] = {}
 
     def _module(self, name: Any) -> types.ModuleType | None:
-        """A module that is sent, by its name; None if it is imported by the worker."""
+        """The module with a name if it is sent; None if the worker imports it."""
         if name not in self._of_user:
             module = sys.modules.get(name) if isinstance(name, str) else None
             is_sent = is_of_user(module) and module.__name__ == name
@@ -341,7 +342,7 @@ class _Pickler(cloudpickle.Pickler):
         reduced = super().reducer_override(obj)
         if reduced is NotImplemented or len(reduced) != 6:
             return reduced
-        # a new class for each function, since the methods of another one may belong to other values
+        # a new class for each function, since the methods of an earlier class may refer to earlier values
         self.uses.classes[id(obj)] = obj
         make, (*arguments, _, extra), (state, slots), *tail = reduced
         members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
@@ -363,7 +364,7 @@ class _Pickler(cloudpickle.Pickler):
         return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
-        """Reduce a function; one of a module of the user gets the namespace of that module."""
+        """Reduce a function; a user function gets the namespace of its module."""
         module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
         if module is None or vars(module) is not function.__globals__:
             self._module(function.__module__)
@@ -391,7 +392,7 @@ class _Pickler(cloudpickle.Pickler):
         return _new_function, (code, namespace, len(code.co_freevars)), state, None, None, _fill_function
 
     def _sendable(self, name: str, value: Any) -> Any:
-        """A value of a module or class, or what is sent instead if it cannot be pickled."""
+        """A value in a module or class, or its replacement if it cannot be pickled."""
         if isinstance(value, types.FunctionType):
             plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
         else:
@@ -441,7 +442,7 @@ def _resolved(imported: frozenset[str], package: str) -> set[str]:
 
 
 def _named_modules(values: Mapping[str, Any], names: frozenset[str]) -> list[types.ModuleType]:
-    """Modules that a code names, also as ``package.module``, which a worker has to import as well."""
+    """Modules that code names, also as ``package.module``; a worker must import them too."""
     found = []
     for module in [values[name] for name in sorted(names & values.keys())]:
         if isinstance(module, types.ModuleType):
@@ -468,7 +469,7 @@ def _fill_function(function: types.FunctionType, state: tuple) -> None:
 
 
 class _Namespace:
-    """The globals of a module, which are the module's own in the process that receives them."""
+    """The globals of a module; the receiving process uses the globals of its own copy of the module."""
 
     def __init__(self, module: types.ModuleType) -> None:
         self._module = module
@@ -509,7 +510,7 @@ def _new_lock(value: Any) -> Any:
 
 
 def _refuse_a_name(value: Any) -> None:
-    """Raise TypeError if an object is pickled as its name in a module of the user, as compiled functions are."""
+    """Raise TypeError if an object is pickled as its name in a user module, as compiled functions are."""
     if isinstance(value, types.FunctionType | _CACHED):
         return
     reduce = cloudpickle.Pickler.dispatch_table.get(type(value), lambda value: value.__reduce_ex__(4))
@@ -519,7 +520,7 @@ def _refuse_a_name(value: Any) -> None:
 
 
 class _Lock:
-    """A lock, which is a new one in the process that receives it."""
+    """A lock, which becomes a new lock in the receiving process."""
 
     def __init__(self, reentrant: bool) -> None:
         self._reentrant = reentrant
@@ -529,7 +530,7 @@ class _Lock:
 
 
 class NotSent:
-    """Stands in a worker for a value of a module that cannot be sent; `ChangedModel` where it is used."""
+    """Placeholder in a worker for a module value that cannot be sent; raises `ChangedModel` when it is used."""
 
     def __init__(self, name: str, why: str) -> None:
         vars(self).update(name=name, why=why)

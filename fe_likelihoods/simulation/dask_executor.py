@@ -20,11 +20,11 @@ __all__ = ["DaskExecutor", "wait_for_nanny"]
 
 logger = logging.getLogger(__name__)
 
-MAX_ATTEMPTS = 3  # attempts of dask, each of which ends with the death of a number of workers
-SECONDS_FOR_MESSAGES = 0.2  # within which dask reports all tasks that it has given up with a worker
+MAX_ATTEMPTS = 3  # submissions of an item to dask, each of which may cost several workers
+SECONDS_FOR_MESSAGES = 0.2  # until dask has reported all tasks that it has given up with a worker
 SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
-SECONDS_TO_START = 60.0  # within which a worker of a cluster begins to run after it was asked for
-SECONDS_TO_RETURN = 15.0  # within which a nanny starts the process of a worker again
+SECONDS_TO_START = 60.0  # until a worker that was requested from a cluster runs
+SECONDS_TO_RETURN = 15.0  # until a nanny has restarted a worker process
 LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait for a worker of a cluster that has none
 _NO_WORKERS = (
     "the dask cluster has had no worker for {:g} s: start workers or scale the cluster, or wait longer by "
@@ -34,7 +34,7 @@ _DIED = TransientReason("the worker process died in every attempt of dask")
 
 
 class _Item(Future):
-    """Future of one item; `deaths` counts the attempts of dask that ended with the death of the worker."""
+    """Future of one item; `deaths` counts the submissions that dask gave up because the workers died."""
 
     def __init__(self, item: Any, reference: FunctionReference) -> None:
         super().__init__()
@@ -44,22 +44,23 @@ class _Item(Future):
 class DaskExecutor(PoolExecutor):
     """Executor for the cluster of a ``dask.distributed.Client``.
 
-    A task costs dask about 2 ms of all processors, so short simulations are sent in groups of about a second, by the
-    duration of earlier simulations, and single items at last, so that the workers finish together. dask retries a group
-    whose worker died, and gives up after a number of times (``distributed.scheduler.allowed-failures``). It counts the
-    death also against other tasks on that worker. So the items of a group are run again, alone and one after the other,
-    beside those that are not suspected. An item is the cause, and gets ``(None, reason)``, if dask gives it up when it
-    runs alone and has given up no other task meanwhile, or after the third time. Workers that the cluster has given up
-    are started again.
+    A task costs dask about 2 ms of processor time, so short simulations are sent in groups of about one second,
+    estimated from earlier simulations. The last groups are single items, so that the workers finish together.
+
+    If a worker dies, dask retries its tasks on other workers, and gives up a task after several deaths
+    (``distributed.scheduler.allowed-failures``), whichever task on the worker caused them. So the items of a group that
+    was given up are run again, alone and one after the other, while other groups continue. An item is the cause, and
+    gets ``(None, reason)``, if dask gives it up again while it gives up no other task, or for the third time. Workers
+    that the cluster has given up are started again.
 
     Parameters
     ----------
     pool : dask.distributed.Client
     resources : dict of str to float, optional
-        What one simulation takes of the resources that workers were started with, such as ``{"GPU": 1}``.
+        Worker resources that one simulation needs, such as ``{"GPU": 1}``.
     longest_wait : float, optional
         How long simulations wait for a cluster without workers before the run ends with an error [s]; one hour by
-        default. More is needed where jobs wait in the queue of the machine for longer.
+        default. Increase it if jobs wait longer in the queue of the machine.
 
     Raises
     ------
@@ -84,16 +85,16 @@ class DaskExecutor(PoolExecutor):
         self._total, self._done = 0.0, 0
         self._lock = threading.RLock()
         self._sent: dict[Any, tuple[list[_Item], int]] = {}  # by dask's future: items, and losses before
-        self._ended: SimpleQueue = SimpleQueue()  # futures of which dask has reported the end, at last None
+        self._ended: SimpleQueue = SimpleQueue()  # futures that dask has reported as ended; None at the end
         self._suspects: deque[_Item] = deque()
-        self._suspect: Any = None  # the future of the one that runs
+        self._suspect: Any = None  # future of the suspect that runs
         self._losses = 0  # tasks that dask has given up
         self._no_workers: RuntimeError | None = None
         self._workers = _Workers()
 
     @property
     def n_workers(self) -> int | None:
-        """Number of simulations that run at once on the workers that the cluster has at present."""
+        """Number of simulations that run at once on the present workers."""
         if self.resources:
             return self.pool.run_on_scheduler(_places, self.resources) or None
         return sum(self.pool.nthreads().values()) or None
@@ -103,7 +104,7 @@ class DaskExecutor(PoolExecutor):
         return results_of(self.submit_all(function, list(items)), self)
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
-        """As `PoolExecutor.submit_all`; short simulations of one call may be one task."""
+        """As `PoolExecutor.submit_all`; one task may contain several short simulations of one call."""
         reference = self._reference(function)
         futures = [_Item(item, reference) for item in items]
         if not futures:
@@ -148,7 +149,7 @@ class DaskExecutor(PoolExecutor):
         self._sent |= {each: (items, self._losses) for each, items in zip(inner, groups, strict=True)}
         if starts:
             self._ended, self._no_workers = SimpleQueue(), None
-            # not in the threads of dask, for which Python waits at its end: a lost scheduler sends no result
+            # not in dask's threads, which Python joins at exit: it would wait for ever if the scheduler is lost
             for target in (self._receive_all, self._watch):
                 threading.Thread(target=target, args=(self._ended,), name="results of dask", daemon=True).start()
         for each in inner:
@@ -156,7 +157,7 @@ class DaskExecutor(PoolExecutor):
         return inner
 
     def _forget(self, inner: Iterable[Any], goes_on: bool = False) -> None:
-        """Groups have ended, and the next suspect is tried if others go on; the lock is held."""
+        """Forget groups that have ended; with `goes_on`, start the next suspect. The lock is held."""
         for each in inner:
             self._sent.pop(each, None)
         if self._suspect not in self._sent:
@@ -171,7 +172,7 @@ class DaskExecutor(PoolExecutor):
     # in threads of their own --------------------------------------------------------------------------------------
 
     def _receive_all(self, ended: SimpleQueue) -> None:
-        """Receive groups as they end, those that have ended meanwhile together, until none is left."""
+        """Receive groups as they end, several at once if possible, until none is left."""
         inner: list = []
         while None not in inner:
             inner = [ended.get()]
@@ -186,7 +187,7 @@ class DaskExecutor(PoolExecutor):
                 self._receive(each, self._sent.get(each, ((), 0))[0], answers.get(each))
 
     def _receive(self, inner: Any, items: Sequence[_Item], answer: tuple[list, float] | None) -> None:
-        """Pass on the outcomes of a group, or the error; there are no items if they were given up meanwhile."""
+        """Pass on a group's outcomes or error; there are no items if they were given up meanwhile."""
         if not items:
             return
         try:
@@ -212,7 +213,7 @@ class DaskExecutor(PoolExecutor):
                 resolve(item, outcome, failure)
 
     def _lose(self, inner: Any) -> None:
-        """Give up the item of a task whose worker died in every attempt, or suspect the items."""
+        """A task was given up because its workers died: its item has failed, or its items become suspects."""
         time.sleep(SECONDS_FOR_MESSAGES)
         with self._lock:
             items, losses_before = self._sent.get(inner, ((), 0))
@@ -227,7 +228,7 @@ class DaskExecutor(PoolExecutor):
             self._forget([inner], goes_on=True)
 
     def _watch(self, ended: SimpleQueue) -> None:
-        """While items are waited for: ask for workers that are lost, and cancel everything after a time without any."""
+        """Until all items have ended: request lost workers again; cancel all items after too long without workers."""
         last_seen = time.monotonic()
         while True:
             time.sleep(SECONDS_BETWEEN_CHECKS)
@@ -246,21 +247,21 @@ class DaskExecutor(PoolExecutor):
 
 
 class _Workers:
-    """Workers of a cluster that were here, and since when others are absent.
+    """Which workers of a cluster have started, and since when workers are absent.
 
-    A cluster of dask closes the nanny of a worker that is absent at the instant 15 s after it was lost
-    (``distributed.deploy.lost-worker-timeout``), and never starts it again: on a busy machine the new process may need
-    longer, or a simulation has killed it once more. So it is asked for again, and so is one that has not started within
-    `SECONDS_TO_START`. A job of dask-jobqueue with several workers that has ended, as by its walltime, is never noticed
-    by the cluster. It is submitted again if its workers were here and are gone; one in the queue is left alone.
+    If a worker is absent 15 s after it was lost (``distributed.deploy.lost-worker-timeout``), dask closes its nanny and
+    never starts the worker again, although on a busy machine the new process may need longer, or a simulation may have
+    killed it once more. So the worker is requested again, as is a worker that has not started within
+    `SECONDS_TO_START`. A dask-jobqueue cluster never notices that a job with several workers has ended, for example at
+    its walltime. The job is submitted again if its workers were present and are gone; queued jobs are left alone.
     """
 
     def __init__(self) -> None:
         self._started: set = set()
-        self._seen: dict[Any, float] = {}  # when they were last here, or asked for
+        self._seen: dict[Any, float] = {}  # when a worker was last present, or requested
 
     def note(self, cluster: Any) -> tuple[dict, set, set]:
-        """Workers and jobs that the cluster wants, those that it has, and those that are here."""
+        """Workers and jobs: wanted by the cluster, known to it, and present with a process."""
         wanted, present = (
             dict(getattr(cluster, "worker_spec", None) or {}),
             set(getattr(cluster, "workers", None) or ()),
@@ -275,7 +276,7 @@ class _Workers:
         return wanted, present, here
 
     def ask_for_lost(self, cluster: Any) -> None:
-        """Ask a cluster for what it should have by its own specification, and has given up."""
+        """Request the workers and jobs that a cluster has given up although its specification contains them."""
         wanted, present, here = self.note(cluster)
         absent = {name: time.monotonic() - seen for name, seen in self._seen.items() if name not in here}
         jobs = {name for name in wanted if "group" in wanted[name]}
@@ -305,7 +306,7 @@ def _places(resources: dict[str, float], dask_scheduler: Any) -> int:
 
 
 def _run_group(function: Callable, items: list) -> tuple[list, float]:
-    """Outcomes of the items of a group, and their total duration [s]; called in the worker."""
+    """Outcomes of a group's items, and their total duration [s]; called in the worker."""
     wait_for_nanny()
     start = time.perf_counter()
     return [function(item) for item in items], time.perf_counter() - start
@@ -315,13 +316,13 @@ def _run_group(function: Callable, items: list) -> tuple[list, float]:
 def wait_for_nanny() -> None:
     """Wait once per process, because dask's nanny does not replace a worker that dies before its start is reported.
 
-    An item that kills every new worker at once would otherwise leave a cluster without workers, and the run would hang.
+    Without this wait, an item that kills every new worker at once could leave a cluster without workers.
     """
     time.sleep(0.5)
 
 
 def _groups(items: list, n_workers: int, largest: int) -> list[list]:
-    """Groups of items: each is half of a worker's share of the remaining items, at least one and at most `largest`."""
+    """Groups of items: each has half a worker's share of the remaining items, at least one and at most `largest`."""
     groups = []
     while items:
         size = min(max(1, len(items) // (2 * n_workers)), max(1, largest))

@@ -1,4 +1,4 @@
-"""Executors: a common ``map`` and ``submit`` over any pool, which runs simulations in other processes or on machines.
+"""Executors: the same ``map`` and ``submit`` for all pools, which run simulations in other processes or machines.
 
 The rule for ``pool=``:
 
@@ -10,15 +10,15 @@ The rule for ``pool=``:
   multiprocessing and schwimmbad.
 
 The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
-is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once: through the worker's own pipe in a
-`LocalPool`, through a private temporary file, whose digest is checked, in other pools on the same machine, and together
-with the items where a worker reports that it has neither the function nor the file. Later tasks consist of a digest of
-the function and the parameters. A function is sent again when anything that it uses has changed.
+is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once: in a `LocalPool` through the
+worker's pipe, in other pools on the same machine through a private temporary file, whose digest is checked. A worker
+that has neither the function nor the file gets the function together with the items. Later tasks consist of the
+function's digest and the parameters. A function is sent again when anything that it uses has changed.
 
-``submit(function, item)`` returns a `concurrent.futures.Future` of the result that ``map`` would give, also where an
-item kills every process that runs it, and ``submit_all(function, items)`` a list of them. ``give_up(futures)`` cancels.
-`concurrent.futures.as_completed` gives whichever ends first. A pool that has ``map`` only cannot do this; the attribute
-``submits`` says so.
+``submit(function, item)`` returns a `concurrent.futures.Future` with the result that ``map`` would return, even if the
+item kills every process that runs it. ``submit_all(function, items)`` returns a list of futures, and
+``give_up(futures)`` cancels futures. Futures work with `concurrent.futures.as_completed`. A pool that only has ``map``
+cannot submit items; the attribute ``submits`` is then False.
 
 Results do not depend on the pool, to the last bit.
 """
@@ -46,7 +46,7 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | Poo
     -------
     LocalPool, DaskExecutor, PoolExecutor or None
         None for None, otherwise an object whose ``map(function, items)`` returns a list. The functions must return an
-        `Outcome`; an item that kills every process that runs it gets one as well, if the pool survives.
+        `Outcome`; an item that kills every process that runs it also gets an `Outcome`, if the pool survives.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | Poo
 
 
 def _check_picklable(model: Any) -> None:
-    """Raise ValueError, with the name of the attribute to blame, if a model cannot be sent to other processes."""
+    """Raise ValueError, naming the attribute at fault, if a model cannot be sent to other processes."""
     try:
         Pickled.of(model)
     except ValueError as error:
@@ -77,7 +77,7 @@ def _check_picklable(model: Any) -> None:
 
 
 def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
-    """Name and value of the innermost attribute of an object that cannot be pickled."""
+    """Name and value of an object's innermost attribute that cannot be pickled."""
     try:
         state = thing.__getstate__()
     except Exception:

@@ -1,12 +1,12 @@
-"""Reasons of failed simulations, and which of them are answers of the model.
+"""Reasons of failed simulations: failures of the model, and faults of the infrastructure.
 
-A failed simulation has a reason in words. A plain `str` is an answer of the model: the exception that it raised, a
+A failed simulation has a reason in words. A plain `str` is a failure of the model: the exception that it raised, a
 response with NaN, a wrong shape, the exit code of a program. It depends on the parameters alone and is stored in a
 cache on disk.
 
-A `TransientReason` is a fault of the infrastructure: a process that was killed or crashed, a limit of time, memory or
-output, a full disk, a missing folder or library. The log-likelihood is -inf in this run, but the next run simulates the
-point again. A `MisfitReason` depends on the measurements, so that it says nothing about other measurements.
+A `TransientReason` is a fault of the infrastructure: a process that was killed or crashed, a time, memory or output
+limit, a full disk, a missing folder or library. The log-likelihood is -inf in this run, but the next run simulates the
+point again. A `MisfitReason` depends on the measurements, so it does not apply to other measurements.
 """
 
 import dis
@@ -61,12 +61,12 @@ class RunFailed(FailedRun):
 
 
 class ChangedModel(ValueError):
-    """A model is not the one whose fingerprint was computed. The message says what to do.
+    """A model has changed since its fingerprint was computed. The message says what to do.
 
     Attributes
     ----------
     ends_run : bool
-        True: samplers stop, since no other point can be evaluated either.
+        True: samplers stop, since no point can be evaluated any more.
     """
 
     ends_run = True
@@ -80,7 +80,7 @@ class TransientReason(str):
     text : str
         The reason.
     time_limit : float
-        The limit that stopped the simulation [s]; 0 where no time limit was the cause.
+        The time limit that stopped the simulation [s]; 0 for other causes.
 
     Attributes
     ----------
@@ -108,17 +108,17 @@ class MisfitReason(str):
 
 
 def is_transient(error: BaseException) -> bool:
-    """Whether an exception is a fault of the infrastructure, such as a full disk, and not an answer of the model."""
+    """Whether an exception is a fault of the infrastructure, such as a full disk, not a failure of the model."""
     if isinstance(error, subprocess.CalledProcessError):
         return error.returncode < 0  # killed by a signal
     return isinstance(error, _FAULTS)
 
 
 def raise_if_it_ends_the_run(error: BaseException) -> None:
-    """Raise what must not become a failed simulation: `ChangedModel`, and Ctrl-C of the user.
+    """Raise exceptions that must not become a failed simulation: `ChangedModel`, and the user's Ctrl-C.
 
-    A model that calls ``sys.exit`` or itself raises KeyboardInterrupt has failed. Ctrl-C interrupts the code at any
-    place, not at a ``raise`` statement; a model may have turned it into another exception.
+    A model that calls ``sys.exit``, or raises KeyboardInterrupt by a ``raise`` statement, has failed. Ctrl-C interrupts
+    code elsewhere; it is also found as the cause of another exception that the model raised.
     """
     if isinstance(error, ChangedModel):
         raise error
@@ -144,7 +144,7 @@ def _is_raised(error: BaseException) -> bool:
 
 
 def reason_of(error: BaseException) -> str:
-    """Reason of the failure of a simulation that raised an exception.
+    """Failure reason for a simulation that raised an exception.
 
     Parameters
     ----------

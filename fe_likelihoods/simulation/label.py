@@ -1,19 +1,18 @@
-"""Label of a model: what its results are seen to depend on besides its declared identity.
+"""Label of a model: the code, files and versions that its results depend on, besides its declared identity.
 
 Stored simulations belong to a declared identity, the fingerprint of the model: class, parameters, channels, excitation,
-``version=`` and ``depends_on=``. Whether the code behind it still computes the same is decided by simulating some of
-them again (`fe_likelihoods.cache.verification`). The label only asks for it: rows that were stored under a known label
-are trusted after a few simulations, an unknown label needs many. So a label may miss something, and may change without
-need. It contains
+``version=`` and ``depends_on=``. Whether the code still computes the same results is verified by repeating some stored
+simulations (`fe_likelihoods.cache.verification`). The label only sets how many: a few for rows that were stored under a
+known label, many for an unknown label. So a label may be incomplete, and may change without need. It contains
 
-* the user's functions, classes and values by value: those of the model, and those that their code names,
-* the source files of the user's modules among them, without comments, and the versions of installed packages,
+* user functions, classes and values by value: the parts of the model, and everything that their code names,
+* the source files of the user modules among them, without comments, and the versions of installed packages,
 * environment variables whose names occur in this code,
 * the source files of this library that simulations depend on,
 * what simulations of the model opened while they ran (`fe_likelihoods.simulation.opened`).
 
-The bytes of cloudpickle are not used, because they are not the same in two processes: they contain random identifiers
-of classes, the order of sets, and the file names of notebook cells.
+Pickles by cloudpickle are not used, because their bytes differ between processes: they contain random class
+identifiers, sets in varying order, and file names of notebook cells.
 """
 
 import ast
@@ -45,7 +44,7 @@ __all__ = [
 ]
 
 SOURCES = ("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "noise/*.py", "units.py")
-MOST_OBJECTS = 1_000_000  # of one value; the rest is left out
+MOST_OBJECTS = 1_000_000  # in one value; further objects are left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
 _WRAPPED = ("__func__", "__self__", "fget", "fset", "fdel", "func", "args", "keywords", "__wrapped__", "cell_contents")
 _WRAPPERS = (
@@ -69,8 +68,8 @@ _OF_CLASSES = {
     "__firstlineno__",
     "__static_attributes__",
 }
-_DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # of a class, which it may change when it runs
-_OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # change without a meaning for simulations
+_DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
+_OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
 _first: dict[str, str] = {}  # digests of values that code changes when it runs, at the time of the first label
 _opened: dict[str, Opened] = {}  # by code, in this process
@@ -78,14 +77,14 @@ _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
 
 class ModelLabel:
-    """Label of a model as it is now, completed by its simulations.
+    """Label of a model in its present state, completed by its simulations.
 
     Parameters
     ----------
     model : Model
-        Its own code is the mapping ``code_parts()`` where it has this method; for other models of the user, the object.
+        Its code is the mapping ``code_parts()`` if it has this method; for other user models, the object itself.
     statistic : function, optional
-        The statistic of the residuals that is stored.
+        The residual statistic that is stored.
 
     Attributes
     ----------
@@ -94,7 +93,7 @@ class ModelLabel:
     opened : Opened
         What simulations opened.
     observes : bool
-        Whether simulations are observed, since they may run code of the user.
+        Whether simulations are observed, since they may run user code.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
@@ -102,7 +101,7 @@ class ModelLabel:
         now = self._present(model)
         self.items = now | {name: digest for name, digest in _first.items() if name in now}
         self.observes = _has_user_code(model) or (statistic is not None and _defined_by_user(statistic))
-        # a module is imported by the first simulation of a process only, so what that opened counts for later labels
+        # only the first simulation of a process imports a module, so the files it opened belong to later labels too
         self.opened, self._was_observed = _opened.get(self.code, Opened({})).read_again(), False
 
     @property
@@ -112,7 +111,7 @@ class ModelLabel:
 
     @property
     def identity(self) -> str:
-        """Digest of the code and values alone, without versions of Python and of this library."""
+        """Digest of code and values only, without the versions of Python and this library."""
         from ..kernels.jit import KERNEL_HASH  # late, because it imports numba
 
         items = {name: digest for name, digest in self.items.items() if name not in ("python", "library")}
@@ -120,16 +119,16 @@ class ModelLabel:
 
     @property
     def text(self) -> str:
-        """The whole label: `code`, and a digest of what was opened."""
+        """The whole label: `code`, and a digest of the opened files."""
         return f"{self.code} {_joined(self.opened.items())}"
 
     @property
     def known(self) -> Opened | None:
-        """What simulations of this process opened; None before the first."""
+        """What simulations of this process opened; None before the first simulation."""
         return self.opened if self._was_observed else None
 
     def add(self, opened: Opened | None, here: bool = True) -> bool:
-        """Add what simulations opened, in this process or `here` = False earlier; returns whether it was new."""
+        """Add what simulations opened (`here`: in this process); returns whether there was anything new."""
         self._was_observed = self._was_observed or (here and opened is not None)
         if opened is None or opened.files.keys() <= self.opened.files.keys():
             return False
@@ -138,13 +137,13 @@ class ModelLabel:
         return True
 
     def changed(self, model: Any) -> set[str]:
-        """Names of the items that differ from what the label says."""
+        """Names of the items that differ from the label."""
         known = self.items | self.opened.items()
         now = self._present(model) | self.opened.read_again().items()
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
-        """State that simulations change some items, which keep their first digests in later labels of this process."""
+        """Record that simulations change some items; later labels of this process keep their first digests."""
         note_own_changes(self.items, dict.fromkeys(names, ""))
 
     @property
@@ -153,7 +152,7 @@ class ModelLabel:
         return self.items.keys() & _first.keys()
 
     def renew(self, model: Any) -> None:
-        """Take the present state of everything as the label."""
+        """Update the label to the present state."""
         known, now = self.items, self._present(model)
         # the same objects where nothing has changed, so that pickles stay small
         same = {name: digest for name, digest in known.items() if now.get(name) == digest}
@@ -170,7 +169,7 @@ class ModelLabel:
 
 
 def _parts_of(model: Any) -> dict[str, Any]:
-    """Class of the user, and attributes of an object; a time limit changes no response."""
+    """User class and attributes of an object, without the time limit, which changes no response."""
     name = type(model).__qualname__
     attributes = {attribute: value for attribute, value in _state(model).items() if attribute != "time_limit"}
     return {"class": type(model)} | {f"{name}().{attribute}": value for attribute, value in attributes.items()}
@@ -181,12 +180,12 @@ def _defined_by_user(function: Any) -> bool:
 
 
 def _has_user_code(model: Any) -> bool:
-    """Whether a model may run code of the user."""
+    """Whether a model may run user code."""
     return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
 
 
 def cpu_name() -> str:
-    """Name of the processor that simulations run on; results on another one may differ in their last digits."""
+    """Name of the processor that simulations run on; on another processor, the last digits of results may differ."""
     asked = [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE")]
     return " ".join(filter(None, [_processor(), *asked]))
 
@@ -197,7 +196,7 @@ def value_digest(value: Any) -> str:
     Raises
     ------
     ValueError
-        If the value contains an object of which only the type is known, such as an open file.
+        If the value contains an object whose content cannot be read, such as an open file.
     """
     walk = _Walk()
     items = walk.items({"value": value})
@@ -207,18 +206,18 @@ def value_digest(value: Any) -> str:
 
 
 def items_of(parts: Mapping[str, Any]) -> dict[str, str]:
-    """Digests of some values, and of the functions, values, files, packages and variables that their code names."""
+    """Digests of values, and of all functions, values, files, packages and variables that their code names."""
     return _Walk().items(parts)
 
 
 def steady_digest(parts: Mapping[str, Any]) -> str:
-    """Digest of `items_of`, in which values that simulations of this process have changed are those before them."""
+    """Digest of `items_of`, with the original digests of values that simulations of this process have changed."""
     items = items_of(parts)
     return _joined(items | {name: digest for name, digest in _first.items() if name in items})
 
 
 def note_own_changes(before: Mapping[str, str], after: Mapping[str, str]) -> None:
-    """State that simulations have changed what differs between two results of `items_of`."""
+    """Record that simulations have changed the items that differ between two results of `items_of`."""
     for name in before.keys() & after.keys() - _PARTS:
         if before[name] != after[name]:
             _first.setdefault(name, before[name])
@@ -229,7 +228,7 @@ def _joined(items: Mapping[str, str]) -> str:
 
 
 class _Walk:
-    """Digests of values. Named functions, classes and variables of the user's modules become items of their own."""
+    """Digests of values. Named functions, classes and variables in user modules become separate items."""
 
     def __init__(self) -> None:
         self.opaque: set[str] = set()
@@ -239,7 +238,7 @@ class _Walk:
         self._library: set[str] = set()
         self._words: set[str] = set()
         self._done: dict[int, tuple[bytes, Any]] = {}
-        self._open: dict[int, int] = {}  # places on the way from the value to what is added now
+        self._open: dict[int, int] = {}  # depth of the objects that contain the object being added
 
     def items(self, parts: Mapping[str, Any]) -> dict[str, str]:
         """Digests by name."""
@@ -252,7 +251,7 @@ class _Walk:
                 if isinstance(value, str):  # a command or an input file of a program
                     self._words |= set(re.findall(r"\w+", value))
         for module in self._all_modules():
-            if module.__name__ not in SCRIPTS:  # a script is represented by what the model uses
+            if module.__name__ not in SCRIPTS:  # of a script, only the parts that the model uses count
                 items[f"source of {module.__name__}"], words = _source(module)
                 self._words |= words
         for module in self._library:
@@ -264,7 +263,7 @@ class _Walk:
         return items
 
     def _all_modules(self) -> Iterable[types.ModuleType]:
-        """The user's modules that were met, and those that they name."""
+        """The user modules found so far, and the user modules that they name."""
         waiting = list(self._modules)
         while waiting:
             module = self._modules[waiting.pop()]
@@ -296,7 +295,7 @@ class _Walk:
             self._hash.update(self._apart(value))
 
     def _apart(self, value: Any) -> bytes:
-        """Digest of one value, the same for equal values, whether they are one object or several."""
+        """Digest of one value; equal values have equal digests, whether they are one object or several."""
         if id(value) not in self._done:
             outer, self._hash = self._hash, blake2b(digest_size=8)
             self._open[id(value)] = len(self._open)
@@ -344,7 +343,7 @@ class _Walk:
             self._add(value())
         elif isinstance(value, logging.Logger):
             self._text(value.name)
-        elif kind.__module__.partition(".")[0] == "numba":  # what was compiled changes with its use
+        elif kind.__module__.partition(".")[0] == "numba":  # the compiled variants change with use
             self._add(_attribute(value, "py_func") or _attribute(_attribute(value, "_dispatcher"), "py_func"))
         else:
             self._add_object(value)
@@ -355,7 +354,7 @@ class _Walk:
         self._text("end")
 
     def _add_code(self, code: types.CodeType) -> None:
-        """Without the names of local variables, lines, and the name of the file."""
+        """Add code without local variable names, line numbers and file name."""
         arguments = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
         self._text(repr((code.co_name, code.co_names, arguments, code.co_freevars, code.co_flags)))
         self._hash.update(code.co_code)
@@ -390,7 +389,7 @@ class _Walk:
                 self._add(member)
 
     def _add_module(self, module: types.ModuleType) -> None:
-        """Data of a module of the user by value; its functions and classes are in its source."""
+        """Add the data of a user module by value; its functions and classes are in its source."""
         self._text(module.__name__)
         for name, value in list(vars(module).items()) if self._is_of_user(module.__name__) else ():
             if not name.startswith("__") and not isinstance(value, types.ModuleType | type | types.FunctionType):
@@ -401,7 +400,7 @@ class _Walk:
         if is_of_user(type(value).__module__) or isinstance(value, types.SimpleNamespace):
             self._add_state(value)
             return
-        try:  # the parts from which pickle would make it
+        try:  # the parts that pickle would rebuild it from
             for part in _parts(value.__reduce_ex__(2)):
                 self._add(part)
         except RecursionError:
@@ -416,7 +415,7 @@ class _Walk:
             self._add(part)
 
     def _is_of_user(self, module: str) -> bool:
-        """Whether a module is the user's; a package is represented by its version, Python by that of Python."""
+        """Whether a module is the user's; other modules are noted, and represented by versions or source digests."""
         top = module.partition(".")[0]
         if is_of_user(module):
             self._modules.update({module: sys.modules[module]} if module in sys.modules else {})
@@ -429,19 +428,19 @@ class _Walk:
 
 
 def _name_of(module: str) -> str:
-    """Name of a module; a script has another one in worker processes."""
+    """Name of a module; ``__main__`` for a script, which has a different name in worker processes."""
     return "__main__" if module in SCRIPTS else module
 
 
 def _parts(reduced: Any) -> list[Any]:
-    """Parts of the result of ``__reduce_ex__``, its iterators as lists."""
+    """Parts of a ``__reduce_ex__`` result, with iterators as lists."""
     if isinstance(reduced, str):
         return [reduced]
     return [list(part) if place in (3, 4) and part is not None else part for place, part in enumerate(reduced)]
 
 
 def _state(value: Any) -> dict[str, Any]:
-    """Attributes of an object, those in slots included."""
+    """Attributes of an object, including slots."""
     found = dict(_attribute(value, "__dict__") or {})
     for cls in type(value).__mro__:
         slots = vars(cls).get("__slots__", ())
@@ -452,7 +451,7 @@ def _state(value: Any) -> dict[str, Any]:
 
 
 def _attribute(value: Any, name: str) -> Any:
-    """An attribute that is found without code of the user; None if there is none."""
+    """An attribute, found without running user code; None if there is none."""
     try:
         return object.__getattribute__(value, name)
     except (AttributeError, ValueError):  # an empty cell raises ValueError
@@ -460,7 +459,7 @@ def _attribute(value: Any, name: str) -> Any:
 
 
 def _global_names(code: types.CodeType) -> set[str]:
-    """Names in a code and in the codes inside it."""
+    """Names in a code object and in the code objects inside it."""
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -469,7 +468,7 @@ def _global_names(code: types.CodeType) -> set[str]:
 
 
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
-    """Digest of the source file of a module, as it was when it was first read, and the words in it."""
+    """Digest of a module's source file when it was first read, and the words in it."""
     file = getattr(module, "__file__", None)
     if file is None:
         return "", frozenset()
@@ -503,5 +502,5 @@ def _processor() -> str:
     name, flags = (re.search(pattern, text, re.MULTILINE) for pattern in patterns)
     if name is None:
         return f"{platform.machine()} {platform.processor()}"
-    # virtual machines give different processors one name
+    # virtual machines may give different processors the same name, so the flags are added
     return name.group(1) + (f" {blake2b(flags.group(1).encode(), digest_size=4).hexdigest()}" if flags else "")

@@ -1,8 +1,8 @@
-"""Pool of processes of this machine that survives the death of its workers.
+"""Pool of local processes that survives the death of its workers.
 
-When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here each process
-has a pipe and a thread of this process, which sends it one item at a time. So it is known which item a process was
-running. Only that item is run again, and it is given up after the third time.
+When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here every worker
+has a pipe and a thread in this process, which sends it one item at a time. So the item that a dead worker was running
+is known. Only this item is run again, and it is given up after the third death.
 """
 
 import math
@@ -20,7 +20,7 @@ from .worker import Worker, WorkerDied
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
 MAX_ATTEMPTS = 3
-_LINGER = 0.1  # [s] for which a thread waits for another item before it ends; its start takes as long as a short item
+_LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
@@ -28,7 +28,7 @@ Outcome = tuple[Any, str]
 
 
 def results_of(futures: Sequence[Future], executor: Any) -> list[Any]:
-    """Results of futures; after the first exception, which is raised, and after Ctrl-C the others are given up."""
+    """Results of futures; at the first exception, which is raised, and at Ctrl-C, the other futures are given up."""
     try:
         for future in wait_for(futures, return_when=FIRST_EXCEPTION).done:
             future.result()
@@ -48,7 +48,7 @@ class _Job(Future):
         self.given_up = False
 
     def start(self) -> bool:
-        """Whether it is to be run, for the first time or again; a job that was given up ends."""
+        """Whether the job is to be run, for the first time or again; ends the job if it was given up."""
         if self.given_up:
             self.set_exception(CancelledError())
             return False
@@ -63,15 +63,15 @@ def _is_positive_whole(value: Any) -> bool:
 
 
 class LocalPool:
-    """Pool of processes of this machine.
+    """Pool of local processes.
 
     The processes start with the first item. They end with `close`, when this object is garbage-collected, or when this
     process ends, even if it is killed (on macOS within a second, unless compiled code keeps the process busy). A
     process that dies is replaced and its item run again; the other items are not affected. Linear algebra and numba use
-    one thread per process, unless environment variables such as OMP_NUM_THREADS say otherwise.
+    one thread per process, unless environment variables such as OMP_NUM_THREADS are set.
 
-    Functions are sent by value, with the values of their modules at that time
-    (`fe_likelihoods.simulation.by_value`), so lambdas and functions of a script or notebook can be used.
+    Functions are sent by value, with the present values of their modules (`fe_likelihoods.simulation.by_value`), so
+    lambdas and functions of a script or notebook can be used.
 
     A pool can be shared by several likelihoods, and can be the ``pool=`` of samplers. Its methods may be called from
     several threads.
@@ -81,8 +81,8 @@ class LocalPool:
     workers : int
         Number of processes.
     runs_per_process : int, optional
-        Number of items after which a process is replaced by a new one, which limits the memory that leaks in compiled
-        code of a model; never by default.
+        Number of items after which a process is replaced, which limits memory leaks in compiled models; never by
+        default.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class LocalPool:
         return self.workers
 
     def close(self) -> None:
-        """Give up all items and end the processes; another item starts new ones."""
+        """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
         with self._changed:
             self._closed += 1
@@ -150,7 +150,7 @@ class LocalPool:
                 self._free.pop().kill()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-        """Results of a function for every item, in their order; they run before items that were submitted.
+        """Results of a function for every item, in order; these items run before items that were submitted.
 
         An item whose process died three times gets the `Outcome` ``(None, reason)``.
 
@@ -166,18 +166,18 @@ class LocalPool:
         return results_of(self._enqueue(function, list(items), first=True), self)
 
     def submit(self, function: Callable[[Any], Any], item: Any) -> Future:
-        """Future of the result of a function for one item, as `map` gives it.
+        """Future with the result of a function for one item, as returned by `map`.
 
-        ``cancel()`` of the future has an effect until the item is sent to a process.
+        ``cancel()`` has an effect until the item is sent to a process.
         """
         return self.submit_all(function, [item])[0]
 
     def submit_all(self, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Future]:
-        """Futures as of `submit` for several items; ValueError if the function cannot be sent to the processes."""
+        """Futures as from `submit`, for several items; ValueError if the function cannot be sent to the processes."""
         return self._enqueue(function, items)
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
-        """Cancel items; with `running`, the processes of those that run are killed. Results that are there are kept."""
+        """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
         self._notice_fork()
         for job in futures:
             if not job.cancel() and running:
@@ -214,7 +214,7 @@ class LocalPool:
     # in a thread per worker -----------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Run items, one after the other, in one process until none waits."""
+        """Run items one after the other in this thread's process, until none is waiting."""
         worker, job = self._first_job(None)
         while job is not None:
             try:
@@ -227,7 +227,7 @@ class LocalPool:
             worker, job = self._first_job(worker)
 
     def _first_job(self, worker: Worker | None) -> tuple[Worker | None, _Job | None]:
-        """The item that waits first; None if the thread ends. The process is free while there is no item."""
+        """The first waiting item; None if the thread ends. The process is free while there is no item."""
         closed = self._closed
         with self._changed:
             while True:
@@ -248,7 +248,7 @@ class LocalPool:
                     return None, None
 
     def _loaded(self, worker: Worker | None, function: Pickled) -> Worker | None:
-        """A process that has loaded a function; None if the pool is closed meanwhile."""
+        """A process that has loaded a function; None if the pool was closed meanwhile."""
         closed = self._closed
         for _ in range(MAX_ATTEMPTS):
             worker = worker or self._take(function) or Worker(self._environment)
@@ -270,7 +270,7 @@ class LocalPool:
         raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
 
     def _take(self, function: Pickled) -> Worker | None:
-        """A process that is free, preferably one that has loaded a function."""
+        """A free process, preferably one that has loaded the function."""
         with self._changed:
             self._free.sort(key=lambda worker: function.key in worker.keys)
             while self._free:
@@ -280,7 +280,7 @@ class LocalPool:
         return None
 
     def _next_job(self, worker: Worker | None, function: Pickled) -> _Job | None:
-        """The next item of a function, for a process; it is no longer waiting."""
+        """Take the next waiting item of a function, for a process."""
         with self._changed:
             for place, job in enumerate(self._waiting if worker is not None else ()):
                 if job.function.key == function.key and not job.cancelled() and not job.given_up:

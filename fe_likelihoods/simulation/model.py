@@ -4,9 +4,9 @@ A model is any object with named parameters, named channels and a method `simula
 parameter set. It raises `SimulationFailed` if a simulation is impossible. No base class is needed.
 
 Samplers request many parameter sets at once. `simulate_batch` and `misfit_batch` use the model's own batch methods if
-it has them (compiled kernels that share work or threads), otherwise they run the sets one by one; with a pool they
-always run them one by one. A failing simulation never raises here: an exception, or a response that is not finite or
-has a wrong shape, becomes a reason in words and a row of NaN, and does not affect other rows.
+it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one by
+one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
+becomes a reason in words and a row of NaN, and does not affect other rows.
 """
 
 import logging
@@ -44,7 +44,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-_RESPONSE_VALUES = 2**23  # responses held at once where only their misfit is needed: 64 MiB
+_RESPONSE_VALUES = 2**23  # largest number of response values in memory if only misfits are needed: 64 MiB
 
 
 class SimulationFailed(FailedRun):
@@ -68,13 +68,13 @@ class SimulationFailed(FailedRun):
 
 
 def split_seconds(reason: str) -> tuple[str, float | None]:
-    """Split a reason such as "crashed after 12.3 s" into the reason proper and the duration [s], None if not given."""
+    """Split a reason such as "crashed after 12.3 s" into the reason itself and the duration [s], None if not given."""
     found = re.fullmatch(r"(.+) after ([0-9.]+(?:e[-+]?[0-9]+)?) s", reason, re.DOTALL)
     return (found[1], float(found[2])) if found else (reason, None)
 
 
 class SimulationBatch(NamedTuple):
-    """Responses of a batch of parameter sets.
+    """Responses for several parameter sets.
 
     Attributes
     ----------
@@ -94,9 +94,9 @@ class ContinuedResponse(NamedTuple):
     Attributes
     ----------
     response : (n_channels, n) float
-        [SI] at the samples after that of the given state; at all samples if there was none.
+        [SI] at the samples after the given state; at all samples if no state was given.
     state : ndarray
-        Numbers that the model needs to go on after the last sample, in one array, of which copies are kept.
+        All numbers that the model needs to continue after the last sample, in one array; copies of it are kept.
     """
 
     response: np.ndarray
@@ -104,13 +104,13 @@ class ContinuedResponse(NamedTuple):
 
 
 class MisfitBatch(NamedTuple):
-    """Misfits of a batch of parameter sets.
+    """Misfits for several parameter sets.
 
     Attributes
     ----------
     misfit : (n, n_channels) float
-        Sums of squared residuals [SI unit of the channel, squared], or (n, n_numbers) for another statistic of the
-        residuals; NaN where the simulation failed.
+        Sums of squared residuals [SI unit of the channel, squared], or (n, n_numbers) for another residual statistic;
+        NaN where the simulation failed.
     reasons : list of n str
         Reasons of failures; empty where the simulation succeeded.
     """
@@ -126,23 +126,23 @@ class Model(Protocol):
     ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
     ``with_record(record)``, which returns the same model under another excitation, for predictions. An attribute
     ``time_limit`` is the largest duration of a simulation [s], or None. An attribute ``path_dependent`` is False if the
-    response to an excitation does not depend on earlier ones. For predictions that start from the end of the model's
-    excitation, a model has its `Record` in the attribute ``record`` and one sample of the response per sample of the
-    record, or a method ``followed_by(record, rest)``, which returns the same model under its own excitation, a pause of
-    ``rest`` seconds and another excitation; the response must end with the samples of the latter.
+    response to an excitation does not depend on earlier excitations. Some predictions start from the end of the model's
+    excitation. They need a `Record` in the attribute ``record``, with one response sample per sample of the record, or
+    a method ``followed_by(record, rest)``. It returns the same model under its excitation, a pause of ``rest`` seconds
+    and the new record, whose samples must be the last samples of the response.
 
     With ``simulate_from(theta, state) -> ContinuedResponse`` such predictions do not run the earlier excitation again
-    where theta is the same (`fe_likelihoods.prediction.kept_states`).
+    if theta is the same (`fe_likelihoods.prediction.kept_states`).
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
-    returns the same model under the first part of its excitation. The response of that model must be the first samples
-    of the response of this one, up to and including the given time [s], which is that of a sample, and its fingerprint
-    must be another one. A model with ``with_record`` and its excitation in the attribute ``record``, a `Record`, can be
-    shortened without this method (`first_part`).
+    returns the same model under the first part of its excitation, with a different fingerprint. The response of the
+    short model must equal the first samples of the full response, up to and including the given sample time [s]. A
+    model with ``with_record`` and a `Record` in the attribute ``record`` can be shortened without this method
+    (`first_part`).
 
-    Tables and figures use ``nominal``, a mapping of names to the nominal values [SI] of which the parameters are
-    multiples, ``nominal_units`` with their units, and ``parameter_units`` with the units of other parameters, in words
-    (`fe_likelihoods.likelihood.parameters.describe_parameters`).
+    Tables and figures use ``nominal``, the nominal values [SI] by parameter name, where parameters are multiples of
+    nominal values; ``nominal_units`` with their units; and ``parameter_units`` with the units of other parameters, in
+    words (`fe_likelihoods.likelihood.parameters.describe_parameters`).
     """
 
     @property
@@ -159,7 +159,7 @@ class Model(Protocol):
 
     @property
     def n_steps(self) -> int:
-        """Number of samples of the response."""
+        """Number of response samples."""
 
     @property
     def fingerprint(self) -> str:
@@ -170,7 +170,7 @@ class Model(Protocol):
 
 
 def has_batch_method(model: Model) -> bool:
-    """Whether a model has a batch method of its own."""
+    """Whether a model has a batch method."""
     return hasattr(model, "misfit_batch") or hasattr(model, "simulate_batch")
 
 
@@ -182,7 +182,7 @@ def first_part(model: Model, seconds: float) -> Model:
     model : Model
         With a method ``first(seconds)``, or with ``with_record`` and a `Record` in the attribute ``record``.
     seconds : float
-        Time of the last sample of the response [s].
+        Time of the last response sample [s].
 
     Returns
     -------
@@ -191,7 +191,7 @@ def first_part(model: Model, seconds: float) -> Model:
     Raises
     ------
     ValueError
-        If the model has neither, or the time is not within its response.
+        If the model has none of these methods, or the time is not within its response.
     """
     if hasattr(model, "first"):
         return model.first(seconds)
@@ -214,7 +214,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         Parameter sets.
     pool : object with ``map(function, items)``, optional
         Runs the simulations one by one, even if the model has a batch method (which would run in this process). The
-        results do not depend on it.
+        results do not depend on the pool.
 
     Returns
     -------
@@ -234,7 +234,7 @@ def misfit_batch(
     pool: Any = None,
     statistic: Statistic | None = None,
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another statistic of them, for many parameter sets; responses are not kept.
+    """Sums of squared residuals, or another residual statistic, for many parameter sets; responses are not kept.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def misfit_batch(
     measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
     statistic : Statistic, optional
-        Statistic of the residuals instead of the sums of squares; the model's own ``misfit_batch`` is then not used.
+        Residual statistic, by default the sums of squares. If given, the model's own ``misfit_batch`` is not used.
 
     Returns
     -------
@@ -266,7 +266,7 @@ def misfit_batch(
 def sent_simulation(
     model: Model, measured: np.ndarray | Comparison | None = None, statistic: Statistic | None = None
 ) -> Callable[[np.ndarray], tuple[np.ndarray | None, str]]:
-    """A function that runs one simulation, in this process or in a worker of a pool.
+    """A function that runs one simulation, in this process or in a pool's worker.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ def sent_simulation(
 def misfit_of_responses(
     model: Model, batch: SimulationBatch, measured: np.ndarray | Comparison, statistic: Statistic | None = None
 ) -> MisfitBatch:
-    """Sums of squared residuals, or another statistic of them, for given responses; arguments as of `misfit_batch`."""
+    """Sums of squared residuals, or another residual statistic, for given responses; arguments as in `misfit_batch`."""
     misfit = np.full((len(batch.response), statistic_width(measured, statistic)), np.nan)
     reasons = list(batch.reasons)
     for place, response in enumerate(batch.response):
@@ -303,7 +303,7 @@ def misfit_of_responses(
 def _misfit_from_responses(
     model: Model, thetas: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic
 ) -> MisfitBatch:
-    """Statistics from the model's own ``simulate_batch``, in parts of bounded memory."""
+    """Statistics from the model's own ``simulate_batch``, in parts that limit the memory."""
     misfits, reasons = [], []
     rows = max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
     for start in range(0, len(thetas), rows):
@@ -416,7 +416,7 @@ def _run_each(
 
 @contextmanager
 def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
-    """A line in the log if a model's own batch method fails: one bad set of parameters must not make others fail."""
+    """Log a failure of the model's own batch method, which must not make all its parameter sets fail."""
     try:
         yield
     except BaseException as error:
@@ -430,7 +430,7 @@ def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
 
 
 def _checked_batch(model: Model, batch: tuple, shape: tuple[int, ...]) -> tuple[np.ndarray, list[str]]:
-    """What a model's own batch method returned, with NaN in the rows that failed; ValueError for a wrong shape."""
+    """Result of a model's own batch method, with NaN in the rows that failed; ValueError for a wrong shape."""
     values, reasons = batch
     if np.iscomplexobj(values):
         raise ValueError("expected real numbers, got complex ones")

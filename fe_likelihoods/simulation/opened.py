@@ -1,8 +1,8 @@
 """What a simulation opens while it runs: files, modules, shared libraries and programs.
 
-A hook of the interpreter (`sys.addaudithook`) is told of every file that Python code opens. It listens while a
-simulation runs, in this process, in a worker of a pool or in the process of an isolated function. Files that the
-simulation writes itself do not count, nor do those of Python and of installed packages.
+An audit hook (`sys.addaudithook`) sees every file that Python code opens. It listens while a simulation runs, in this
+process, in a pool's worker or in the process of an isolated function. Not counted are files that the simulation writes
+itself, and files of Python and installed packages.
 """
 
 import contextlib
@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 __all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
 
-_MOST_REPEATED = 100  # files that each result names
-_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again without another time of modification
+_MOST_REPEATED = 100  # if more files were opened, a result names the new ones only
+_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the same modification time
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV", "/run/")
 
@@ -43,7 +43,7 @@ class Opened(NamedTuple):
     files: dict[str, str]
 
     def items(self) -> dict[str, str]:
-        """Digests by names that are the same in another folder."""
+        """Digests by file name, so that the folder does not matter."""
         found: dict[str, list[str]] = {}
         for path, digest in self.files.items():
             found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
@@ -53,12 +53,12 @@ class Opened(NamedTuple):
         return Opened(self.files | other.files)
 
     def read_again(self) -> "Opened":
-        """The same files as they are now; those of another machine are not found and not changed."""
+        """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
         return Opened({path: _digest_or(path, digest) for path, digest in self.files.items()})
 
 
 class _Observer:
-    """What is opened while it is in the list of observers."""
+    """Records what is opened while it is in the list of observers."""
 
     def __init__(self) -> None:
         self.read: set[str] = set()
@@ -67,7 +67,7 @@ class _Observer:
         self.modules = set(sys.modules)
 
     def result(self, known: Opened | None = None) -> Opened | None:
-        """Files that were read and not written, of new modules too, and shared libraries; None for no unknown ones."""
+        """Files that were read and not written, including new modules and shared libraries; None if all are known."""
         files = {} if known is None else known.files
         if known is not None and self.noted.keys() <= files.keys() and len(sys.modules) == len(self.modules):
             if not any(path not in files and _counts(path) for path in self.read - self.written):
@@ -79,17 +79,17 @@ class _Observer:
 
 
 class Observed:
-    """A function that is sent to other processes; its results say what it has opened there.
+    """A function for other processes, whose results include what it opened there.
 
     Parameters
     ----------
     function : callable
-        Of one item.
+        Takes one item.
 
     Notes
     -----
-    A call returns the result, and an `Opened` of all files that calls in this process have opened, or of the new ones
-    if they are more than 100, or None.
+    A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
+    files if there are more than 100 in all; None if there is nothing to report.
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
@@ -110,12 +110,12 @@ class Observed:
         new = observer.result(self._known)
         if new is not None:
             self._known = new if self._known is None else new | self._known
-        # all of it each time, since earlier results may have been lost
+        # all files each time, since earlier results may have been lost
         return result, self._known if len(self._known.files) <= _MOST_REPEATED else new
 
 
 def unpack(outcome: tuple) -> tuple[Any, Opened | None]:
-    """Result of a simulation in a worker and what it opened; the pool reports a lost worker by a result alone."""
+    """Simulation result from a worker, and what it opened; for a lost worker, the pool reports a result only."""
     return (outcome, None) if isinstance(outcome[1], str) else outcome
 
 
@@ -137,14 +137,14 @@ def observing() -> Iterator[_Observer]:
 
 
 def note(opened: Opened | None) -> None:
-    """Tell those who observe this process what another process has opened for it."""
+    """Tell the observers of this process what another process has opened for it."""
     if opened is not None:
         for observer in list(_observers):
             observer.noted.update(opened.files)
 
 
 def file_digest(path: str | os.PathLike) -> str:
-    """Digest of the content of a file, read again only after a change of its size or time of modification."""
+    """Digest of a file's content; read again only after its size or modification time has changed."""
     name = os.fspath(path)
     status = os.stat(name)
     stamp = status.st_size, status.st_mtime_ns, status.st_ino
@@ -187,7 +187,7 @@ def _add(path: Any, writes: bool) -> None:
 
 
 def _mapped() -> list[str]:
-    """Files that are mapped into the memory of this process, such as shared libraries; on Linux only."""
+    """Files mapped into this process's memory, such as shared libraries; on Linux only."""
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
@@ -197,7 +197,7 @@ def _mapped() -> list[str]:
 
 
 def _counts(path: str) -> bool:
-    """Whether a file is neither of the system nor of Python or an installed package."""
+    """Whether a file counts: it does not belong to the system, Python or an installed package."""
     if path.startswith(_SYSTEM) or path.endswith((".pyc", "-shm", "-wal")) or "-packages" + os.sep in path:
         return False
     return not path.startswith(_installed()) and os.path.realpath(path) != os.path.realpath(sys.executable)

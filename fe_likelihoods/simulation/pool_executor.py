@@ -1,4 +1,4 @@
-"""Executor of other pools: concurrent.futures, multiprocessing, MPI, and any object with ``map``."""
+"""Executor for other pools: concurrent.futures, multiprocessing, MPI, and any object with ``map``."""
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -13,7 +13,7 @@ __all__ = ["PoolExecutor", "resolve"]
 
 
 class _Task(Future):
-    """Future of an item, which stands for that of the pool."""
+    """Future of an item, in place of the pool's future."""
 
     inner: Any = None
 
@@ -37,8 +37,8 @@ def resolve(future: Future, result: Any = None, error: BaseException | None = No
 class PoolExecutor:
     """Executor for any object with ``map(function, items)``.
 
-    A `multiprocessing.Pool` replaces a process that dies, but not the item that it ran: its results are waited for for
-    ever. Use a `LocalPool` where simulations may crash.
+    A `multiprocessing.Pool` replaces a process that dies but does not run its item again, so the call never returns.
+    Use a `LocalPool` if simulations may crash.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class PoolExecutor:
         return next((size for size in sizes if isinstance(size, int) and size > 0), None)
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
-        """Outcomes of a function for every item, in their order; ValueError if a worker cannot load the function."""
+        """Outcomes of a function for every item, in order; ValueError if a worker cannot load the function."""
         items = list(items)
         reference = self._reference(function)
         outcomes = list(self.pool.map(reference, items))
@@ -78,19 +78,19 @@ class PoolExecutor:
         return outcomes
 
     def submit(self, function: Callable[[Any], Outcome], item: Any) -> Future:
-        """Future of the outcome of a function for one item, with the errors of `map`.
+        """Future with the outcome of a function for one item; raises the errors of `map`.
 
-        ``cancel()`` of the future has an effect until the pool starts the item, where the pool can cancel.
+        ``cancel()`` has an effect until the pool starts the item, if the pool can cancel.
         """
         return self.submit_all(function, [item])[0]
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
-        """Futures as of `submit` for several items.
+        """Futures as from `submit`, for several items.
 
         Raises
         ------
         ValueError
-            If the pool has ``map`` only.
+            If the pool only has ``map``.
         """
         if not self.submits:
             raise ValueError(
@@ -108,20 +108,20 @@ class PoolExecutor:
         return tasks
 
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
-        """Cancel items; with `running`, the results of those that the pool has started are ignored."""
+        """Cancel items; with `running`, also ignore the results of items that the pool has started."""
         for future in futures:
             if not future.cancel() and running:
                 Future.cancel(future)
 
     def _reference(self, function: Callable) -> FunctionReference:
-        """The function as it is sent to the workers: as it is now, if they are known to be other processes."""
+        """The function as it is sent to workers, pickled now if they are known to be other processes."""
         reference = FunctionReference(function, self._files)
         if self.other_processes:
             reference.pickle()
         return reference
 
     def _send(self, task: _Task, item: Any, reference: FunctionReference, carried: bool = False) -> _Task:
-        """Send an item to the pool, and the function with it if a worker does not find it."""
+        """Send an item to the pool, and again together with the function if the worker does not have it."""
 
         def received(result: Any) -> None:
             if isinstance(result, Missing) and not carried:

@@ -1,7 +1,7 @@
-"""Programs that run under a supervisor, which kills everything that they leave.
+"""Programs that run under a supervisor, which kills all processes that they leave behind.
 
-See `fe_likelihoods.simulation.supervisor`. A supervisor runs one program at a time and is kept for the next one, since
-its start takes about 50 ms.
+See `fe_likelihoods.simulation.supervisor`. A supervisor runs one program at a time and is kept for the next program,
+since its start takes about 50 ms.
 """
 
 import json
@@ -43,7 +43,7 @@ class _Supervisor:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs and is a child of this process (not of the one this was forked from)."""
+        """Whether the supervisor runs and is a child of this process (not of a process this one was forked from)."""
         return self._owner == os.getpid() and self._process.poll() is None
 
     def send(self, request: dict | None) -> None:
@@ -52,7 +52,7 @@ class _Supervisor:
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
     def receive(self, seconds: float) -> dict:
-        """Next answer, empty if there is none within a time [s]; RunFailed if the supervisor has died."""
+        """Next answer, empty if there is none within `seconds`; RunFailed if the supervisor has died."""
         if not wait([self._process.stdout], seconds):
             return {}
         line = self._process.stdout.readline()
@@ -65,7 +65,7 @@ class _Supervisor:
         """Kill the program and everything that it has started."""
         self.send(None)
         with suppress(RunFailed):
-            # the program may have ended by itself at the same time, which is answered first
+            # if the program has just ended by itself, this is answered first
             while answer := self.receive(_STOP_SECONDS):
                 if "stopped" in answer:
                     return
@@ -85,7 +85,7 @@ def run_program(
     place: Path,
     watch: Callable[[float], float],
 ) -> int:
-    """Run a program to its end and kill everything that it leaves.
+    """Run a program to its end and kill all processes that it leaves behind.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def run_program(
     folder : Path
         Working folder.
     stdout, stderr : Path
-        Files for its output.
+        Files for the program's output.
     place : Path
         Folder of the run, which is removed if this process is killed.
     watch : callable
@@ -113,7 +113,7 @@ def run_program(
     OSError
         If the program cannot be started.
     RunFailed
-        If its supervisor dies.
+        If the supervisor dies.
     """
     paths = {"folder": str(folder), "stdout": str(stdout), "stderr": str(stderr), "place": str(place)}
     keeper, answer = _take(), {}

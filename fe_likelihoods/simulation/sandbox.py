@@ -1,4 +1,4 @@
-"""A function that runs in another process, with limits of time, memory and output."""
+"""A function that runs in another process, with time, memory and output limits."""
 
 import math
 import os
@@ -21,9 +21,9 @@ _POLL_INTERVAL = 0.1  # [s] between checks of the amount of output
 class Sandbox:
     """Callable that runs a function in another process.
 
-    The process is kept for later calls. It is replaced after a call that did not end by itself, and after a number of
-    calls, which limits the memory that the function leaks. Concurrent calls of several threads use one process each.
-    The function is sent by value, as it is when it is called. What it prints is not shown.
+    The process is kept for later calls. It is replaced after a call that did not end by itself, and after
+    `runs_per_process` calls, which limits memory leaks. Concurrent calls from several threads use one process each. The
+    function is sent by value, in its state at the call. Its output is not shown.
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ class Sandbox:
     time_limit : float, optional
         Largest duration of a call [s], without the start of the process.
     memory_limit : int
-        Limit of the address space of the process [bytes]; 0 for no limit.
+        Limit of the process's address space [bytes]; 0 for no limit.
     max_output : int
-        Largest amount of output of one call [bytes].
+        Largest output per call [bytes].
     runs_per_process : int, optional
         Number of calls after which a process is replaced; never by default.
 

@@ -1,4 +1,4 @@
-"""Functions that are sent to each worker process of any pool once, through a private file, and then named by a digest.
+"""Functions that each worker process receives once, through a private file; later tasks contain only their digest.
 
 Workers on other machines, which do not find the file, get the function together with the items.
 """
@@ -21,7 +21,7 @@ class Missing(NamedTuple):
 
 
 class PrivateFiles:
-    """The most recent functions of one pool, in files that only this user can read, and that end with this process."""
+    """One pool's most recent functions, in files that only this user can read and that this process deletes."""
 
     def __init__(self) -> None:
         self._files = Recent()
@@ -60,8 +60,8 @@ class FunctionReference:
         return self._function(item)
 
     def pickle(self) -> Pickled:
-        """The function as it was when this was first called; ValueError if it cannot be pickled."""
-        with self._lock:  # pools pickle in threads of their own, often once per item
+        """The function in its state at the first call of this method; ValueError if it cannot be pickled."""
+        with self._lock:  # pools pickle in their own threads, often once per item
             if self._pickled is None:
                 self._pickled = Pickled.of(self._function)
             return self._pickled

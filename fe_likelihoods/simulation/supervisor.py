@@ -1,11 +1,10 @@
-"""Process that runs programs one after the other, and kills everything that a program leaves before it reports its end.
+"""Process that runs programs one after the other, and kills all processes that a program leaves behind.
 
-On Linux it is a subreaper (``PR_SET_CHILD_SUBREAPER``): a process whose parent has ended becomes its child, whatever
-session, group or environment the process has given itself. All its children are therefore the program and what this
-has started. On other systems the process group of the program is killed.
-
-It also kills them when its standard input closes, as it does when the process that started it dies, or at SIGTERM, and
-then removes the folder of the run.
+The end of a program is reported after these were killed. On Linux the supervisor is a subreaper
+(``PR_SET_CHILD_SUBREAPER``): a process whose parent has ended becomes a child of the supervisor, whatever session,
+group or environment it has. So the supervisor's descendants are exactly the program and the processes that it started.
+On other systems, the program's process group is killed. All are also killed, and the folder of the run is removed, at
+SIGTERM and when standard input closes, as it does when the process that started the supervisor dies.
 
 This file imports the standard library only, so that it can be run alone and starts quickly.
 """
@@ -24,7 +23,7 @@ from contextlib import suppress
 __all__ = ["main"]
 
 _PR_SET_CHILD_SUBREAPER = 36
-_KILL_SECONDS = 10.0  # after which processes that cannot be killed are given up
+_KILL_SECONDS = 10.0  # until processes that cannot be killed are given up
 
 
 class _Program:
@@ -52,7 +51,7 @@ class _Program:
             )
 
     def reap(self) -> bool:
-        """Wait for all children that have ended; returns whether others are left."""
+        """Collect the exit status of children that have ended; returns whether other children are left."""
         try:
             while True:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -78,7 +77,7 @@ class _Program:
 
 
 def _descendants() -> list[int]:
-    """Process ids of all descendants of this process, from /proc."""
+    """Process ids of this process's descendants, from /proc."""
     parents = {}
     for name in filter(str.isdigit, os.listdir("/proc")):
         with suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
@@ -91,11 +90,11 @@ def _descendants() -> list[int]:
 
 
 def main() -> None:
-    """Read requests, one line of JSON each, and answer each of them with one line, until standard input closes.
+    """Read requests, one line of JSON each, and answer each with one line, until standard input closes.
 
-    A request is the arguments of a program, answered at its end by ``{"exit_code": int}`` or at once by
-    ``{"errno": int, "error": str}`` if it cannot be started; or null, which kills the program, if there is one, and is
-    answered by ``{"stopped": true}``.
+    A request with the arguments of `_Program.start` runs a program; the answer is ``{"exit_code": int}`` at its end, or
+    ``{"errno": int, "error": str}`` if it cannot be started. The request null kills the program, if there is one; the
+    answer is ``{"stopped": true}``.
     """
     program = _Program()
     ended, wake = os.pipe()

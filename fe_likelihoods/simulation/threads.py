@@ -1,4 +1,4 @@
-"""Batches of simulations on threads: compiled kernels release the GIL, and each simulation has its own memory."""
+"""Simulations on several threads: compiled kernels release the GIL, and simulations share no memory."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def map_threads(
 
 
 def run_on_threads(run: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Results of a function for every item, in their order, on as many threads as numba uses."""
+    """Results of a function for every item, in order, on as many threads as numba uses."""
     n_threads = min(numba.get_num_threads(), len(items), os.cpu_count() or 1)
     if n_threads <= 1:
         return [run(item) for item in items]

@@ -1,11 +1,11 @@
-"""Servers of UM-Bridge, seen from a model: requests, faults of the network, and which server is asked.
+"""Client for UM-Bridge servers: requests, network faults, and the choice of a server.
 
 UM-Bridge (L. Seelinger, V. Cheng-Seelinger, A. Davis, M. Parno and A. Reinarz, *UM-Bridge: Uncertainty quantification
-and modeling bridge*, Journal of Open Source Software 8(83), 4748, 2023, doi:10.21105/joss.04748) sends the parameters
-of a model as JSON over HTTP and receives its output in the same way. The protocol is small enough for the standard
-library. The Python client of UM-Bridge has no time limit, and cannot tell a lost connection from an error of the model.
+and modeling bridge*, Journal of Open Source Software 8(83), 4748, 2023, doi:10.21105/joss.04748) sends model parameters
+as JSON over HTTP and receives the output in the same way. The standard library suffices for this protocol; UM-Bridge's
+Python client has no time limit, and cannot distinguish a lost connection from a model error.
 
-Requests are sent directly, without the proxy of ``http_proxy``, so that servers on this machine are found.
+Requests are sent directly, ignoring ``http_proxy``, so that servers on this machine are found.
 """
 
 import json
@@ -26,21 +26,21 @@ __all__ = ["SIMULATION_FAILED", "TRANSIENT_FAILURE", "ServerError", "ServerTimeo
 logger = logging.getLogger(__name__)
 
 TRANSIENT_FAILURE = "TransientFailure"
-"""Type of error with which `fe_likelihoods.serve` reports a failure whose cause is not the model."""
+"""Error type with which `fe_likelihoods.serve` reports a failure whose cause is not the model."""
 
 SIMULATION_FAILED = "SimulationFailed"
-"""Type of error with which it reports other failures."""
+"""Error type with which `fe_likelihoods.serve` reports other failures."""
 
 _CONNECT_SECONDS = 10.0  # longest time until a server accepts a connection
 _LONGEST_WAIT = 60.0  # [s] between two attempts
 _RECENT = 30.0  # [s] after a fault during which other servers are preferred
-# the system ends a connection within minutes after the other machine has vanished without a word
+# the system closes a connection within minutes after the other machine has failed silently
 _KEEP_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
     (socket.IPPROTO_TCP, getattr(socket, option), value)
     for option, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4))
     if hasattr(socket, option)  # not on every system
 ]
-_BUSY = {429, 502, 503, 504}  # HTTP status of a load balancer without a free or living server
+_BUSY = {429, 502, 503, 504}  # HTTP status of a load balancer without a free server
 
 
 class Unavailable(RuntimeError):
@@ -57,9 +57,9 @@ class ServerError(RuntimeError):
     Parameters
     ----------
     kind : str
-        Type of the error, as in ``"InvalidInput"``; ``"HTTP 500"`` for an error that is not in the form of UM-Bridge.
+        Type of the error, as in ``"InvalidInput"``; ``"HTTP 500"`` for an error without UM-Bridge's format.
     message : str
-        Its text.
+        Text of the error.
     """
 
     def __init__(self, kind: str, message: str) -> None:
@@ -68,7 +68,7 @@ class ServerError(RuntimeError):
 
 
 class _Fault(Exception):
-    """The server did not accept the request, or (`is_loss`) the connection was lost after it had received it."""
+    """The server did not accept the request, or (`is_loss`) the connection was lost afterwards."""
 
     def __init__(self, text: str, is_loss: bool = False) -> None:
         super().__init__(text)
@@ -76,7 +76,7 @@ class _Fault(Exception):
 
 
 class UMBridgeServers:
-    """Servers of the same models; each request goes to the one that is least busy.
+    """Servers of the same models; each request goes to the least busy server.
 
     Threads can share the object. Servers that had a fault in the last 30 s are asked last.
 
@@ -85,15 +85,15 @@ class UMBridgeServers:
     urls : sequence of str
         Addresses, as in ``"http://localhost:4242"``.
     retries : int
-        Number of further attempts after a fault. An attempt ends when every server has refused the request, or when
-        one has accepted it and the connection was lost.
+        Number of further attempts after a fault. An attempt ends when every server has refused the request, or when a
+        server has accepted it and the connection was lost.
     retry_wait : float
         Time between the first two attempts [s]; it is doubled each time, up to 60 s.
 
     Raises
     ------
     ValueError
-        If an address is not one of http or https, or is given twice, or a number is negative.
+        If an address is not a http or https address, or is given twice, or a number is negative.
     """
 
     def __init__(self, urls: Sequence[str], retries: int, retry_wait: float) -> None:
@@ -120,26 +120,26 @@ class UMBridgeServers:
         self._lock = threading.Lock()
 
     def evaluate(self, request: dict[str, Any], time_limit: float | None = None) -> Any:
-        """Answer of one of the servers to an evaluation.
+        """Answer to an evaluation, from any of the servers.
 
         Parameters
         ----------
         request : dict
             Content of the request.
         time_limit : float or None
-            Longest time until the answer [s], without the attempts before.
+            Longest time until the answer [s], not counting earlier attempts.
 
         Returns
         -------
         object
-            The vectors of the output, as read from JSON; not checked.
+            The output vectors, as read from JSON; not checked.
 
         Raises
         ------
         ServerError
             If the server answers with an error.
         ServerTimeout
-            If it does not answer within the time limit.
+            If the server does not answer within the time limit.
         Unavailable
             If all attempts have failed.
         """
@@ -153,14 +153,14 @@ class UMBridgeServers:
                     return self._output(asked[-1], request, time_limit)
                 except _Fault as fault:
                     text = f"{asked[-1]}: {fault}"
-                    if fault.is_loss:  # perhaps because of the parameters: no other server for now
+                    if fault.is_loss:  # the parameters may be the cause, so another server could be lost too
                         break
             else:
                 text = text if len(self.urls) == 1 else f"none of {len(self.urls)} servers is available; {text}"
         raise Unavailable(f"{text} ({attempt + 1} attempt{'s' if attempt else ''})")
 
     def _least_busy(self, asked: Sequence[str]) -> str:
-        """The server with the fewest requests among those that were not asked, which has one more from now on."""
+        """Choose the least busy server that was not asked yet, and count the request as running on it."""
         with self._lock:
             now = time.monotonic()
             left = [url for url in self.urls if url not in asked]
@@ -188,7 +188,7 @@ class UMBridgeServers:
                 logger.warning("UM-Bridge server %s answers again", url)
 
     def sizes(self, url: str, name: str, config: dict[str, Any]) -> tuple[list[int], list[int]]:
-        """Sizes of the inputs and of the outputs of a model on one of the servers.
+        """Input and output sizes of a model on one of the servers.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class UMBridgeServers:
         name : str
             Name of the model.
         config : dict
-            Its configuration.
+            Configuration of the model.
 
         Returns
         -------
@@ -206,7 +206,7 @@ class UMBridgeServers:
         Raises
         ------
         ServerError
-            If the server has no such model, the model cannot be evaluated, or the sizes are not those of vectors.
+            If the server has no such model, the model cannot be evaluated, or the sizes are no lists of vector lengths.
         Unavailable
             If the server cannot be reached.
         """
@@ -230,7 +230,7 @@ class UMBridgeServers:
 
 
 def _address(url: str) -> str:
-    """Address without a slash at its end; ValueError if it is not one of http or https."""
+    """Address without a slash at the end; ValueError if it is not a http or https address."""
     try:
         parts = urlsplit(url)
         usable = parts.scheme in ("http", "https") and bool(parts.hostname) and not parts.query and parts.port != 0
@@ -244,7 +244,7 @@ def _address(url: str) -> str:
 def _ask(
     url: str, path: str, content: Any = None, time_limit: float | None = _CONNECT_SECONDS, key: str | None = None
 ) -> Any:
-    """JSON object that a server answers, or its value of a key; GET without `content`."""
+    """A server's answer, a JSON object, or the object's value for a key; a GET request without `content`."""
     status, body = _exchange(url, path, content, time_limit)
     if status in _BUSY:
         raise _Fault(f"HTTP {status}, no server is free")
@@ -268,7 +268,7 @@ def _ask(
 
 
 def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tuple[int, bytes]:
-    """Status and body of the answer to one request, on a connection of its own."""
+    """Status and body of the answer to one request, on a new connection."""
     parts = urlsplit(url)
     kind = HTTPSConnection if parts.scheme == "https" else HTTPConnection
     body = None if content is None else json.dumps(content, allow_nan=False)

@@ -1,7 +1,7 @@
-"""Which code belongs to the user, and the digest of the source files of this library.
+"""Which code belongs to the user, and the digest of this library's source files.
 
-Code of the user changes without a version: it travels to workers by value, and labels contain its source. This library
-is represented by a digest of its files, and installed packages by their versions.
+User code has no version: it is sent to workers by value, and labels contain its source. This library is represented by
+a digest of its files, and installed packages by their versions.
 """
 
 import functools
@@ -21,7 +21,7 @@ SCRIPTS = ("__main__", "__mp_main__")  # names of a script or notebook, and of a
 
 
 def is_of_user(module: Any) -> bool:
-    """Whether a module, given by itself or by its name, belongs neither to this library, to Python nor to a package."""
+    """Whether a module (or its name) is user code, not part of this library, of Python or of an installed package."""
     if isinstance(module, str):
         name, module = module, sys.modules.get(module)
     else:
@@ -37,7 +37,7 @@ def _values(module: Any) -> dict[str, Any]:
 
 
 def _places(module: Any) -> tuple[str, ...]:
-    """The file of a module, or the folders of a package without a file."""
+    """The file of a module, or the folders of a package that has no file."""
     file = _values(module).get("__file__")
     return (file,) if isinstance(file, str) else tuple(map(str, _values(module).get("__path__", ())))
 
@@ -68,7 +68,7 @@ def _distributions() -> Mapping[str, list[str]]:
 
 
 def package_version(top: str) -> str:
-    """Version of an installed package by the name of its top module; empty for others."""
+    """Version of an installed package, by the name of its top-level module; empty for other modules."""
     try:
         return importlib.metadata.version(top)
     except (importlib.metadata.PackageNotFoundError, ValueError):
@@ -81,7 +81,7 @@ def package_version(top: str) -> str:
 
 @functools.cache
 def sources_digest(*patterns: str) -> bytes:
-    """Digest of the source files of this library that match patterns, such as ``"kernels/*.py"``; of all without."""
+    """Digest of this library's source files: those that match patterns such as ``"kernels/*.py"``, or all files."""
     root, digest = Path(__file__).resolve().parents[1], blake2b(digest_size=16)
     for file in sorted({file for pattern in patterns or ("**/*.py",) for file in root.glob(pattern)}):
         digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())

@@ -1,12 +1,12 @@
-"""A process of this machine that calls a function for one item at a time, and may hang, crash or use too much memory.
+"""A local process that calls a function for one item at a time, and may hang, crash or use too much memory.
 
-The process is a Python interpreter that receives the function by value (`fe_likelihoods.simulation.by_value`), so the
-user's script is not imported in it. It leads a session of its own, which is killed with it. On Linux it is also killed
-when the process that started it ends, for whatever reason (``PR_SET_PDEATHSIG``); on macOS it notices that within a
-second, unless compiled code keeps the interpreter busy.
+The process is a Python interpreter that receives the function by value (`fe_likelihoods.simulation.by_value`), so it
+does not import the user's script. It leads a new session, which is killed with it. On Linux it is also killed when the
+process that started it ends, for whatever reason (``PR_SET_PDEATHSIG``); on macOS it ends within a second, unless
+compiled code keeps the interpreter busy.
 
-It is started with `subprocess`, not with `multiprocessing`, because it must also work in the processes of any pool,
-many of which may not start processes with `multiprocessing`.
+It is started with `subprocess`, because pool processes, in which it must also work, often may not start processes with
+`multiprocessing`.
 """
 
 import ctypes
@@ -40,15 +40,15 @@ _BOOT = (
 )
 _LOAD = bytes(16)  # in place of the key of a function
 _PR_SET_PDEATHSIG = 1
-_CHECK = 0.5  # [s] between two looks at the process while its answer is waited for
+_CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
 
 
 class WorkerDied(RunFailed):
-    """The process of a worker has ended before it answered."""
+    """A worker process has ended before it answered."""
 
 
 def _renew_starter() -> None:
-    """Thread that starts processes and lasts: Linux kills a process when the thread that started it ends."""
+    """Make the permanent thread that starts processes: Linux kills a process when the thread that started it ends."""
     global _starter
     _starter = ThreadPoolExecutor(1, "starts workers")
 
@@ -66,11 +66,11 @@ class Worker:
     Parameters
     ----------
     environment : mapping, optional
-        Environment variables in addition to those of this process.
+        Environment variables in addition to this process's variables.
     memory_limit : int
-        Limit of the address space of the process [bytes], beyond which its allocations fail; 0 for no limit.
+        Limit of the process's address space [bytes], beyond which allocations fail; 0 for no limit.
     output : open file, optional
-        Receives standard output and standard error, which are otherwise those of this process.
+        Receives standard output and standard error; by default, the worker writes to the streams of this process.
 
     Attributes
     ----------
@@ -114,9 +114,9 @@ class Worker:
         Raises
         ------
         WorkerDied
-            If the process dies meanwhile, or does not answer within a time.
+            If the process dies meanwhile, or does not answer within `seconds`.
         ValueError
-            If the process cannot load it.
+            If the process cannot load the function.
         """
         self._key = function.key
         if function.key in self.keys:
@@ -130,13 +130,13 @@ class Worker:
         self.keys.keep(function.key, True, len(function.payload))
 
     def send(self, item: Any) -> None:
-        """Send an item for the function that was loaded last; its answer is then received."""
+        """Send an item for the function that was loaded last; `receive` returns the answer."""
         self.keys.use(self._key)
         self._send(self._key + pickle.dumps(item, protocol=5))
         self.calls += 1
 
     def receive(self, seconds: float | None = None) -> "Answer | None":
-        """The answer, None if there is none within a time; WorkerDied if the process has died."""
+        """The answer, None if there is none within `seconds`; WorkerDied if the process has died."""
         stop = math.inf if seconds is None else time.monotonic() + seconds
         try:
             while not self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
@@ -172,7 +172,7 @@ class Answer(NamedTuple):
 
 
 def _ended(process: subprocess.Popen) -> bool:
-    """Whether a process has ended; it is not waited for, so that its process id is not used again."""
+    """Whether a process has ended; its exit status is not collected, so that its process id is not reused."""
     if process.returncode is not None:
         return True
     if not hasattr(os, "waitid"):  # macOS before Python 3.13
@@ -217,7 +217,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
     memory_limit : int
         As for `Worker`.
     parent : int
-        Process that has started this one.
+        Id of the process that has started this process.
     """
     _end_with(parent)
     os.set_inheritable(fileno, False)
@@ -250,7 +250,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """Let this process end when another one ends."""
+    """Let this process end when the parent ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has ended before
@@ -266,11 +266,11 @@ def _end_with(parent: int) -> None:
 
 
 def _packed(value: Any, error: BaseException | None = None) -> bytes:
-    """Pickled `Answer`; what cannot be pickled is replaced by an exception with its message, or that of the error."""
+    """Pickled `Answer`; if it cannot be pickled, a `RunFailed` with the text of `error` or of the pickling error."""
     try:
         data = pickle.dumps((value, error), protocol=5)
         if error is not None:
-            pickle.loads(data)  # exceptions with constructors of their own can often be pickled but not unpickled
+            pickle.loads(data)  # exceptions with custom constructors can often be pickled but not unpickled
         if error is None or isinstance(error, Exception):
             return data  # but SystemExit and KeyboardInterrupt of the function must not end the parent
     except Exception as failure:
