@@ -1,8 +1,8 @@
-"""Which stored simulations may be used: those of the model's generation, or of one that new simulations agree with.
+"""Which stored simulations may be used: the model's generation, or a generation that new simulations agree with.
 
-Where the label of a model is unknown in a file, stored rows are simulated again, chosen to cover the space of the
-parameters. If all agree, the label is *adopted*: it becomes one of their generation. If one differs, a new generation
-begins. Rows of earlier releases, which have no label, are taken into the generation of the model if they agree.
+If a model's label is unknown in a file, some stored rows are simulated again, chosen to cover the parameter space. If
+all agree, the label is *adopted*: it is added to the rows' generation. If one differs, a new generation begins. Rows of
+earlier releases, which have no label, are moved to the model's generation if they agree.
 """
 
 import logging
@@ -28,12 +28,12 @@ __all__ = ["LATEST", "MAX_ATTEMPTS", "Adoption", "choose_rows"]
 
 logger = logging.getLogger(__name__)
 
-FIRST_COMPARED = 3  # of many rows; then four times as many, and so on, because the first difference is enough
+FIRST_COMPARED = 3  # rows in the first batch; each further batch has four times as many, until a row differs
 LATEST = 100  # rows among which the latest success is looked for
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
-PAUSE_SECONDS = 60.0  # before another attempt, where no simulation could be compared
-MAX_SOURCES = 8  # of earlier releases that are compared with a model
-LARGEST = 3  # rows with the largest misfits, and failed rows next to succeeded ones
+PAUSE_SECONDS = 60.0  # before another attempt, if no simulation could be compared
+MAX_SOURCES = 8  # sources of earlier releases that are compared with a model
+LARGEST = 3  # rows with the largest misfits, and failed rows nearest to successful rows
 
 
 class Adoption:
@@ -43,7 +43,7 @@ class Adoption:
     ----------
     cache : SimulationCache
     trust : Trust
-        Its lock is held during a search.
+        Locked during a search.
     again : Repetition
         Runs the simulations that are compared.
     """
@@ -57,7 +57,7 @@ class Adoption:
         Parameters
         ----------
         fingerprint : str
-            Of the statistics, as for `SimulationCache.look_up`, or of the model, for responses.
+            Fingerprint for statistics, as in `SimulationCache.look_up`, or the model's fingerprint for responses.
         run : VerifyingRun
         """
         found = self.trust.generations.get(fingerprint)
@@ -69,7 +69,7 @@ class Adoption:
         return found
 
     def begin(self, fingerprint: str, run: VerifyingRun) -> None:
-        """Begin a new generation, with the simulations that have shown that it is needed."""
+        """Begin a new generation, with the simulations that differed from stored ones."""
         used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.model.fingerprint, "responses")}
         self.trust.begin(self.cache.file, run.model, used)
         text = "%s: stored simulations of this %s differ from new ones; they stay in the file and are not used"
@@ -111,7 +111,7 @@ class Adoption:
     def _complete(
         self, fingerprint: str, run: VerifyingRun, present: list[int], earlier: list[int], n: int
     ) -> int | None:
-        """The generation of a known label, for which further rows are compared if there were few."""
+        """The generation of a known label; compares further rows if only a few were compared before."""
         trust, stored, before = self.trust, self.trust.find(self.cache.file, run.model), self.trust.stored
         if stored.generation in present and stored.compared < n:
             same = {each.id for each in labels_of(self.cache.file, stored.source) if each.label == stored.label}
@@ -126,7 +126,7 @@ class Adoption:
     def _search(
         self, fingerprint: str, run: VerifyingRun, present: list[int], earlier: list[int], n: int
     ) -> int | None:
-        """The generation that an unknown label belongs to, as far as new simulations tell."""
+        """The generation that an unknown label belongs to, according to new simulations; None if they cannot tell."""
         logger.warning(
             "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up to %d "
             "of them are simulated again, to see whether they can be used",
@@ -147,7 +147,7 @@ class Adoption:
     def _rows(
         self, fingerprint: str, run: VerifyingRun, generation: int, most: int = MAX_CANDIDATES
     ) -> list[StoredSimulation]:
-        """Rows of a generation, the latest first; those of responses without their statistics."""
+        """Rows of a generation, the latest first; for responses, without statistics."""
         if fingerprint == run.model.fingerprint:
             points = self.cache.response_points(run.model, generation, most)
             return [StoredSimulation(theta, None, "", label) for theta, label in points]
@@ -155,7 +155,7 @@ class Adoption:
         return [row for row in rows if not (row.reason and self.cache.retry_failures)]
 
     def _adopts(self, fingerprint: str, run: VerifyingRun, generation: int, n: int) -> bool | None:
-        """Whether rows of a generation agree with new simulations; the label is then one of it. None: cannot tell."""
+        """Whether a generation's rows agree with new simulations, so that its label is adopted; None: cannot tell."""
         trust, rows = self.trust, self._rows(fingerprint, run, generation)
         chosen = choose_rows(rows, n, np.random.default_rng())
         if fingerprint == run.model.fingerprint:
@@ -177,7 +177,7 @@ class Adoption:
         return True
 
     def _compare(self, fingerprint: str, run: VerifyingRun, rows: list[StoredSimulation]) -> tuple[bool, int]:
-        """Whether rows agree with new simulations, as far as these were not stopped, and how many were compared."""
+        """Whether rows agree with the new simulations that were not stopped, and how many were compared."""
         size, attempts, compared = FIRST_COMPARED, 0, 0
         tolerances = self.again.tolerances(run)
         while rows and not (attempts >= MAX_ATTEMPTS and compared == 0):
@@ -196,7 +196,7 @@ class Adoption:
         return True, compared
 
     def _adopt_earlier(self, fingerprint: str, run: VerifyingRun, earlier: list[int], n: int) -> bool:
-        """Compare rows of earlier releases, and take those that agree into the generation of the model."""
+        """Compare rows of earlier releases; if they agree, move their source to the model's generation."""
         cache, trust = self.cache, self.trust
         for source in earlier:
             rows = cache.stored_rows(source, OF_EARLIER_RELEASES, run.n_numbers, run.n_steps)
@@ -215,7 +215,7 @@ class Adoption:
 
 
 def _earlier_sources(file: CacheFile, run: VerifyingRun) -> list[int]:
-    """Sources of simulations that an earlier release has stored with the shapes of a model, the latest first."""
+    """Sources of earlier releases whose simulations have the model's shapes, the latest first."""
     if file.has_earlier_rows is None:
         query = "SELECT 1 FROM simulations INDEXED BY simulation_generations WHERE generation = ? LIMIT 1"
         file.has_earlier_rows = bool(file.select(query, (OF_EARLIER_RELEASES,)))
@@ -230,7 +230,7 @@ def _earlier_sources(file: CacheFile, run: VerifyingRun) -> list[int]:
 
 
 def _take_over(file: CacheFile, source: int, fingerprint: str, generation: int, label: int) -> None:
-    """Make the simulations of an earlier release those of an identity and generation."""
+    """Move the simulations of an earlier release to an identity and generation."""
     query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? AND generation = ?"
     update = "UPDATE OR REPLACE simulations SET key = ?, source = ?, crc = ?, generation = ?, label = ? WHERE key = ?"
 
@@ -249,25 +249,25 @@ def _take_over(file: CacheFile, source: int, fingerprint: str, generation: int, 
 
 
 def choose_rows(rows: list[StoredSimulation], n: int, rng: np.random.Generator) -> list[StoredSimulation]:
-    """Rows that show a change of the model in a part of the space.
+    """Choose rows that would show a change of the model in a part of the parameter space.
 
-    The space is divided into n cells with equal numbers of rows, by medians. Each cell gives one row: a special one if
-    there is any, otherwise one at random. A change that concerns a share p of the rows is then missed with a
-    probability of at most (1 - p)^n, as with n rows at random, and less if the changed part is connected.
+    The space is divided into n cells with about equal numbers of rows. One row per cell is chosen: a special row if
+    there is one, otherwise a random row. A change that concerns a share p of the rows is then missed with a probability
+    of at most (1 - p)^n, as with n random rows, and less if the changed part is connected.
 
     Parameters
     ----------
     rows : list of StoredSimulation
         The latest first.
     n : int
-        Number of rows that are chosen.
+        Number of rows to choose.
     rng : numpy.random.Generator
 
     Returns
     -------
     list of StoredSimulation
-        The special rows first: the latest, corners, failed next to succeeded ones, largest misfits; then the others in
-        random order.
+        The special rows first: the latest row, failed rows nearest to successful ones, largest misfits, extremes of
+        each parameter; then the others in random order.
     """
     if len(rows) <= n:
         return list(rows)
@@ -285,7 +285,7 @@ def choose_rows(rows: list[StoredSimulation], n: int, rng: np.random.Generator) 
 
 
 def _special(thetas: np.ndarray, rows: list[StoredSimulation]) -> list[int]:
-    """Indices of special rows, without repetitions, those of each kind in turn."""
+    """Indices of special rows, one kind after the other, without repetitions."""
     failed = np.array([bool(row.reason) for row in rows])
     extremes = [end for column in thetas.T for end in (int(column.argmin()), int(column.argmax()))]
     sums = np.array([np.nan if row.reason or row.misfit is None else np.sum(row.misfit) for row in rows])
@@ -299,7 +299,7 @@ def _special(thetas: np.ndarray, rows: list[StoredSimulation]) -> list[int]:
 
 
 def _cells(rows: np.ndarray, thetas: np.ndarray, n: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Parts of some rows, divided along the widest of the parameters; of equally wide ones, along one at random."""
+    """Divide rows into n parts, each time along the widest parameter (a random one of equally wide parameters)."""
     if n == 1:
         return [rows]
     width = np.ptp(thetas[rows], axis=0)

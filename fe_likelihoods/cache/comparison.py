@@ -1,4 +1,4 @@
-"""Simulations that are run again, and how much two simulations with the same parameters may differ."""
+"""Repeated simulations, and how much two simulations with the same parameters may differ."""
 
 import time
 from collections import defaultdict
@@ -40,8 +40,8 @@ __all__ = [
 ]
 
 DEFAULT_TOLERANCE = 1e-9
-ROUNDING = 1e-13  # of a sum of squares, whose terms another processor adds in another order
-RESPONSE_VALUES = 2**23  # responses held at once: 64 MiB
+ROUNDING = 1e-13  # relative, of a sum of squares; processors differ in the order of summation
+RESPONSE_VALUES = 2**23  # largest number of response values in memory: 64 MiB
 
 
 class VerifyingRun(NamedTuple):
@@ -55,7 +55,7 @@ class VerifyingRun(NamedTuple):
     measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI].
     statistic : Statistic or None
-        Statistic of the residuals that is stored; None for the sums of squares.
+        Residual statistic that is stored; None for the sums of squares.
     n_numbers : int
         Length of the statistic.
     tolerance : float or None
@@ -81,11 +81,11 @@ class Simulated(NamedTuple):
     Attributes
     ----------
     misfit : (n_numbers,) float
-        Statistics; NaN where it failed.
+        Statistics; NaN if the simulation failed.
     reason : str
-        Reason of the failure; empty where it succeeded.
+        Reason of the failure; empty if the simulation succeeded.
     norm : (n_channels,) float
-        Norm of the response of each channel [SI].
+        Response norm per channel [SI].
     """
 
     misfit: np.ndarray
@@ -98,7 +98,7 @@ class Simulated(NamedTuple):
 
 @contextmanager
 def observed(label: ModelLabel | None, pool: Any, complete: Callable[[Opened | None], None]) -> Iterator[None]:
-    """Pass on what the simulations of a block open, in this process or in workers, if the label asks for it."""
+    """Pass what the simulations in a ``with`` block open to `complete`, if the label observes simulations."""
     if label is None or not label.observes:
         yield
         return
@@ -113,7 +113,7 @@ def simulate_again(
     label: ModelLabel | None = None,
     complete: Callable[[Opened | None], None] | None = None,
 ) -> list[Simulated]:
-    """New simulations; what they open is passed to the function `complete`, if the label of the model is given."""
+    """New simulations; if the model's label is given, what they open is passed to the function `complete`."""
     rows = []
     size = max(1, RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))
     for start in range(0, len(thetas), size):
@@ -127,7 +127,7 @@ def simulate_again(
 
 
 class Repetition:
-    """Simulations that are run again for one likelihood.
+    """Runs stored simulations again, for one likelihood.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Repetition:
     compared, unverified, seconds
         As for `VerifiedCache`.
     found : dict
-        New simulations of the search or verification that goes on.
+        New simulations in the present search or verification.
     """
 
     def __init__(self, file: CacheFile, trust: Trust) -> None:
@@ -148,7 +148,7 @@ class Repetition:
         self.found: dict[tuple, tuple[np.ndarray, Simulated]] = {}
 
     def simulate(self, fingerprint: str, rows: list[StoredSimulation], run: VerifyingRun) -> list[Simulated]:
-        """New simulations at the points of some rows; those that were found before are not run again."""
+        """New simulations at the parameters of rows; simulations in `found` are not run again."""
         keys = [(fingerprint, row.theta.tobytes()) for row in rows]
         left = {key: row.theta for key, row in zip(keys, rows, strict=True) if key not in self.found}
         if left:
@@ -163,7 +163,7 @@ class Repetition:
         return [self.found[key][1] for key in keys]
 
     def tolerances(self, run: VerifyingRun) -> Mapping[int, float]:
-        """Tolerances by the label of a row; a row of an unknown label may be that of another processor."""
+        """Tolerances by the label of a row; a row with an unknown label may come from another processor."""
         same = response_tolerance(run.model) if run.tolerance is None else run.tolerance
         other = max(same, DEFAULT_TOLERANCE) if run.tolerance is None else same
         cpu = self.trust.cpu
@@ -175,14 +175,14 @@ class Repetition:
 
 
 def row_of_response(theta: np.ndarray, response: np.ndarray, label: int, run: VerifyingRun) -> StoredSimulation:
-    """A stored response as its statistics."""
+    """A stored response, reduced to its statistics."""
     batch = SimulationBatch(response[None], [""])
     misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
     return StoredSimulation(theta, misfit[0], reason, label)
 
 
 def is_transient(reason: str) -> bool:
-    """Whether a simulation failed for a reason that says nothing about the model."""
+    """Whether a simulation failed for a reason other than the model."""
     return isinstance(reason, TransientReason)
 
 
@@ -190,11 +190,11 @@ def is_transient(reason: str) -> bool:
 
 
 def response_tolerance(model: Model) -> float:
-    """Relative difference of responses with the same parameters that a model may have.
+    """Accepted relative difference between two responses of a model with the same parameters.
 
-    It is the attribute ``response_tolerance`` of the model: zero for the compiled models of this library, whose
-    responses are the same to the last bit on the same processor. For models without the attribute, and for subclasses
-    of the user that do not define it, it is 1e-9, because sums of several threads may differ in their last digits.
+    It is the model's attribute ``response_tolerance``: zero for the compiled models of this library, whose responses
+    are the same to the last bit on the same processor. For models without the attribute, and for user subclasses that
+    do not define it, it is 1e-9, because sums over several threads may differ in their last digits.
     """
     cls = type(model)
     if is_of_user(cls.__module__) and "response_tolerance" not in getattr(model, "__dict__", {}):
@@ -205,7 +205,7 @@ def response_tolerance(model: Model) -> float:
 
 
 def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
-    """Number and size of the largest difference beyond a tolerance, as of `largest_difference`; None if they agree."""
+    """Index and size of the largest difference beyond a tolerance, from `largest_difference`; None without any."""
     return largest_difference(stored, new.misfit, new.norm, tolerance, needs_response(run.statistic))
 
 
@@ -217,26 +217,26 @@ def largest_difference(
     Parameters
     ----------
     stored, new : (n_numbers,) float
-        Statistics of the residuals, the sums of squares (n_channels,) first; further numbers have the order and the
+        Residual statistics, the sums of squares (n_channels,) first; further numbers have the channel order and the
         scale of the sums.
     norm : (n_channels,) float
-        Norm of the new response of each channel [SI].
+        Norm of the new response per channel [SI].
     tolerance : float
-        Accepted change of the response of a channel, relative to its norm; zero for equal bits.
+        Accepted change of a channel's response, relative to its norm; zero for equal bits.
     of_response : bool
-        Whether sums of squares of the response are among the further numbers.
+        Whether the further numbers contain sums of squared responses.
 
     Returns
     -------
     int, float
-        Index of the number, and the change of the response that explains its difference, relative as for `tolerance`;
-        None if all numbers agree.
+        Index of the number, and the response change that explains its difference, relative to the response norm; None
+        if all numbers agree.
 
     Notes
     -----
-    If a response of the norm r changes by t r, the sum of squares s^2 changes by at most 2 s t r + (t r)^2, and so does
-    a sum of products of two residuals of the channel. A sum of squares of the response changes by at most
-    2 r t r + (t r)^2. The rounding of the sums themselves is no change of the response.
+    If a response with norm r changes by t r, the sum of squared residuals s^2 changes by at most 2 s t r + (t r)^2, and
+    so does a sum over products of two residuals of the channel. A sum of squared responses changes by at most
+    2 r t r + (t r)^2. Rounding errors in the sums do not count as response changes.
     """
     if np.array_equal(stored, new):
         return None

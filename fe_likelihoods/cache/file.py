@@ -1,14 +1,14 @@
 """SQLite file of the simulation cache: how it is created, recognised, shared, and moved aside when damaged.
 
-The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a process that is killed during a
-transaction leaves the file as it was before it. The application id of the file identifies it as a cache, its user
-version is the version of the layout. A file with another id or version is never written to.
+The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a transaction whose process is
+killed has no effect. SQLite's application id identifies the file as a cache, the user version is the layout version. A
+file with another id or version is never written to.
 
 SQLite connections must not be used after a fork. Therefore every process has its own connection, opened when it is
-first needed, and the connections of a process are closed before it forks. WAL mode needs memory shared by all users of
-a file, so the file must be on a local disk, not on a network file system.
+first needed and closed before the process forks. WAL mode needs memory shared by all users of a file, so the file must
+be on a local disk, not on a network file system.
 
-A cache never makes a run fail: `CacheFile.attempt` logs an error of the file and returns what the run continues with.
+A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value with which the run continues.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from typing import Any
 try:
     from fcntl import LOCK_EX, LOCK_NB
     from fcntl import flock as lock_file
-except ImportError:  # without such locks two programs must not find the same damage at the same time
+except ImportError:  # without file locks, two programs must not move the same damaged file aside at the same time
     lock_file = None
 
 from .rows import transaction
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 4
-EARLIER = (2, 3)  # layouts of earlier releases, which are completed: without remarks, and without labels
+EARLIER = (2, 3)  # layouts of earlier releases, without remarks or labels; such files are completed
 GENERATION = "generation INTEGER NOT NULL DEFAULT 0"
 LABEL = "label INTEGER NOT NULL DEFAULT 0"
 ADDED = (GENERATION, LABEL)
@@ -53,27 +53,27 @@ LAYOUT = (
     # to find the last simulation of a model, or all of them
     "CREATE INDEX simulation_generations ON simulations (source, generation)",
     "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
-    # simulations that failed, for any measurements; a time limit of 0 is an answer of the model
+    # simulations that failed, for any measurements; a time limit of 0 marks a failure of the model
     "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
-    # what models said about their simulations
+    # remarks of models on their simulations
     "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "text BLOB NOT NULL)",
-    # labels of models, and the generation of simulations that belongs to them
+    # model labels, and the generation of each label
     "CREATE TABLE labels (id INTEGER PRIMARY KEY, source INTEGER NOT NULL, label BLOB NOT NULL, cpu BLOB NOT NULL, "
     "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
     "UNIQUE (source, label, cpu))",
 )
-# what earlier layouts lack, in the form in which SQLite adds it
+# statements that complete an earlier layout; the columns are as SQLite adds them
 COMPLETION = (
     LAYOUT[-2].replace("TABLE", "TABLE IF NOT EXISTS"),
     *(f"ALTER TABLE {table} ADD COLUMN {column}" for table in ("simulations", "responses") for column in ADDED),
     "DROP INDEX simulation_sources",
     LAYOUT[2],
     LAYOUT[-1],
-    "DELETE FROM failures",  # their keys contain a digest that is not computed any more, and they have no parameters
+    "DELETE FROM failures",  # their keys contain a digest of an earlier release, and they have no parameters
 )
-CHECK_SECONDS = 2.0  # limit of the integrity check on opening; rows have checksums of their own
+CHECK_SECONDS = 2.0  # limit for the integrity check on opening; each row has a checksum
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
@@ -122,7 +122,7 @@ def _is_damage(error: Exception) -> bool:
 
 
 def _is_earlier(layout: dict[str, str]) -> bool:
-    """Whether tables and indices, by name, are those of an earlier release."""
+    """Whether tables and indices (their SQL, by name) have the layout of an earlier release."""
     expected = {"simulations": LAYOUT[0], "responses": LAYOUT[1], "response_sizes": LAYOUT[3], "failures": LAYOUT[4]}
     expected = {name: sql.replace(f", {GENERATION}, {LABEL}", "") for name, sql in expected.items()}
     expected["simulation_sources"] = "CREATE INDEX simulation_sources ON simulations (source)"
@@ -136,7 +136,7 @@ class _Damaged(sqlite3.DatabaseError):
 
 
 class CacheFile:
-    """A file and the connection of this process to it. Hold `lock` while using the connection.
+    """A file and this process's connection to it. Hold `lock` while using the connection.
 
     Parameters
     ----------
@@ -150,13 +150,13 @@ class CacheFile:
     path : Path
         Absolute path without symbolic links.
     lock : threading.RLock
-        Lock of the threads of this process.
+        Lock between threads of this process.
     writable : bool
         False for a read-only file.
     retry_times : dict of str to float
-        Actions that failed, and the monotonic time [s] before which they are not tried again.
+        Actions that failed, with the monotonic time [s] before which they are not tried again.
     has_earlier_rows : bool or None
-        Whether there are rows of earlier releases; None until somebody has looked.
+        Whether there are rows of earlier releases; None until this was queried.
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
@@ -168,7 +168,7 @@ class CacheFile:
         self.has_earlier_rows: bool | None = None
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
-        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new one
+        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
         self._inode_of_cache: tuple[int, int] | None = None  # of the last file that was identified as a cache
         with _files_lock:
             _files.add(self)
@@ -213,7 +213,7 @@ class CacheFile:
                 self._replace(error)
 
     def damage(self) -> str:
-        """What is wrong with the contents of an existing file, which is not changed; empty for an undamaged cache.
+        """Describe the damage of an existing file, which is not changed; empty for an undamaged cache.
 
         Raises
         ------
@@ -247,9 +247,10 @@ class CacheFile:
             ) from failure
 
     def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
-        """Result of an action on the connection; after an error a warning, `otherwise`, and a pause of this action.
+        """Result of an action on the connection; `otherwise`, with a warning, if the action fails.
 
-        The warning names the action by the participle `what`, such as "read"; actions of one name pause together.
+        After a failure, all actions with the same name `what` pause for a while. The name is a participle, such as
+        "read", which the warning contains.
         """
         with self.lock:
             if time.monotonic() < self.retry_times.get(what, -math.inf):
@@ -279,7 +280,7 @@ class CacheFile:
             return otherwise
 
     def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
-        """Result of an action that the user has called explicitly; OSError where the file cannot be used."""
+        """Result of an action that the user has called explicitly; OSError if the file cannot be used."""
         with self.lock:
             try:
                 return action(self.connection())
@@ -291,11 +292,11 @@ class CacheFile:
                 raise
 
     def select(self, query: str, values: tuple = ()) -> list[tuple]:
-        """Rows of a query; none where the file cannot be read."""
+        """Rows of a query; none if the file cannot be read."""
         return self.attempt("read", lambda connection: connection.execute(query, values).fetchall(), [])
 
     def write(self, statement: str, rows: list[tuple], what: str = "written") -> bool:
-        """Execute a statement for some rows in one transaction; False where the file cannot be written."""
+        """Execute a statement for some rows in one transaction; False if the file cannot be written."""
 
         def execute(connection: sqlite3.Connection) -> bool:
             with transaction(connection):
@@ -313,7 +314,7 @@ class CacheFile:
         ValueError
             If the file belongs to another program or has another layout.
         sqlite3.Error
-            If it cannot be opened.
+            If the file cannot be opened.
         """
         if self._connection is None:
             with self._exclusive():
@@ -348,7 +349,7 @@ class CacheFile:
         ValueError
             If the file is not known to be a cache; it is not changed.
         OSError
-            If it cannot be renamed.
+            If the file cannot be renamed.
         """
         with self.lock, self._exclusive():
             self.close()
@@ -359,7 +360,7 @@ class CacheFile:
             n = 1
             while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
                 n += 1
-            # the log first, because SQLite would use it for a new file of the same name
+            # the log first, because SQLite would use it for a new file with the same name
             for suffix in ("-wal", "-shm", ""):
                 part = self.path.with_name(self.path.name + suffix)
                 if part.exists():
@@ -377,10 +378,10 @@ class CacheFile:
 
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:
-        """Lock on the folder, which prevents other processes from opening the file or moving it aside meanwhile.
+        """Lock the folder, so that no other process opens the file or moves it aside meanwhile.
 
-        SQLite finds the log by its name. A process that opened a damaged file while it is renamed would write to the
-        log of the new file. The file itself cannot be locked instead, because closing it releases SQLite's own locks.
+        SQLite finds the log by its name: a process that opens a damaged file while it is renamed would write to the
+        new file's log. The file itself cannot be locked instead, because closing it releases SQLite's locks.
         """
         if lock_file is None:
             yield
@@ -459,7 +460,7 @@ class CacheFile:
         connection.execute("COMMIT")
 
     def _complete(self, connection: sqlite3.Connection) -> None:
-        """Add to a file of an earlier release what it lacks, in one transaction."""
+        """Complete the layout of an earlier release, in one transaction."""
         version = "PRAGMA user_version"
         if connection.execute(version).fetchone() == (SCHEMA_VERSION,):
             return
@@ -475,7 +476,7 @@ class CacheFile:
         connection.execute("COMMIT")
 
     def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
-        """Execute a statement for which SQLite itself does not wait while another process holds a lock."""
+        """Execute a statement, waiting while another process holds a lock, where SQLite itself does not wait."""
         give_up = time.monotonic() + self.timeout
         while True:
             try:
@@ -487,7 +488,7 @@ class CacheFile:
             time.sleep(0.005)
 
     def _identify(self, connection: sqlite3.Connection) -> None:
-        """ValueError for a file of another program or release; `_Damaged` for other tables than expected."""
+        """ValueError for a file of another program or release; `_Damaged` for unexpected tables."""
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
         layout = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall())
@@ -507,7 +508,7 @@ class CacheFile:
 
     @staticmethod
     def _check_integrity(connection: sqlite3.Connection, seconds: float = CHECK_SECONDS) -> None:
-        """SQLite's own integrity check, as far as it gets in some seconds."""
+        """SQLite's integrity check, stopped after some seconds."""
         stop = time.monotonic() + seconds
         connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
         try:
@@ -522,10 +523,10 @@ class CacheFile:
             raise _Damaged(answer)
 
     def _refuse_other_files(self) -> None:
-        """ValueError if a damaged file need not be a cache, but may be a file of the user, such as a table.
+        """ValueError if a damaged file may be a user's file, such as a table, and not a cache.
 
-        Its first page shows what it is: a cache has the header of SQLite with the application id, of which a truncated
-        file has the beginning. A first page of zeros, in a file of whole pages, is a page that was never written.
+        The first page identifies a cache: it has SQLite's header with the application id, or the beginning of this
+        header in a truncated file. A first page of zeros, in a file of whole pages, was never written.
         """
         size = self.path.stat().st_size
         with open(self.path, "rb") as file:

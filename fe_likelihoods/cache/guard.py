@@ -1,10 +1,9 @@
-"""Models that change while they are used: a value that is set between two batches, a file that is edited.
+"""Detects models that change while they are used, as when a value is set between two batches or a file is edited.
 
-The results of two states of a model must not be mixed, neither in memory nor on disk. So the label of the model
-(`fe_likelihoods.simulation.label`) and its fingerprint are compared before and after simulations, in about 1 % of the
-time. Code of the user may change values itself, such as a counter or a table of earlier results. Therefore a difference
-alone is no error: the first and the latest simulation are run again, and the model counts as unchanged if they give the
-same results.
+Results from two states of a model must not be mixed, neither in memory nor on disk. So the model's label
+(`fe_likelihoods.simulation.label`) and fingerprint are compared before and after simulations, in about 1 % of the time.
+User code may change values itself, such as a counter or a table of earlier results. Therefore a difference alone is no
+error: the first and the latest simulation are repeated, and the model counts as unchanged if the results are the same.
 """
 
 import copy
@@ -22,42 +21,42 @@ __all__ = ["EarlierPoint", "ModelGuard"]
 
 _SHARE_OF_TIME = 0.01  # for comparisons
 _NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
-_ROWS_PER_REPETITION = 100  # simulations between two repetitions because of values that have changed before
+_ROWS_PER_REPETITION = 100  # simulations between two repetitions if only `changing` items have changed
 
 
 class EarlierPoint(NamedTuple):
-    """A simulation that may be run again."""
+    """A simulation that may be repeated."""
 
     theta: np.ndarray
     misfit: np.ndarray
 
 
 class ModelGuard:
-    """Compares a model with what it was at the start.
+    """Compares a model with its state at the start.
 
     Parameters
     ----------
     model : Model
     label : ModelLabel
-        Its label.
+        Label of the model.
 
     Attributes
     ----------
     known : ModelLabel
-        What the model is compared with.
+        Label that the model is compared with.
     points : list of EarlierPoint
         The first and the latest successful simulation.
     changing : set of str
-        Items of the label that have changed without an effect.
+        Label items that have changed without an effect on results.
     unchecked : list of (n, n_structural) ndarray
-        Parameters of the simulations since the last comparison.
+        Parameters simulated since the last comparison.
     compared, seconds : int, float
-        Simulations that were run again, and their wall time [s].
+        Simulations that were repeated, and their wall time [s].
     """
 
     def __init__(self, model: Model, label: ModelLabel) -> None:
         self._fingerprint = model.fingerprint
-        self.known = copy.copy(label)  # because the label of stored rows never changes
+        self.known = copy.copy(label)  # a copy, because the label of stored rows never changes
         self.changing: set[str] = label.changing
         self.compared, self.seconds = 0, 0.0
         self._begin()
@@ -65,7 +64,7 @@ class ModelGuard:
     def _begin(self) -> None:
         self.points: list[EarlierPoint] = []
         self.unchecked: list[np.ndarray] = []
-        self._rows_since = 0  # the last repetition
+        self._rows_since = 0  # since the last repetition
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
 
     def __getstate__(self) -> tuple:
@@ -76,12 +75,12 @@ class ModelGuard:
         self._begin()
 
     def before(self, run: VerifyingRun) -> None:
-        """Compare before simulations, unless the last comparison was too short ago.
+        """Compare before simulations, unless the last comparison was too recent.
 
         Raises
         ------
         ChangedModel
-            If the model has changed; the simulations at `unchecked` may be those of either state.
+            If the model has changed; the simulations at `unchecked` may come from either state.
         """
         self._is_due = time.monotonic() >= self._not_before
         if self._is_due:
@@ -98,7 +97,7 @@ class ModelGuard:
         seconds: float,
         last: bool = True,
     ) -> bool:
-        """Compare after simulations, if they were compared before them or took long; return whether.
+        """Compare after simulations if `before` compared and, with a pool, they took long; return whether it compared.
 
         Parameters
         ----------
@@ -110,9 +109,9 @@ class ModelGuard:
         reasons : list of n str
             Reasons of failures; empty where the simulation succeeded.
         seconds : float
-            Their wall time [s]; with a pool that runs without interruption, the time since the last comparison.
+            Wall time [s]; with a pool that runs without interruption, the time since the last comparison.
         last : bool
-            Whether no other simulations run. While some do, a comparison before them is no reason for one.
+            Whether no other simulations run. If others run, the model is not compared now.
 
         Raises
         ------
@@ -131,7 +130,7 @@ class ModelGuard:
         return due
 
     def _require_same(self, run: VerifyingRun, simulated_here: bool = False) -> None:
-        """Raise `ChangedModel` if the model differs in more than values that it changes itself."""
+        """Raise `ChangedModel` if the model has changed, except for values that it changes itself."""
         start = time.monotonic()
         same_fingerprint = run.model.fingerprint == self._fingerprint
         changed = self.known.changed(run.model)
@@ -140,7 +139,7 @@ class ModelGuard:
             self.unchecked.clear()
             return
         if same_fingerprint:
-            if not self.points and simulated_here:  # the first simulation has changed what it uses
+            if not self.points and simulated_here:  # the first simulation has changed values that it uses
                 self._accept(run.model, changed)
                 return
             if changed <= self.changing and (not self.points or self._rows_since < _ROWS_PER_REPETITION):
@@ -166,7 +165,7 @@ class ModelGuard:
         self.unchecked.clear()
 
     def _repeat(self, run: VerifyingRun) -> bool:
-        """Whether the first and the latest simulation give the earlier results, or the model is not repeatable."""
+        """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
         start = time.perf_counter()
         thetas = np.array([point.theta for point in self.points])
 

@@ -1,7 +1,7 @@
-"""Labels of models in a file, the generation of rows that each belongs to, and what a process knows of them.
+"""Model labels in a file, the generation of rows that each label belongs to, and their state in a process.
 
-A generation contains the simulations of one state of a model's code. Several labels belong to it: all gave equal
-results where they were compared (`fe_likelihoods.cache.adoption`).
+A generation contains the simulations of one state of a model's code. It may have several labels, which gave equal
+results when they were compared (`fe_likelihoods.cache.adoption`).
 """
 
 import contextlib
@@ -38,8 +38,8 @@ from .rows import (
 
 __all__ = ["OWN", "Trust", "labels_of", "shared_trust"]
 
-OWN = 2**40  # rows compared by the label with which a generation began: it stored them itself
-MAX_OWN_KEYS = 200_000  # of 16 bytes, about 100 bytes each in memory
+OWN = 2**40  # `compared` of the label with which a generation began, whose rows need no comparison
+MAX_OWN_KEYS = 200_000  # keys of 16 bytes; each takes about 100 bytes in memory
 MAX_TRUSTS = 32
 
 
@@ -47,14 +47,14 @@ MAX_TRUSTS = 32
 
 
 def labels_of(file: CacheFile, source: int) -> list[StoredLabel]:
-    """Labels under which simulations of a model, given by its source number, were stored or adopted."""
+    """Labels under which the simulations of a source number were stored or adopted."""
     query = f"SELECT {LABEL_COLUMNS} FROM labels WHERE source = ? ORDER BY rowid"
     rows = file.select(query, (source,))
     return [unpack_label(*row) for row in rows if is_undamaged_label(*row)]
 
 
 def _enter(file: CacheFile, label: StoredLabel, move: bool) -> StoredLabel:
-    """Store a label unless another process has stored it, or `move` it to its generation; return the stored one."""
+    """Store a label unless another process has stored it (`move`: replace its generation); return the stored label."""
 
     def enter(connection: sqlite3.Connection) -> StoredLabel:
         with transaction(connection):
@@ -79,21 +79,21 @@ def _enter(file: CacheFile, label: StoredLabel, move: bool) -> StoredLabel:
 class Trust:
     """Label and generation of a model in a file, and which rows are trusted in this process.
 
-    Likelihoods share it (`shared_trust`), those that were derived from one, and their copies.
+    Likelihoods with the same file, model and pool share it (`shared_trust`), as do derived likelihoods and copies.
 
     Parameters
     ----------
     label : ModelLabel
-        Completed by simulations.
+        Label of the model, completed by simulations.
     is_local : bool
         Whether simulations run on this machine, so that the processor is known.
     token : str
-        Identifies the object in other processes, where it starts anew.
+        Identifies the object in other processes, where it starts without trusted rows.
 
     Attributes
     ----------
     stored : StoredLabel or None
-        The label as it is in the file; None until it is known.
+        The label in the file; None until it is known.
     generations : dict of str to int
         Generation in use for the rows of a fingerprint.
     served : Counter
@@ -122,7 +122,7 @@ class Trust:
 
     @property
     def lock(self) -> threading.RLock:
-        """A lock that no thread of a parent process held at the time of the fork."""
+        """Lock of this process; replaced after a fork, when another thread of the parent may have held it."""
         if self._owner != os.getpid():
             self._lock, self._owner = threading.RLock(), os.getpid()
         return self._lock
@@ -133,9 +133,9 @@ class Trust:
         return cpu_name() if self.is_local else ""
 
     def find(self, file: CacheFile, model: Model) -> StoredLabel | None:
-        """The label as it is in the file; None if it is unknown there.
+        """The label in the file; None if it is unknown there.
 
-        Files that earlier simulations have opened are part of it, as they are now.
+        The label includes the present contents of files that earlier simulations have opened.
         """
         source = source_number(model.fingerprint)
         if self.stored is not None and source != self.stored.source:  # another length of the record, for example
@@ -155,21 +155,21 @@ class Trust:
         return self.stored
 
     def _text_with(self, files: tuple[str, ...]) -> str:
-        """Text of the label, if these files were all that simulations opened."""
+        """Text of the label if simulations had opened exactly these files."""
         known = copy.copy(self.label)
         known.opened = Opened({path: self.label.opened.files.get(path, "") for path in files})
         return known.text
 
     def adopt(self, file: CacheFile, model: Model, generation: int, compared: int) -> None:
-        """Enter the label in the file as one of a generation, of which some rows were compared."""
+        """Add the label to a generation in the file, after `compared` of its rows were compared."""
         self._of_others.clear()
         self.stored = self._add(file, model, generation, compared)
 
     def begin(self, file: CacheFile, model: Model, used: set[int]) -> None:
-        """Begin a generation, or go on with the one that another process has begun under the same label."""
+        """Begin a generation, or continue the generation that another process has begun under the same label."""
         text = f"{model.fingerprint} {self.label.text}".encode()
         generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
-        if generation in used:  # rows of this label that differ
+        if generation in used:  # it contains rows that differ
             generation = secrets.randbits(62) | 1
         move = self.stored is not None
         self._of_others.clear()
@@ -177,18 +177,18 @@ class Trust:
         self.generations.clear()
 
     def start_again(self) -> None:
-        """Verify all rows anew, those of this process too."""
+        """Verify all rows again, including rows that this process has stored."""
         self.served.clear()
         self.own.clear()
 
     def add_own(self, thetas: np.ndarray, generation: int, *fingerprints: str) -> None:
-        """State that simulations were run and stored in this process."""
+        """Record that simulations were run and stored in this process."""
         if len(self.own) < MAX_OWN_KEYS:
             for fingerprint in fingerprints:
                 self.own.update(simulation_keys(fingerprint, thetas, generation))
 
     def complete(self, file: CacheFile, opened: Opened | None) -> None:
-        """Add to the label what simulations opened."""
+        """Add what simulations opened to the label."""
         if opened is not None:
             with self.lock:
                 if self.label.add(opened):
@@ -207,8 +207,8 @@ class Trust:
         return _enter(file, StoredLabel(number, source, self.label.text, self.cpu, generation, compared, files), move)
 
 
-# of this process, the most recently used last
-_by_token: "OrderedDict[str, Trust]" = OrderedDict()  # of pickled objects: copies in a process share one
+# objects of this process, the most recently used last
+_by_token: "OrderedDict[str, Trust]" = OrderedDict()  # pickled objects: all copies in a process share one object
 _shared: "list[tuple[tuple, list[Callable], Trust]]" = []
 
 
@@ -225,10 +225,10 @@ def _remember(token: str, trust: Trust) -> Trust:
 
 
 def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats_bits: bool) -> Trust:
-    """The object for a file, a model in its present state, and a pool; this process makes it once.
+    """The `Trust` of this process for a file, a model in its present state, and a pool.
 
-    Two compiled models of this library with equal values are the same. A model that runs code of the user may have a
-    state that neither its fingerprint nor its label contains, so the object counts, and so does its pool.
+    Compiled models of this library with equal values share it. A model that runs user code may have a state that
+    neither its fingerprint nor its label contains, so only the same model object with the same pool shares it.
 
     Parameters
     ----------
@@ -249,18 +249,18 @@ def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats
     others, found = [], Trust(label, is_local, uuid.uuid4().hex)
     for known, referred, trust in list(_shared):
         if known == key and all(refer() is each for refer, each in zip(referred, objects, strict=True)):
-            stored = trust.stored  # not in the file if another one has replaced it
+            stored = trust.stored  # no longer in the file if another label has replaced it
             if stored is None or stored.id in {each.id for each in labels_of(cache.file, stored.source)}:
                 found = trust
         elif all(refer() is not None for refer in referred):
             others.append((known, referred, trust))
-    # a new list, since another thread may look for its own at the same time
+    # a new list, since another thread may search at the same time
     _shared[:] = [*others[1 - MAX_TRUSTS :], (key, [_reference(each) for each in objects], found)]
     return found
 
 
 def _reference(value: Any) -> Callable[[], Any]:
-    """A weak reference, or a strong one where the class allows no other."""
+    """A weak reference, or a strong reference if the class does not allow weak ones."""
     try:
         return weakref.ref(value)
     except TypeError:

@@ -1,8 +1,8 @@
-"""Simulations in memory: caches of recent statistics and responses, and rows on their way to the file.
+"""Simulations in memory: caches of recent statistics and responses, and rows that wait to be written.
 
-The statistics of the residuals do not depend on the noise parameters. They are reused when only these change, when a
-sampler returns to a point, and when a chain is evaluated again. Responses do not depend on the measurements and on the
-noise either. They are reused when a search for modes is repeated, and by likelihoods of the same model.
+Residual statistics do not depend on the noise parameters. They are reused when only noise parameters change, when a
+sampler returns to a point, and when a chain is evaluated again. Responses depend neither on the noise nor on the
+measurements. They are reused when a mode search is repeated, and by other likelihoods with the same model.
 """
 
 import logging
@@ -21,18 +21,18 @@ logger = logging.getLogger(__name__)
 SECONDS_BETWEEN_WRITES = 1.0
 MOST_BYTES = 2**26  # of responses that wait to be written
 _NAN = np.array([np.nan]).tobytes()
-_ENTRY_BYTES = 250  # of an entry of the response memory besides its numbers
+_ENTRY_BYTES = 250  # memory of one stored response, besides its numbers
 
 
 def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
-    """Bytes of the distinct rows of a float array, by first appearance, and the index of every row in them."""
+    """Bytes of a float array's distinct rows, in order of appearance, and the index of every row among them."""
     first: dict[bytes, int] = {}
     which = [first.setdefault(row.tobytes(), len(first)) for row in rows + 0.0]  # adding zero makes 0.0 of -0.0
     return list(first), which
 
 
 def _as_limit(name: str, what: str, value: Any) -> int:
-    """The limit of a cache as int; ValueError for anything but a whole number of 0 or more."""
+    """A cache limit as int; ValueError for anything but a whole number of 0 or more."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise ValueError(f"{name} must be the {what}, a whole number of 0 or more; got {value!r}")
     return int(value)
@@ -41,8 +41,8 @@ def _as_limit(name: str, what: str, value: Any) -> int:
 class MemoryCache:
     """Least-recently-used cache of statistics, with the bytes of the structural parameters as keys.
 
-    Failures are cached as NaN. The cache may be shared by threads. It is empty after unpickling, because its contents
-    would be larger than anything else in the pickle.
+    Failures are cached as NaN. Threads may share the cache. It is empty after unpickling, because its contents would
+    dominate the size of the pickle.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class MemoryCache:
         return misfits, [misfit is not None for misfit in found]
 
     def successes(self, n_structural: int) -> np.ndarray:
-        """Structural parameters (n, n_structural) of the cached simulations that did not fail."""
+        """Structural parameters (n, n_structural) of cached simulations that did not fail."""
         with self._lock:
             keys = [key for key, misfit in self._misfits.items() if not np.isnan(np.frombuffer(misfit)).any()]
         return np.frombuffer(b"".join(keys), dtype=float).reshape(-1, n_structural)
@@ -108,15 +108,15 @@ class MemoryCache:
 
 
 class ResponseMemory:
-    """The most recently stored responses, in double precision, and the reasons of the failures among them.
+    """The most recently stored responses in double precision, and reasons of failures.
 
-    Likelihoods of one model and of its shortened versions share one. It may be shared by threads. It is empty after
-    unpickling, as a `MemoryCache` is.
+    Likelihoods with the same model or shortened versions of it share one. Threads may share it. It is empty after
+    unpickling, like a `MemoryCache`.
 
     Parameters
     ----------
     max_bytes : int
-        Largest size [bytes]; 0 for no responses. The oldest are dropped, with a message at level INFO at the first one.
+        Largest size [bytes]; 0 for no responses. The oldest are dropped; the first time, a message at level INFO.
 
     Attributes
     ----------
@@ -143,16 +143,16 @@ class ResponseMemory:
         return len(self._outcomes)
 
     def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
-        """Stored outcomes of simulations of the model with a fingerprint, by keys of `distinct_keys`.
+        """Stored outcomes for a model's fingerprint and keys from `distinct_keys`.
 
-        The response (n_channels, n_steps) [SI], not to be changed; the reason (str) where the simulation failed; None
-        where nothing is stored.
+        An outcome is the response (n_channels, n_steps) [SI], not to be changed; the reason (str) if the simulation
+        failed; None if nothing is stored.
         """
         with self._lock:
             return [self._outcomes.get((fingerprint, key)) for key in keys]
 
     def store(self, fingerprint: str, keys: Sequence[bytes], outcomes: Iterable[np.ndarray | str]) -> None:
-        """Store copies of responses, and reasons of failures; the oldest beyond the limit are dropped."""
+        """Store copies of responses, and reasons of failures; drops the oldest outcomes beyond the limit."""
         if not self.max_bytes:
             return
         with self._lock:
@@ -217,8 +217,8 @@ class FinishedRows(NamedTuple):
 class RowBuffer:
     """Rows that wait to be written.
 
-    The first rows are written at once, later ones together, a second after the last write: by the thread that adds
-    them, or by a timer if no more come.
+    The first rows are written at once, later rows together, one second after the last write: by the thread that adds
+    rows, or by a timer if no more rows are added.
     """
 
     def __init__(self) -> None:
@@ -238,7 +238,7 @@ class RowBuffer:
             if wait <= 0.0 or self._bytes > MOST_BYTES:
                 self.flush()
             elif self._timer is None:
-                self._timer = threading.Timer(wait, self.flush)  # no daemon: the process ends after the last rows
+                self._timer = threading.Timer(wait, self.flush)  # no daemon: rows are written before the process ends
                 self._timer.start()
 
     def flush(self) -> None:
@@ -252,7 +252,7 @@ class RowBuffer:
             rows, self._rows, self._bytes = self._rows, [], 0
             self._last = time.monotonic()
             write, self._write = self._write, None  # it refers to the likelihood
-            # those with responses apart: one cannot be stored without the other
+            # separately with and without responses, since `write` takes either responses for all rows or none
             for some in ([r for r in rows if r.response is None], [r for r in rows if r.response is not None]):
                 if some:
                     write(_joined(some))

@@ -48,7 +48,7 @@ __all__ = [
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc, generation, label"
 RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response, generation, label"
 LABEL_COLUMNS = "id, source, label, cpu, generation, compared, files, crc"
-OF_EARLIER_RELEASES = 0  # the generation of rows whose keys contain a digest that is not computed any more
+OF_EARLIER_RELEASES = 0  # generation of rows from earlier releases, whose keys cannot be computed any more
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
@@ -71,11 +71,11 @@ STORE_FAILURE = (
     "stops = CASE WHEN time_limit = excluded.time_limit THEN stops + 1 ELSE 1 END, "
     "reason = excluded.reason, time_limit = excluded.time_limit, crc = excluded.crc"
 )
-MIN_STOPS = 2  # runs that were stopped at a time limit, before the limit is taken as the cause and not a busy machine
+MIN_STOPS = 2  # stops at a time limit before the simulation counts as too slow; a busy machine may cause the first
 
 
 class CachedRows(NamedTuple):
-    """Result of looking up n simulations.
+    """Stored rows for n simulations.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class CachedRows(NamedTuple):
 
 
 class StoredSimulation(NamedTuple):
-    """One simulation of a cache.
+    """One stored simulation.
 
     Attributes
     ----------
@@ -119,17 +119,17 @@ class StoredLabel(NamedTuple):
     Attributes
     ----------
     id : int
-        What rows name it by.
+        Number by which rows refer to the label.
     source : int
-        Of the model.
+        Source number of the model.
     label : str
         See `fe_likelihoods.simulation.label.ModelLabel`.
     cpu : str
         Name of the processor.
     generation : int
-        The rows that belong together.
+        Generation that the label belongs to.
     compared : int
-        Number of rows that were compared before those of other labels were adopted.
+        Number of rows that were compared before the rows of other labels were adopted.
     files : tuple of str
         Paths of the files that simulations opened.
     """
@@ -152,7 +152,7 @@ def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -
     Parameters
     ----------
     fingerprint : str
-        Everything declared that a simulation depends on, but the parameters.
+        Declared identity: everything that a simulation depends on, except the parameters.
     thetas : (n, n_structural) float
         Structural parameters; -0.0 and 0.0 have the same key.
     generation : int
@@ -168,12 +168,12 @@ def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -
 
 
 def source_number(fingerprint: str) -> int:
-    """Number of 64 bits that identifies all simulations of one model against one set of measurements."""
+    """64-bit number of a fingerprint; identifies all simulations of one model against one set of measurements."""
     return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
 
 
 def checksum(*values: Any) -> int:
-    """CRC-32 of the values of `COLUMNS`, its own left out: values of another key are found to be damaged."""
+    """CRC-32 of the values in `COLUMNS` except the checksum; the key is included, so swapped rows count as damaged."""
     key, source, theta, misfit, n_steps, reason, seconds, generation, label = values
     # earlier releases stored no generation and no label
     numbers = NUMBERS.pack(source, n_steps, seconds) + (LABEL_NUMBERS.pack(generation, label) if generation else b"")
@@ -233,9 +233,9 @@ def pack_response(
 
 
 def pack_failure(key: bytes, source: int, reason: str) -> tuple | None:
-    """A failure as it is stored: key, source, reason, time limit [s], checksum; None if it is not stored.
+    """A failure as it is stored: key, source, reason, time limit [s], checksum; None for failures that are not stored.
 
-    Failures that depend on the measurements are not stored, nor are faults of the infrastructure except time limits.
+    Not stored are failures that depend on the measurements, and faults of the infrastructure except time limits.
     """
     time_limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
     if not reason or isinstance(reason, MisfitReason) or (isinstance(reason, TransientReason) and not time_limit):
@@ -273,9 +273,9 @@ def unpack_label(*row: Any) -> StoredLabel:
 
 
 def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tuple:
-    """A stored simulation, given by the values of `COLUMNS`, as one of another identity and generation.
+    """A stored simulation, given by the values of `COLUMNS`, moved to another identity and generation.
 
-    Returns key, source, checksum, generation, label, and the key that the row had.
+    Returns key, source, checksum, generation, label, and the former key.
     """
     (key,) = simulation_keys(fingerprint, np.frombuffer(row[2], dtype="<f8")[None], generation)
     source = source_number(fingerprint)
@@ -295,7 +295,7 @@ def _encoded(reason: str) -> bytes:
 
 @contextlib.contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """One transaction that writes; an error inside rolls it back."""
+    """A write transaction; an error inside rolls it back."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield connection
@@ -321,7 +321,7 @@ def select_rows(
 def insert_rows(
     connection: sqlite3.Connection, statement: str, rows: list[tuple], max_rows: int, max_response_bytes: int
 ) -> tuple[int, int]:
-    """Store rows in one transaction, which also evicts the oldest.
+    """Store rows and evict the oldest, in one transaction.
 
     Parameters
     ----------

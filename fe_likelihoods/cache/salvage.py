@@ -1,10 +1,9 @@
-"""Rows of a damaged cache that can still be read, copied to the new one.
+"""Copies the readable rows of a damaged cache to the new cache.
 
-A damaged page of an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Ranges of
-row numbers are read, and halved where they fail, until only the rows of the damaged pages are left out. Each row has a
-checksum of its own, so nothing wrong is copied. Simulations and responses are copied, and labels if they can be read:
-rows of an unknown label are verified. Failures that are stored for any measurements, and remarks, are not: they can be
-simulated again.
+A damaged page in an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Therefore
+ranges of row numbers are read, and halved where they fail, until only rows on damaged pages are left out. Each row has
+a checksum, so nothing wrong is copied. Simulations and responses are copied, and labels if they can be read (rows of an
+unknown label are verified). Remarks and the table of failures are not copied: simulations yield them again.
 """
 
 import contextlib
@@ -33,11 +32,11 @@ __all__ = ["Salvaged", "number_or_unknown", "read_options", "salvage"]
 logger = logging.getLogger(__name__)
 
 SECONDS = 60.0
-FEWEST_BYTES = 100  # of a row; bounds the row numbers where they cannot be queried
+FEWEST_BYTES = 100  # per row; bounds the row numbers if they cannot be queried
 
 
 class _Table(NamedTuple):
-    """A table that is copied: its columns, its statement, the check of a row, and the rows that are read together."""
+    """A table to copy: its columns, the statement and check for a row, and the number of rows per query."""
 
     name: str
     columns: str
@@ -52,9 +51,9 @@ _ADDED = "generation, label"  # columns that files of earlier releases do not ha
 
 
 class Salvaged(NamedTuple):
-    """Numbers of simulations and responses that were copied, and that cannot be read or have a wrong checksum.
+    """Numbers of simulations and responses that were copied, and that are lost (unreadable or a wrong checksum).
 
-    Where rows had been deleted, at most so many were lost; None where the file does not tell how many there were.
+    The numbers of lost rows are upper bounds, since they may count deleted rows; None if they are unknown.
     """
 
     rows: int
@@ -83,22 +82,22 @@ def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
 def _opened(damaged: Path) -> Iterator[sqlite3.Connection]:
     with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{read_options(damaged)}", uri=True)) as source:
         source.text_factory = bytes
-        source.execute("PRAGMA writable_schema = ON")  # a file that was cut off is read as far as it goes
+        source.execute("PRAGMA writable_schema = ON")  # so that a truncated file can be read
         yield source
 
 
 def read_options(path: Path) -> str:
-    """Options of SQLite to read a file without changing it; one without a log is not in use, and no log is created."""
+    """SQLite options to read a file without changing it; a file without a log is not in use, and gets no log."""
     return "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "mode=ro&immutable=1"
 
 
 def number_or_unknown(n: int | None) -> str:
-    """A number of rows in words."""
+    """A number of rows as text."""
     return "an unknown number" if n is None else str(n)
 
 
 def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple[int, int | None]:
-    """Copy the readable rows of a table; return how many were copied, and how many were lost, None if not known."""
+    """Copy the readable rows of a table; return how many were copied, and how many were lost (None if unknown)."""
     kept, lost, known = 0, 0, True
     try:
         with _opened(damaged) as source:
@@ -120,7 +119,7 @@ def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple
 
 
 def _as_stored(source: sqlite3.Connection, table: _Table) -> _Table:
-    """The table with the columns that it has in a file, and zeros in place of those that are not there."""
+    """The table with zeros in place of columns that a file of an earlier release does not have."""
     with contextlib.suppress(sqlite3.DatabaseError):
         known = [name for _, name, *_ in source.execute(f"PRAGMA table_info({table.name})")]
         if known and b"label" not in known:
@@ -131,7 +130,7 @@ def _as_stored(source: sqlite3.Connection, table: _Table) -> _Table:
 def _ranges(
     source: sqlite3.Connection, path: Path, table: _Table, largest: int
 ) -> Iterator[tuple[list[tuple], int | None]]:
-    """Rows of consecutive ranges of row numbers, and how many rows of each cannot be read, None if not known."""
+    """Rows in consecutive ranges of row numbers, and how many rows per range are unreadable (None if unknown)."""
     query = f"SELECT {table.columns} FROM {table.name} WHERE id BETWEEN ? AND ?"
     stop = time.monotonic() + SECONDS
     waiting = [(1, largest)]

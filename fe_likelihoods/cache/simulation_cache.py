@@ -1,21 +1,20 @@
 """Cache of simulations on disk, shared by runs, samplers, processes and programs.
 
-The sums of squared residuals of a simulation are stored, one number per channel. They depend neither on the noise nor
+For each simulation, the sum of squared residuals is stored, one number per channel. It depends neither on the noise nor
 on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
-simulation is a digest of the declared identity of model and measurements (fingerprints), of the generation, and of the
+simulation is a digest of the declared identity (fingerprints of model and measurements), the generation, and the
 structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
-model's code (`fe_likelihoods.cache.adoption`); rows of another one stay in the file and are not used. The oldest rows
-are evicted in the end.
+model's code (`fe_likelihoods.cache.adoption`); rows of other generations stay in the file and are not used. When the
+cache is full, the oldest rows are evicted.
 
-Responses are stored where they were requested, as a guide does, or for every simulation. They depend on the model alone
-and are stored in double precision: in single precision, a response with an offset of a million times its noise would
-lose its digits. Compression without loss would save 10 to 25 % of their size and is not used.
+Responses are stored if they are requested, for example by a guide, or for every simulation. They depend on the model
+alone. They are stored in double precision: in single precision, a response with an offset of a million times its noise
+would lose its digits. Lossless compression would save only 10 to 25 %, and is not used.
 
-Failures are stored as well if they are answers of the model: under a key of the model, so that they hold for any
-measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run simulates
-the point again. A simulation that was stopped at a time limit is stored together with this limit: a later run with a
-longer limit simulates it again, and one with the same or a shorter limit does so once, because a busy machine may have
-been the cause.
+Failures of the model are stored under a key of the model, so that they are valid for any measurements. Faults of the
+infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run simulates the point again. A simulation
+that was stopped at a time limit is stored together with this limit. A later run with a longer limit repeats it; a run
+with the same or a shorter limit repeats it once, because a busy machine may have been the cause.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
@@ -64,7 +63,7 @@ __all__ = ["MAX_CANDIDATES", "CacheInfo", "SimulationCache", "rows_to_compare"]
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
-MAX_CANDIDATES = 5000  # rows among which those to be compared are chosen
+MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 CONFIDENCE = 0.95
 STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
 TABLES = ("simulations", "responses", "failures", "remarks")
@@ -81,14 +80,14 @@ class CacheInfo(NamedTuple):
     path : Path
         The file.
     simulations, failures, responses : int
-        Number of stored simulations, of failed ones among them, and of stored responses.
+        Numbers of stored simulations, failed simulations among them, and stored responses.
     response_bytes, file_bytes : int
-        Size of the responses, and of the file without its write-ahead log [bytes].
+        Sizes of the responses, and of the file without its write-ahead log [bytes].
     seconds : float
         Wall time of the stored simulations [s].
     hits, misses, evictions, damaged, verified : int
-        Rows found, not found, evicted, found damaged, and simulated again without a difference, by this object in this
-        process.
+        Rows that this object has found, not found, evicted, found damaged, and simulated again without a difference, in
+        this process.
     """
 
     path: Path
@@ -108,8 +107,8 @@ class CacheInfo(NamedTuple):
 def rows_to_compare(verify: bool | int | str) -> int:
     """Number of rows that are simulated again before rows of an unknown label are used.
 
-    `verify` is that of `SimulationCache`: a share such as "5 %" stands for the number of rows with which a change of
-    that share of the space is found with a probability of 95 %. ValueError for anything else.
+    `verify` is as for `SimulationCache`. A share such as "5 %" stands for the number of rows that detect a change in
+    5 % of the parameter space with a probability of 95 %. ValueError for anything else.
     """
     if isinstance(verify, bool):
         return rows_to_compare("5 %") if verify else 0
@@ -127,40 +126,40 @@ def rows_to_compare(verify: bool | int | str) -> int:
 
 
 class SimulationCache:
-    """Cache of the sums of squared residuals of simulations, in one SQLite file.
+    """Cache of simulations (sums of squared residuals, responses and failures) in one SQLite file.
 
     Any number of threads, processes and programs may use a file at the same time, each process through its own
     connection. The object may be forked and pickled: another process opens the file by its path. The file must be on a
-    local disk, because SQLite's shared memory does not work on network file systems. On a cluster let the parent
+    local disk, because SQLite's shared memory does not work on network file systems. On a cluster, let the parent
     process own the cache (``FELikelihood(..., pool=...)``); its workers return sums.
 
-    Stored rows survive the death of the process, also by ``kill -9``; a power failure may lose the last seconds.
+    Stored rows survive if the process is killed, even by ``kill -9``; a power failure may lose the last seconds.
 
     Parameters
     ----------
     path : path
         The file; created if it does not exist. A read-only file is used for reading, with a warning.
     max_rows : int
-        Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond it.
+        Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond this number.
     retry_failures : bool
         Run failed simulations again, after a change that no fingerprint contains (an external program, a licence).
     responses : bool
-        Store the response of every simulation. By default only the responses that are requested are stored
+        Store the response of every simulation. By default, only requested responses are stored
         (`FELikelihood.simulate`, guides).
     max_response_bytes : int
-        Largest size of the stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted, with a
-        message at level INFO at the first one.
+        Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted; the
+        first time, a message at level INFO.
     timeout : float
         How long to wait for another writer [s].
     verify : bool, int or str
-        How many stored rows are simulated again before the others are used (`fe_likelihoods.cache.verification`). Where
-        the label of the model is known: two rows per process, and one of every 1000. Where it is unknown, because code,
-        a file or a package has changed: so many that a change in 5 % of the space is found with a probability of 95 %
-        (59 rows, or all there are). Another share, such as "2 %", or a number of rows; False: none.
+        How many stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`). If
+        the model's label is known: two rows per process, and one of every 1000. If it is unknown, because code, a file
+        or a package has changed: enough rows to detect a change in 5 % of the parameter space with a probability of
+        95 % (59 rows, or all rows). Give another share, such as "2 %", or a number of rows; False for no rows.
     tolerance : float, optional
-        Accepted difference of a response that is simulated again, relative to the norm of the response. By default 0
-        for the compiled models of this library on the same processor, 1e-9 on another one and for other models, or
-        their attribute ``response_tolerance``.
+        Accepted difference between a stored and a new response, relative to the response norm. By default the model's
+        attribute ``response_tolerance``: 0 for the compiled models of this library on the same processor, 1e-9 on
+        another processor and for other models.
 
     Attributes
     ----------
@@ -184,9 +183,9 @@ class SimulationCache:
 
     Notes
     -----
-    Methods for rows have the arguments `fingerprint`, everything declared, but the parameters, that rows depend on
-    (`FELikelihood.simulation_key` for statistics, the model's own for responses and failures), `thetas`, the structural
-    parameters (n, n_structural), and `generation` and `label` of a `StoredLabel`; by default the latest generation.
+    Methods for rows have the arguments `fingerprint`, the declared identity (`FELikelihood.simulation_key` for
+    statistics, the model's fingerprint for responses and failures); `thetas`, the structural parameters
+    (n, n_structural); and `generation` and `label` of a `StoredLabel`, by default the latest generation.
 
     Examples
     --------
@@ -281,14 +280,14 @@ class SimulationCache:
         generation: int | None = None,
         label: int = 0,
     ) -> None:
-        """Store simulations in one transaction that also evicts; failed ones unless the reason is a `TransientReason`.
+        """Store simulations and evict the oldest, in one transaction; a `TransientReason` is not stored.
 
         Parameters
         ----------
         fingerprint, thetas, generation, label
             See the notes of the class.
         n_steps : int
-            Number of samples of the measurements.
+            Number of measured samples.
         misfit : (n, n_channels) float
             Sums of squared residuals [SI unit of the channel, squared].
         reasons : sequence of n str
@@ -308,7 +307,7 @@ class SimulationCache:
     def store_responses(
         self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int | None = None, label: int = 0
     ) -> None:
-        """Store finite responses (n, n_channels, n_steps) [SI], in one transaction that also evicts."""
+        """Store finite responses (n, n_channels, n_steps) [SI] and evict the oldest, in one transaction."""
         generation = self._given_or_latest(model.fingerprint, generation)
         keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
         rows = [
@@ -323,7 +322,7 @@ class SimulationCache:
     ) -> list[np.ndarray | None]:
         """Responses (n_channels, n_steps) [SI] of a model.
 
-        None where a response is not stored, or in single precision, by an earlier version.
+        None for a response that is not stored, or was stored by an earlier version in single precision.
         """
         shape = len(model.channels), model.n_steps
         size = 8 * shape[0] * shape[1]
@@ -341,7 +340,7 @@ class SimulationCache:
     def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
         """Whether a simulation, a response or a failure is stored (n,), under one of several fingerprints.
 
-        The rows are neither verified nor checked for damage, and not counted.
+        Rows are not verified, not checked for damage, and not counted as hits.
         """
         stored = np.zeros(len(thetas), dtype=bool)
         for fingerprint in fingerprints:
@@ -357,7 +356,7 @@ class SimulationCache:
     ) -> None:
         """Store failures of a model for any measurements, and simulations that were stopped at a time limit.
 
-        Reasons are empty where the simulation succeeded. A `MisfitReason` is not stored, nor is a `TransientReason`
+        Reasons are empty where the simulation succeeded. Not stored are a `MisfitReason`, and a `TransientReason`
         without a time limit.
         """
         generation = self._given_or_latest(model.fingerprint, generation)
@@ -366,9 +365,9 @@ class SimulationCache:
         self._write(STORE_FAILURE, [row for row in rows if row is not None])
 
     def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int | None = None) -> list[str]:
-        """Reasons of stored failures that are answers for any measurements; empty where the simulation has to be run.
+        """Reasons of stored failures that are valid for any measurements; empty where the simulation must be run.
 
-        The model's ``time_limit`` [s], if there is one, is compared with that of the stored failures.
+        The model's ``time_limit`` [s], if there is one, is compared with the time limits of stored failures.
         """
         if self.retry_failures:
             return [""] * len(thetas)
@@ -386,7 +385,7 @@ class SimulationCache:
         return [found.get(key, "") for key in keys]
 
     def store_remark(self, model: Model) -> None:
-        """Store the attribute `range_remark` of a model, if it has one and none is stored: a law beyond its range."""
+        """Store a model's `range_remark` (a law was used beyond its range), unless it is empty or one is stored."""
         if text := getattr(model, "range_remark", ""):
             source = source_number(model.fingerprint)
             key = source.to_bytes(8, "little", signed=True)
@@ -398,10 +397,10 @@ class SimulationCache:
         return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
 
     def repeat_remark(self, model: Model) -> None:
-        """Log the stored remark of a model, once per process and not where the model has made one itself.
+        """Log a model's stored remark, once per process, unless the model has just made a remark itself.
 
-        A built-in model says once, as a warning, that a simulation was beyond the range of its laws. A later process
-        that takes the simulations from the cache would hear nothing.
+        A built-in model warns once if a simulation was beyond the range of its laws. Without the stored remark, a later
+        process that uses cached simulations would give no warning.
         """
         place = str(self.path), model.fingerprint
         if not hasattr(model, "range_remark") or place in _repeated:
@@ -414,7 +413,7 @@ class SimulationCache:
     # generations ------------------------------------------------------------------------------------------------------
 
     def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
-        """Generations of the simulations, or of the responses, of one identity, the latest first."""
+        """Generations of one identity's simulations or responses, the latest first."""
         query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
@@ -426,12 +425,12 @@ class SimulationCache:
         Parameters
         ----------
         fingerprint : str or int
-            Or the number of a source of an earlier release.
+            Fingerprint, or a source number from an earlier release.
         generation : int
         n_channels, n_steps : int
             Shape of the measurements.
         most : int
-            Largest number of rows, about.
+            Approximate largest number of rows.
         """
         values = fingerprint if isinstance(fingerprint, int) else source_number(fingerprint), generation
         where = "FROM simulations WHERE source = ? AND generation = ?"
@@ -452,7 +451,7 @@ class SimulationCache:
         return [(np.frombuffer(theta, dtype="<f8"), label) for theta, label in rows if isinstance(theta, bytes)]
 
     def label_of(self, fingerprint: str, theta: np.ndarray, generation: int) -> int:
-        """Id of the label under which a simulation or a response was stored; 0 if it is not known."""
+        """Id of the label under which a simulation or a response was stored; 0 if unknown."""
         keys = simulation_keys(fingerprint, theta[None], generation)
         found = [row for table in TABLES[:2] for row in self._rows(keys, f"label FROM {table}")]
         return found[0][0] if found else 0
@@ -460,7 +459,7 @@ class SimulationCache:
     # the file ---------------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
-        """Write a copy of the cache, with all rows, to a new file: to archive it, or to take it to another machine.
+        """Copy the cache with all rows to a new file, for an archive or another machine.
 
         Returns
         -------
@@ -486,7 +485,7 @@ class SimulationCache:
         Parameters
         ----------
         path : path
-            The other file, which no other process uses. One of an earlier release is completed.
+            The other file, which no other process uses. A file of an earlier release is completed.
 
         Returns
         -------
@@ -541,7 +540,7 @@ class SimulationCache:
         Returns
         -------
         rows, damaged : int
-            Numbers of simulations, and of those that do not match their checksums.
+            Number of simulations, and how many do not match their checksums.
 
         Raises
         ------
@@ -565,10 +564,10 @@ class SimulationCache:
             self.file.attempt("vacuumed", lambda connection: connection.execute("VACUUM"), None)
 
     def forget(self, *fingerprints: str) -> int:
-        """Delete the simulations and responses of some models, of all generations, for all users of the file.
+        """Delete all rows with these fingerprints, in all generations, for all users of the file.
 
-        ``cache.forget(*likelihood.simulator.cache_keys)`` deletes what a likelihood uses. The caches in memory of
-        likelihoods are not affected: make a new likelihood.
+        ``cache.forget(*likelihood.simulator.cache_keys)`` deletes the rows that a likelihood uses. Likelihoods keep
+        their caches in memory: make a new likelihood.
 
         Returns
         -------
@@ -596,7 +595,7 @@ class SimulationCache:
                 self.file.attempt("repaired", lambda connection: _delete_rows(connection, "key = ?", rows), None)
 
     def close(self) -> None:
-        """Store waiting rows, if possible, and close the connection of this process; the next use opens a new one."""
+        """Store waiting rows, if possible, and close this process's connection; the next use opens a new connection."""
         with self.file.lock:
             self.file.retry_times.clear()
             if self._waiting:
@@ -628,13 +627,13 @@ class SimulationCache:
             )
 
     def _write(self, statement: str, rows: list[tuple]) -> None:
-        if not rows and statement is not STORE:  # which also writes the rows that wait
+        if not rows and statement is not STORE:  # `STORE` also writes waiting rows
             return
         with self.file.lock:
             if not self.file.writable:
                 self._warn_read_only()
                 return
-            if statement is STORE:  # responses can be computed again and do not wait
+            if statement is STORE:  # only simulations wait; responses can be computed again
                 rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
             written = self.file.attempt("written", lambda found: self._insert(found, statement, rows) or True, False)
             if written and statement is STORE:
@@ -656,7 +655,7 @@ class SimulationCache:
 
 
 def _delete_rows(connection: sqlite3.Connection, condition: str, rows: Collection[tuple]) -> int:
-    """Delete rows of all tables in one transaction; return their number."""
+    """Delete rows from all tables in one transaction; return their number."""
     with transaction(connection):
         statements = [f"DELETE FROM {table} WHERE {condition}" for table in TABLES]
         return sum(connection.executemany(statement, rows).rowcount for statement in statements)

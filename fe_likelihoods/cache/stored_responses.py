@@ -1,6 +1,6 @@
-"""Responses of a model that are stored in a cache on disk as soon as they are simulated, without measurements.
+"""Model responses without measurements, stored in a cache on disk as soon as they are simulated.
 
-A prediction that was interrupted finds them when it is made again. Likelihoods store their responses themselves
+An interrupted prediction finds them when it is run again. Likelihoods store their responses themselves
 (`fe_likelihoods.likelihood.simulator`), under the same keys.
 """
 
@@ -23,14 +23,14 @@ _SECONDS = 0.1  # of simulations between two writes, if one simulation is shorte
 
 
 class StoredResponses:
-    """Simulations of a model, each of which is run once for all processes that use a cache.
+    """Simulations of a model; each is run only once for all processes that use the cache.
 
     Parameters
     ----------
     model : Model
     pool : executor or None
     cache : SimulationCache
-        One or two stored responses per process are simulated again and compared.
+        Cache of the responses. One or two stored responses per process are simulated again and compared.
     """
 
     def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
@@ -49,7 +49,7 @@ class StoredResponses:
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) [SI], stored or new, and the reasons of failures.
 
-        The parameter sets (n, n_parameters) are distinct. `StaleCache` if a stored and a new simulation differ.
+        The parameter sets (n, n_parameters) must be distinct. `StaleCache` if a stored and a new simulation differ.
         """
         responses = np.full((len(thetas), len(self.model.channels), self.model.n_steps), np.nan)
         left = []
@@ -82,7 +82,7 @@ class StoredResponses:
         self._verified.store(self.model.fingerprint, thetas, None, batch.reasons, batch.response, 0.0, run)
 
     def _new(self, thetas: np.ndarray) -> SimulationBatch:
-        """New simulations, the first of which complete the label."""
+        """New simulations, which complete the label."""
         label = self._verified.label
         if self.pool is not None:
             return simulate_batch(self.model, thetas, self.pool)

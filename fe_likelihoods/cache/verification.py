@@ -1,22 +1,21 @@
 """Verification of a cache: stored simulations are run again and compared before they are trusted.
 
-Stored simulations belong to the declared identity of a model. Nothing that can be computed from code and files tells
-with certainty whether the model behind that identity still computes the same. Therefore rows of a file are compared
-with new simulations. How many is decided by the label of the model (`fe_likelihoods.simulation.label`):
+Stored simulations belong to the declared identity of a model. Code and files cannot prove that the model with this
+identity still computes the same results. Therefore stored rows are compared with new simulations. The model's label
+(`fe_likelihoods.simulation.label`) decides how many:
 
-* The label is known in the file: two rows before the first row is used in a process (the one that was stored last, and
-  one at random of those that are requested), and one more for every 1000 rows used. A difference is an error,
-  `StaleCache`: something that the label does not contain has changed.
-* The label is unknown: so many rows, chosen to cover the space of the parameters, that a change in 5 % of the space is
-  found with a probability of 95 % (59 rows, or all there are). If all agree, the rows are adopted: the label is entered
-  as one of their generation. If one differs, a new generation begins: the earlier rows stay in the file and are not
-  used. Both are logged.
+* The label is known in the file: two rows before the first row is used in a process (the row stored last, and a random
+  one of the requested rows), and one more for every 1000 rows used. A difference is an error, `StaleCache`: something
+  that the label does not contain has changed.
+* The label is unknown: enough rows, chosen to cover the parameter space, to detect a change in 5 % of the space with a
+  probability of 95 % (59 rows, or all rows). If all agree, the label is added to the rows' generation (adoption). If
+  one differs, a new generation begins: the earlier rows stay in the file and are not used. Both are logged.
 
-All simulations complete the label, by what they open while they run. Files of earlier releases have
-rows without a label. Those with the right numbers of parameters, channels and samples are compared in the same way.
+Simulations complete the label with the files that they open. Files of earlier releases have rows without a label; rows
+with the model's numbers of parameters, channels and samples are compared in the same way.
 
-Failures count only where there is no successful simulation, since a changed model often fails at the same points.
-Likelihoods of one model and file share what they have verified and stored (`fe_likelihoods.cache.labels.shared_trust`).
+Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
+Likelihoods of one model and file share their verified and stored rows (`fe_likelihoods.cache.labels.shared_trust`).
 """
 
 import logging
@@ -49,23 +48,23 @@ __all__ = ["StaleCache", "VerifiedCache"]
 
 logger = logging.getLogger(__name__)
 
-FIRST_ROWS = 2  # verified before the first row is used, where the label is known
+FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
 ROWS_PER_VERIFICATION = 1000
-LARGEST_ROUNDING = 1e-4  # relative difference of responses that may come from rounding and iterations
+LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
     "cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or depends_on=)"
 )
 MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
-PAUSE_SECONDS = 60.0  # after failed attempts; at least
-PAUSE_RATIO = 20.0  # of the duration of the last attempt
+PAUSE_SECONDS = 60.0  # shortest pause of verification after failed attempts
+PAUSE_RATIO = 20.0  # shortest pause, relative to the duration of the last attempt
 
 
 class StaleCache(ValueError):
     """A stored simulation differs from a new one with the same parameters. The message says what to do.
 
-    It is raised again, for any row, as long as that simulation is stored and the model is the same object. Samplers
-    stop (`ends_run`), since no other point can be evaluated either. `theta` (n_structural,) are the parameters.
+    It is raised again, for any row, as long as this simulation is stored and the model is the same object. Samplers
+    stop (`ends_run`), since no point can be evaluated any more. `theta` (n_structural,) are the parameters.
     """
 
     ends_run = True
@@ -81,14 +80,14 @@ class StaleCache(ValueError):
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
-    Copies in another process verify rows of their own, once for all copies of that process.
+    Another process verifies rows again, once for all copies of this object there.
 
     Parameters
     ----------
     cache : SimulationCache
         Its settings `verify` and `tolerance` apply.
     model : Model
-        As it is when the likelihood is made.
+        The model in its state when the likelihood is made.
     pool : executor or None
     label : ModelLabel
         Label of the model.
@@ -101,8 +100,8 @@ class VerifiedCache:
         self.cache, self._trust = cache, trust
         self._again = Repetition(cache.file, trust)
         self._adoption = Adoption(cache, trust, self._again)
-        self._model: Any = None  # of the last look-up; None if there was none, or in another process
-        self._random = random.Random()  # its own, so that the user's streams of random numbers do not change
+        self._model: Any = None  # model of the last look-up in this process
+        self._random = random.Random()  # separate, so that the user's random number streams do not change
 
     def __getstate__(self) -> tuple:
         return self.cache, self._trust
@@ -112,17 +111,17 @@ class VerifiedCache:
 
     @property
     def compared(self) -> int:
-        """Rows that were compared with a new simulation."""
+        """Number of rows that were compared with a new simulation."""
         return self._again.compared
 
     @property
     def unverified(self) -> int:
-        """Rows whose new simulation was stopped for another reason than the model, so that it could not be compared."""
+        """Number of rows that could not be compared, since the new simulation was stopped (not by the model)."""
         return self._again.unverified
 
     @property
     def seconds(self) -> float:
-        """Wall time of the simulations for verification [s]."""
+        """Wall time of simulations for verification [s]."""
         return self._again.seconds
 
     @property
@@ -131,11 +130,11 @@ class VerifiedCache:
         return self._trust.label
 
     def complete(self, opened: Opened | None) -> None:
-        """Add to the label of the model what simulations opened."""
+        """Add what simulations opened to the model's label."""
         self._trust.complete(self.cache.file, opened)
 
     def share_trust(self, other: "VerifiedCache") -> None:
-        """Verify no row that another object has verified or stored, unless the code is another one."""
+        """Trust rows that another object has verified or stored, if its model has the same code."""
         if other._trust.label.code == self._trust.label.code:
             self._set_up(self.cache, other._trust)
 
@@ -151,13 +150,13 @@ class VerifiedCache:
         seconds: float,
         run: VerifyingRun,
     ) -> None:
-        """Store simulations under the label of the model: their statistics, responses and failures, where given."""
+        """Store simulations under the model's label: statistics, responses and failures, if given."""
         stored = self._label_to_store(run.model)
         if stored is None:
             return
         place = stored.generation, stored.id
         if responses is not None:
-            # before the statistics, which are computed from them if the program is killed in between
+            # before the statistics, which can be computed from the responses if the program is killed in between
             self.cache.store_responses(run.model, thetas, responses, *place)
         if misfit is not None:
             self.cache.store(fingerprint, thetas, run.n_steps, misfit, reasons, seconds, *place)
@@ -165,7 +164,7 @@ class VerifiedCache:
         self._trust.add_own(thetas, stored.generation, *{fingerprint, run.model.fingerprint})
 
     def _label_to_store(self, model: Model) -> StoredLabel | None:
-        """The label under which new simulations are stored; None while it is not known which rows agree with them."""
+        """The label under which new simulations are stored; None while the search for a generation pauses."""
         trust = self._trust
         with trust.lock:
             if trust.find(self.cache.file, model) is None:
@@ -193,7 +192,7 @@ class VerifiedCache:
     # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
-        """Rows of `SimulationCache.look_up`, of which some are verified.
+        """Rows from `SimulationCache.look_up`; some of them are verified.
 
         Raises
         ------
@@ -214,7 +213,7 @@ class VerifiedCache:
     def _verify_rows(
         self, fingerprint: str, thetas: np.ndarray, rows: CachedRows, generation: int, run: VerifyingRun
     ) -> bool:
-        """Verify some of the rows that were found; False if another generation is to be used."""
+        """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
         known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist(), generation)
         if not known:
             return True
@@ -242,7 +241,7 @@ class VerifiedCache:
         return self._verify_due(table, fingerprint, len(known), candidates, run)
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
-        """Responses of `SimulationCache.look_up_responses`, of which some are verified by their statistics."""
+        """Responses from `SimulationCache.look_up_responses`; some of them are verified by their statistics."""
         self._notice_other_model(run)
         fingerprint = run.model.fingerprint
         while True:
@@ -261,9 +260,9 @@ class VerifiedCache:
                 return responses
 
     def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
-        """Reasons of `SimulationCache.look_up_failures`, of which some are verified, as in `look_up`.
+        """Reasons from `SimulationCache.look_up_failures`; some of them are verified, as in `look_up`.
 
-        Those that name a time limit are not, because each would take as long as the limit.
+        Failures at a time limit are not verified, because each would take as long as the limit.
         """
         self._notice_other_model(run)
         with self._trust.lock:
@@ -285,7 +284,7 @@ class VerifiedCache:
     # the usual few ------------------------------------------------------------------------------------------------
 
     def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int], generation: int) -> list[int]:
-        """Those of some rows that were not stored here; none if the cache is not to be verified."""
+        """The rows that this process has not stored; none if the cache is not to be verified."""
         if not self.cache.verify or not rows:
             return []
         own = self._trust.own
@@ -297,7 +296,7 @@ class VerifiedCache:
     def _verify_due(
         self, table: str, fingerprint: str, n: int, candidates: Callable[[], Iterator], run: VerifyingRun
     ) -> bool:
-        """Verify as many rows as are due now that `n` more are used; False if another generation is to be used."""
+        """Verify the rows that are due when `n` more rows are used; False if a new generation has begun."""
         trust = self._trust
         with trust.lock:
             if trust.stale is not None:
@@ -311,7 +310,7 @@ class VerifiedCache:
                 return True
             before = trust.served[table, fingerprint]
             first = before == 0
-            # one row suffices for responses and for shorter records, if others of the same code were verified
+            # one row suffices for responses and shorter records if other rows of the same code were verified
             first_rows = 1 if trust.served else FIRST_ROWS
             due = first_rows if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
             start = time.monotonic()
@@ -337,10 +336,10 @@ class VerifiedCache:
             return True
 
     def _verify(self, rows: Iterable[StoredSimulation], due: int, fingerprint: str, run: VerifyingRun) -> bool | None:
-        """Simulate the first `due` rows again, and further ones in place of those whose simulation is stopped.
+        """Simulate the first `due` rows again; for each new simulation that is stopped, a further row instead.
 
-        Returns whether a row was compared; two failures do not count if successful rows could not be compared. None if
-        a row of another label differs, and a new generation has begun.
+        Returns whether rows were compared; failures alone do not count if another simulation was stopped. None if a row
+        of another label differs, and a new generation has begun.
         """
         rows, done, succeeded, reasons = iter(rows), 0, 0, []
         attempts = max(due, MAX_ATTEMPTS)
@@ -370,7 +369,7 @@ class VerifiedCache:
         return bool(succeeded or (done and not reasons))
 
     def _differs(self, row: StoredSimulation, new: Simulated, fingerprint: str, run: VerifyingRun) -> bool:
-        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
+        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows that differ."""
         if row.reason and new.reason:
             return False
         label = self._label_of(row, fingerprint, run)
@@ -415,14 +414,14 @@ class VerifiedCache:
         )
 
     def _label_of(self, row: StoredSimulation, fingerprint: str, run: VerifyingRun) -> int:
-        """Id of the label under which a row was stored; 0 if it is not known."""
+        """Id of the label under which a row was stored; 0 if unknown."""
         if row.label != -1:
             return row.label
         generation = self._trust.generations.get(fingerprint)
         return 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
 
     def _scatter(self, theta: np.ndarray, earlier: Simulated, run: VerifyingRun) -> str:
-        """Advice for a model whose new simulations differ among themselves, after one more; empty if they agree."""
+        """Advice if one more simulation differs from the new simulation (no repeatable model); empty if they agree."""
         start = time.perf_counter()
         (new,) = simulate_again(run, theta[None])
         self._again.seconds += time.perf_counter() - start
@@ -443,7 +442,7 @@ class VerifiedCache:
         )
 
     def _notice_other_model(self, run: VerifyingRun) -> None:
-        """Start again with the first verification if another model object was set."""
+        """Verify all rows again if another model object was set."""
         if run.model is not self._model:
             if self._model is not None:
                 with self._trust.lock:
@@ -453,7 +452,7 @@ class VerifiedCache:
             self._model = run.model
 
     def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:
-        """Indices in random order, first those that have just been simulated again."""
+        """Indices in random order, but rows that have just been simulated again come first."""
         again = {key[-1] for key in self._again.found}
         shuffled = self._random.sample(rows, len(rows))
         return sorted(shuffled, key=lambda row: thetas[row].tobytes() not in again) if again else shuffled
