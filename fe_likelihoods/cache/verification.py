@@ -369,7 +369,7 @@ class VerifiedCache:
         return bool(succeeded or (done and not reasons))
 
     def _differs(self, row: StoredSimulation, new: Simulated, fingerprint: str, run: VerifyingRun) -> bool:
-        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows that differ."""
+        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
         if row.reason and new.reason:
             return False
         label = self._label_of(row, fingerprint, run)
