@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 DEFAULT_TOLERANCE = 1e-9
-ROUNDING = 1e-13  # relative, of a sum of squares; processors differ in the order of summation
+ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 RESPONSE_VALUES = 2**23  # largest number of response values in memory: 64 MiB
 
 
@@ -248,7 +248,7 @@ def largest_difference(
     if tolerance:
         difference = np.where(difference <= ROUNDING * s**2, 0.0, difference)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # the positive root of (t r)^2 + 2 s (t r) = difference, in the form that does not cancel
+        # the positive root of (t r)^2 + 2 s (t r) = difference, in a form without cancellation
         change = np.where(difference == 0.0, 0.0, difference / (s + np.sqrt(s**2 + difference)) / r)
     worst = int(np.argmax(np.nan_to_num(change, nan=np.inf)))
     return (worst, float(change[worst])) if not change[worst] <= tolerance else None

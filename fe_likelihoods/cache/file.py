@@ -64,7 +64,7 @@ LAYOUT = (
     "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
     "UNIQUE (source, label, cpu))",
 )
-# statements that complete an earlier layout; the columns are as SQLite adds them
+# statements that complete an earlier layout; the tables then have exactly the SQL in `LAYOUT`
 COMPLETION = (
     LAYOUT[-2].replace("TABLE", "TABLE IF NOT EXISTS"),
     *(f"ALTER TABLE {table} ADD COLUMN {column}" for table in ("simulations", "responses") for column in ADDED),

@@ -212,7 +212,7 @@ class SimulationCache:
                 raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")
         if tolerance is not None and not 0.0 <= tolerance < np.inf:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
-        rows_to_compare(verify)  # raises what is wrong with it
+        rows_to_compare(verify)  # refuses an impossible value
         bounds = int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes)
         self._set_up(path, *bounds, timeout, verify, tolerance)
         self.file.check()
@@ -232,7 +232,7 @@ class SimulationCache:
         return tuple(getattr(self, name) for name in SETTINGS)
 
     def __setstate__(self, state: tuple) -> None:
-        self._set_up(*state)  # opens the file when it is needed; a run continues without it if that fails
+        self._set_up(*state)  # the file is opened when it is needed; if that fails, a run continues without it
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"

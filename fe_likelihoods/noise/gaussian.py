@@ -47,7 +47,7 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
 _LOCAL, _GROWTH = 0.25, 0.25  # see docs/theory/noise.rst
-_LARGEST_GAP = 0.05  # part of the samples of a channel
+_LARGEST_GAP = 0.05  # largest share of missing samples in a channel without a warning
 _RESPONSE = 'level="response" without bands'
 _SHARES = 'level="measured" or "response", without bands'
 
@@ -263,7 +263,7 @@ class GaussianNoise:
             )
         return default if given is None and means else given
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ kind and names
 
     @property
     def _kind(self) -> str:
@@ -549,8 +549,8 @@ class GaussianNoise:
         Parameters
         ----------
         statistics : (n, n_numbers) float
-            Sums of squared residuals (n, n_channels), or what `statistic` returns [SI unit of the channel, squared];
-            NaN where the simulation failed.
+            Sums of squared residuals (n, n_channels), or results of `statistic` [SI unit of the channel, squared]; NaN
+            where the simulation failed.
         n_samples : int or SampleCounts
             Samples per channel; `SampleCounts` where samples are missing.
         parameters : (n, n_noise) float

@@ -46,7 +46,7 @@ _DESCRIPTORS = {property, staticmethod, classmethod, types.MemberDescriptorType,
 # constant, or with contents that are compared separately
 _CONSTANT = {*_PLAIN, *_LOCKS, types.FunctionType, types.CodeType} | _DESCRIPTORS
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
-_ABSENT = type("Absent", (), {})  # in place of the value of a name that is not defined
+_ABSENT = type("Absent", (), {})  # in place of a value, for a name that is not defined
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
@@ -412,7 +412,7 @@ class _Names(NamedTuple):
     """Names in the code of a function and of the functions inside it."""
 
     all: frozenset[str]
-    imported: frozenset[str]  # modules, with a dot for each level of a relative import, and what is imported from them
+    imported: frozenset[str]  # modules (with a dot per level of a relative import) and names imported from them
 
 
 @functools.lru_cache(maxsize=4096)

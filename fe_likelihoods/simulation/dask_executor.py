@@ -25,7 +25,7 @@ SECONDS_FOR_MESSAGES = 0.2  # until dask has reported all tasks that it has give
 SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
 SECONDS_TO_START = 60.0  # until a worker that was requested from a cluster runs
 SECONDS_TO_RETURN = 15.0  # until a nanny has restarted a worker process
-LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait for a worker of a cluster that has none
+LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait while a cluster has no worker
 _NO_WORKERS = (
     "the dask cluster has had no worker for {:g} s: start workers or scale the cluster, or wait longer by "
     "DaskExecutor(client, longest_wait=...), and run again. Evaluations that are stored are not repeated"
@@ -169,7 +169,7 @@ class DaskExecutor(PoolExecutor):
             if not item.cancelled():
                 (self._suspect,) = self._send([[item]])
 
-    # in threads of their own --------------------------------------------------------------------------------------
+    # in separate threads ------------------------------------------------------------------------------------------
 
     def _receive_all(self, ended: SimpleQueue) -> None:
         """Receive groups as they end, several at once if possible, until none is left."""

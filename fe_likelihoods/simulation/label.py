@@ -71,7 +71,7 @@ _OF_CLASSES = {
 _DATA = (int, float, complex, str, bytes, list, dict, set, np.ndarray)  # class attributes that running code may change
 _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simulations
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
-_first: dict[str, str] = {}  # digests of values that code changes when it runs, at the time of the first label
+_first: dict[str, str] = {}  # first digests of values that running code changes
 _opened: dict[str, Opened] = {}  # by code, in this process
 _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 

@@ -15,7 +15,7 @@ from .worker import Answer, Worker
 __all__ = ["Sandbox"]
 
 _START_LIMIT = 120.0  # [s] for starting a process and loading the function
-_POLL_INTERVAL = 0.1  # [s] between checks of the amount of output
+_POLL_INTERVAL = 0.1  # [s] between checks of the output size
 
 
 class Sandbox:
@@ -55,7 +55,7 @@ class Sandbox:
         self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
         self.max_output, self.runs_per_process = max_output, runs_per_process
         self._free: list[Worker] = []
-        Pickled.of(function)  # raises here what would be raised in the first call
+        Pickled.of(function)  # an error is raised here instead of in the first call
 
     def __getstate__(self) -> dict:
         return vars(self) | {"_free": []}

@@ -260,7 +260,7 @@ def _ask(
             raise _Fault(f"the answer has no {key}")
         return answer if key is None else answer[key]
     beginning = " ".join(text[:200].split())
-    if status == 500:  # what servers in Python answer if the model raises an exception
+    if status == 500:  # the answer of Python servers if the model raises an exception
         raise ServerError("HTTP 500", beginning)
     if status == 200 and answer is None and re.search(r"\b(nan|inf)\b", text):  # Python's text of such numbers
         raise ServerError("not finite", "the output contains nan or inf")

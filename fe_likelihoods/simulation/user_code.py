@@ -54,7 +54,7 @@ def _is_of_user(name: str, places: tuple[str, ...]) -> bool:
             return not package_version(top)
         if any(path.resolve().is_relative_to(folder) for folder in _standard_folders()):
             return False
-    return bool(places) or top not in sys.stdlib_module_names  # a module that is made by code has no place
+    return bool(places) or top not in sys.stdlib_module_names  # a module created by code has no file
 
 
 @functools.cache
