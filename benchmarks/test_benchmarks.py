@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import zipfile
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from samplers import SMCSampler
 from tests.contract.targets import Gaussian
 from tests.statistics import analytic_runs
 
+ROOT = Path(__file__).parents[1]
 ANSWER = {
     "evaluations": 100,
     "microseconds": 5.0,
@@ -113,6 +115,18 @@ def test_options_are_those_of_the_functions():
 def test_the_readme_lists_every_benchmark():
     table = (Path(__file__).parent / "README.md").read_text()
     assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == list(BENCHMARKS)
+
+
+def test_commands_that_texts_cite_name_benchmarks_and_options():
+    cited = []
+    for pattern in ("docs/*.rst", "docs/theory/*.rst", "tutorials/*.py", "fe_likelihoods/**/*.py", "samplers/**/*.py"):
+        for path in ROOT.glob(pattern):
+            text = re.sub(r"\n#? *", " ", path.read_text())
+            cited += re.findall(r"`python -m benchmarks ([^`]+)`", text)
+    assert len(cited) > 25
+    for command in cited:
+        words = shlex.split(re.sub(r"--repeats \d+|--compare \S+ \S+", "", command))
+        assert parsed(words)[0], command
 
 
 @pytest.mark.slow
