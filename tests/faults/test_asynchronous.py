@@ -69,11 +69,11 @@ def test_a_run_depends_on_the_order_of_arrival_and_on_nothing_else(tmp_path):
 
 
 def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(tmp_path):
-    """Cut after every seventh block, and continued with other lengths: nothing known is evaluated again."""
+    """Cut after every thirteenth block, and continued with other lengths: nothing known is evaluated again."""
     whole, cluster = finished(tmp_path / "whole.h5", order=1)
     assert whole.failures and cluster.evaluations == whole.evaluations
-    places = [place for _, place in blocks(tmp_path / "whole.h5")][::7]
-    assert len(places) > 10
+    places = [place for _, place in blocks(tmp_path / "whole.h5")][::13]
+    assert len(places) > 5
     for number, place in enumerate(places):
         path = tmp_path / "killed.h5"
         cut(tmp_path / "whole.h5", place, path)

@@ -3,7 +3,9 @@
 import random
 import signal
 import sys
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import emcee
 import pytest
@@ -55,22 +57,30 @@ def run(path, kind, log, lines=()):
     return go_on(sampler, kind), interrupts
 
 
+@cache
+def whole_run(kind):
+    """Outcome of a run without interrupts, the points that it evaluates, and the number of lines that it traces."""
+    with TemporaryDirectory() as folder:
+        whole, _ = run(None, kind, Path(folder) / "log")
+        points = set(points_of(Path(folder) / "log"))
+    with Interrupt() as counted:
+        go_on(make(None, kind), kind)
+    return outcome(whole), points, counted.count
+
+
 @pytest.mark.parametrize("stored", [False, True], ids=["memory", "file"])
 @pytest.mark.parametrize("kind", ["smc", "moves", "guided", "map", "asynchronous", "thin"])
 def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored, tmp_path):
-    whole, _ = run(None, kind, tmp_path / "whole")
-    with Interrupt() as counted:
-        go_on(make(None, kind), kind)
+    whole, evaluated, lines_traced = whole_run(kind)
     choose, interrupts = random.Random(kind), 0
     for trial in range(2):
         path = tmp_path / f"{trial}.h5" if stored else None
         # the last lines are those of the steps
-        lines = [choose.randint(1, counted.count), int((0.7 + 0.3 * choose.random()) * counted.count)]
+        lines = [choose.randint(1, lines_traced), int((0.7 + 0.3 * choose.random()) * lines_traced)]
         sampler, more = run(path, kind, tmp_path / f"log {trial}", lines)
         interrupts += more
-        assert sampler.iteration == STEPS and outcome(sampler) == outcome(whole)
-        points = points_of(tmp_path / f"log {trial}")
-        assert set(points) == set(points_of(tmp_path / "whole"))
+        assert sampler.iteration == STEPS and outcome(sampler) == whole
+        assert set(points_of(tmp_path / f"log {trial}")) == evaluated
     assert interrupts >= 2
 
 
