@@ -9,9 +9,17 @@ import warnings
 
 import numpy as np
 
-from fe_likelihoods import EventRatios, Hierarchy, LevelRatios, event_level, event_ratio, predict_new_event, propagate
+from fe_likelihoods import (
+    EventRatios,
+    Hierarchy,
+    LevelRatios,
+    event_level,
+    event_ratio,
+    predict_new_event,
+    propagate,
+    share_within,
+)
 from fe_likelihoods.prediction.score_tables import QuantityScores
-from fe_likelihoods.prediction.scores import share_within
 
 from . import transfer
 from .rows import Row

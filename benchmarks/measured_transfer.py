@@ -37,10 +37,10 @@ from fe_likelihoods import (
     Posterior,
     SimulationCache,
     propagate,
+    share_within,
 )
 from fe_likelihoods.prediction.quantities import ChannelQuantity, measured_quantity
 from fe_likelihoods.prediction.score_tables import QuantityScores, score_values
-from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler
 
 from .rows import Row

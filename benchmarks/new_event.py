@@ -26,10 +26,11 @@ from fe_likelihoods import (
     Prior,
     StoredPosterior,
     Varying,
+    interval_score,
     peak,
     predict_new_event,
 )
-from fe_likelihoods.prediction.scores import interval_score, pit_samples
+from fe_likelihoods.prediction.scores import pit_samples
 from tests.prediction.twins import ERROR, MEDIAN_SD, SPREAD_SD, hyper_samples
 
 from .rows import Row

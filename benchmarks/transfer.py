@@ -61,12 +61,12 @@ from fe_likelihoods import (
     propagate,
     read_record,
     residual_checks,
+    share_within,
 )
 from fe_likelihoods.models.equivalent_linear import response_level
 from fe_likelihoods.models.linear_system import respond_structure
 from fe_likelihoods.prediction.prediction import Prediction
 from fe_likelihoods.prediction.score_tables import HistoryScores, QuantityScores
-from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler
 
 from .rows import Row

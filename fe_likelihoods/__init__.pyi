@@ -47,6 +47,7 @@ from .prediction.new_event import event_level, event_ratio, predict_from_median,
 from .prediction.propagation import fit_measures, propagate
 from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
 from .prediction.reliability import exceedance
+from .prediction.scores import interval_score, share_within
 from .priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal, TruncatedMultivariateNormal
@@ -143,6 +144,7 @@ __all__ = [
     "from_si",
     "growing_durations",
     "innovations",
+    "interval_score",
     "leave_one_out",
     "limit_states",
     "material_curves",
@@ -178,6 +180,7 @@ __all__ = [
     "rrmse",
     "score_left_out",
     "serve",
+    "share_within",
     "table_motion",
     "to_bilby",
     "to_pints",

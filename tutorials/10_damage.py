@@ -40,12 +40,12 @@ from fe_likelihoods import (
     damage_measures,
     damage_outputs,
     from_si,
+    interval_score,
     park_ang_constants,
     plot_damage,
     problems,
     propagate,
 )
-from fe_likelihoods.prediction.scores import interval_score
 from samplers import SMCSampler
 
 parser = argparse.ArgumentParser(description="Predict four earthquakes on one column, and its damage.")

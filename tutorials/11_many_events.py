@@ -69,8 +69,8 @@ from fe_likelihoods import (
     propagate,
     read_record,
     score_left_out,
+    share_within,
 )
-from fe_likelihoods.prediction.scores import share_within
 from samplers import SMCSampler, compare_models
 
 parser = argparse.ArgumentParser(description="Predict earthquakes of one bridge from other earthquakes.")

@@ -21,8 +21,8 @@ from fe_likelihoods import (
     peak,
     predict_new_event,
     score_left_out,
+    share_within,
 )
-from fe_likelihoods.prediction.scores import share_within
 from tests.prediction.test_new_event import TOP, Amplified
 
 PRIOR = {"gain": LogNormal(0.03, 1.0), "sigma_top": HalfNormal(0.01)}

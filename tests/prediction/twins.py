@@ -24,10 +24,10 @@ from fe_likelihoods import (
     StoredPosterior,
     Varying,
     fragility,
+    interval_score,
     peak,
 )
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.prediction.scores import interval_score
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.signals.records import Record
 

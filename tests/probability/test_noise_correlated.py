@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from fe_likelihoods import AutoregressiveNoise, GaussianNoise
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise, interval_score
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
@@ -16,7 +16,6 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.draws import SampleNoise
 from fe_likelihoods.noise.residuals import effective_samples, lag_one_sums
 from fe_likelihoods.prediction.propagation import fit_measures, propagate
-from fe_likelihoods.prediction.scores import interval_score
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
