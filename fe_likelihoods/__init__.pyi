@@ -33,7 +33,7 @@ from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
-from .noise.residuals import effective_samples, innovations, plot_residuals, residual_checks
+from .noise.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
 from .plots.damage import plot_damage
 from .plots.histories import plot_histories, plot_loop
 from .plots.materials import plot_material, plot_moment_curvature
@@ -44,6 +44,7 @@ from .prediction.averaging import average_predictions
 from .prediction.fragility import fragility, peak_ground_acceleration
 from .prediction.held_out import score_left_out
 from .prediction.new_event import event_level, event_ratio, predict_from_median, predict_new_event
+from .prediction.prediction import Prediction
 from .prediction.propagation import fit_measures, propagate
 from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
 from .prediction.reliability import exceedance
@@ -107,9 +108,11 @@ __all__ = [
     "Patches",
     "Pier",
     "Posterior",
+    "Prediction",
     "Prior",
     "RCColumn",
     "Record",
+    "ResidualChecks",
     "Rubber",
     "ShearFlexuralBeam",
     "ShearFrame",

@@ -30,7 +30,9 @@ from fe_likelihoods import (
     HalfNormal,
     Measurements,
     Posterior,
+    Prediction,
     Prior,
+    ResidualChecks,
     SimulationCache,
     Uniform,
     effective_samples,
@@ -40,8 +42,6 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
-from fe_likelihoods.noise.residuals import ResidualChecks
-from fe_likelihoods.prediction.prediction import Prediction
 from samplers import SMCSampler, plot_corner, summary
 
 
