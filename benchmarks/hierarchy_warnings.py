@@ -1,12 +1,12 @@
 """How often the warnings of `Hierarchy` come on right results, and how often a wrong result has none.
 
-The problems are those of `tests.probability.hierarchy_problems`, with other seeds than those with which the limits of
+The problems are those of `tests.events.hierarchy_problems`, with other seeds than those with which the limits of
 the warnings were chosen.
 """
 
 from collections import Counter
 
-from tests.probability.hierarchy_problems import RIGHT, WRONG, problem, solve
+from tests.events.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 from .rows import Row
 

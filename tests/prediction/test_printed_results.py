@@ -26,8 +26,8 @@ from fe_likelihoods.prediction.fragility_curve import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore
 from fe_likelihoods.prediction.score_tables import score_values
 from fe_likelihoods.text_tables import NamedResults, text_table
+from tests.events.test_leave_one_out import ALIKE, hierarchy_of
 from tests.prediction.flexible import Flexible
-from tests.probability.test_leave_one_out import ALIKE, hierarchy_of
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))
 RATIOS = EventRatios([0.8, 1.0, 1.25])

@@ -12,7 +12,7 @@ from scipy import stats
 from fe_likelihoods import Posterior, TruncatedNormal, propagate
 from samplers import SMCSampler, TMCMCSampler, to_arviz
 from tests.contract.targets import Gaussian
-from tests.probability.linear_gaussian import likelihood_of
+from tests.likelihood.linear_gaussian import likelihood_of
 
 arviz = pytest.importorskip("arviz")
 SIGMA, MEAN, SD = 0.5, 0.8, 1.5

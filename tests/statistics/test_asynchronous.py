@@ -13,7 +13,7 @@ from samplers import SMCSampler
 from samplers.tempering.guided import Batch
 from samplers.tempering.pending_points import PendingPoints
 from tests.contract.targets import Gaussian
-from tests.probability.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
+from tests.likelihood.linear_gaussian import KnownNoise, exact_log_evidence, likelihood_of
 from tests.simulated_cluster import SimulatedCluster
 from tests.statistics import analytic_posteriors as analytic
 from tests.tempering.guides import LearningGuide

@@ -19,7 +19,7 @@ from fe_likelihoods import (
     nautilus_prior,
 )
 from samplers import SMCSampler
-from tests.probability.linear_gaussian import exact_log_evidence, likelihood_of
+from tests.likelihood.linear_gaussian import exact_log_evidence, likelihood_of
 
 MEAN, COVARIANCE = np.array([1.0, -0.5]), np.array([[0.5, 0.3], [0.3, 0.8]])
 NORMAL = TruncatedNormal(1.0, 0.7, -np.inf, np.inf)

@@ -27,7 +27,7 @@ from fe_likelihoods.events.hierarchical_posterior import _correlation_factor
 from fe_likelihoods.events.pareto_smoothing import pareto_shape
 from fe_likelihoods.events.scales import scales_of
 from fe_likelihoods.events.stored_posterior import describe
-from tests.probability.hierarchy_problems import RIGHT, WRONG, problem, solve
+from tests.events.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance

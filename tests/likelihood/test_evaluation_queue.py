@@ -341,7 +341,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from tests.faults.treacherous import Gated, posterior_of
-from tests.probability.test_evaluation_queue import LONG, SHORT
+from tests.likelihood.test_evaluation_queue import LONG, SHORT
 
 folder = Path(sys.argv[1])
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from fe_likelihoods.noise.marginal import MarginalNoise
 from fe_likelihoods.prediction.propagation import fit_measures
 from fe_likelihoods.problems import bridge_column_data
 from samplers import SMCSampler
-from tests.probability.linear_gaussian import Linear, exact_log_evidence, likelihood_of
+from tests.likelihood.linear_gaussian import Linear, exact_log_evidence, likelihood_of
 
 NORMAL = TruncatedNormal(1.0, 0.7, -np.inf, np.inf)
 
