@@ -174,6 +174,12 @@ class FELikelihood:
         """An entry of the report, such as ``simulations`` or ``failures``."""
         return reported(self, name)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; AttributeError for those of the simulator, such as ``pool``, which have no effect here."""
+        if name in vars(vars(self).get("simulator", object)):
+            raise AttributeError(f"{name!r} belongs to the simulator: set likelihood.simulator.{name}")
+        super().__setattr__(name, value)
+
     @property
     def fingerprint(self) -> str:
         """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""

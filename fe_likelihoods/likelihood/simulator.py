@@ -64,7 +64,9 @@ _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk
 def reported(likelihood: Any, name: str) -> Any:
     """A report entry that is read as an attribute of a likelihood; AttributeError for any other name."""
     if name not in (*COUNTS, "failures", "failure_reasons"):
-        raise AttributeError(f"{type(likelihood).__name__!r} object has no attribute {name!r}")
+        moved = name[0] != "_" and hasattr(vars(likelihood).get("simulator"), name)
+        hint = f": it belongs to the simulator, as likelihood.simulator.{name}" if moved else ""
+        raise AttributeError(f"{type(likelihood).__name__!r} object has no attribute {name!r}{hint}")
     return likelihood.report()[name]
 
 

@@ -442,6 +442,15 @@ def test_one_point_that_is_cached_takes_the_short_way_with_the_same_value(thetas
     assert likelihood.simulator.cache_hits - known == len(points) - 3 and likelihood.simulations <= len(thetas)
 
 
-def test_a_likelihood_refuses_another_model():
+def test_what_belongs_to_the_simulator_is_not_set_beside_it():
+    likelihood = likelihood_of(Line())
     with pytest.raises(AttributeError):
-        likelihood_of(Line()).model = Line()
+        likelihood.model = Line()
+    with pytest.raises(AttributeError, match=r"set likelihood\.simulator\.pool"):
+        likelihood.pool = None
+    with pytest.raises(AttributeError, match=r"as likelihood\.simulator\.cache_keys"):
+        likelihood.cache_keys  # noqa: B018
+    with pytest.raises(AttributeError, match="no attribute 'cash'$"):
+        likelihood.cash  # noqa: B018
+    likelihood.simulator.pool = None
+    likelihood.note = "of the user"
