@@ -7,4 +7,56 @@ and type checkers read as well. Other modules are imported by their names, as in
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# names that were public in 0.2: what takes their place, or their module
+_REPLACED = {
+    "BandNoise": "GaussianNoise(groups=(edges [Hz]))",
+    "EventNoise": 'GaussianNoise(groups="event")',
+    "MarginalNoise": "posterior.marginal()",
+    "ModulatedNoise": 'GaussianNoise(level="response", window=...)',
+    "RelativeNoise": 'GaussianNoise(level="measured")',
+    "SharedGaussianNoise": 'GaussianNoise(groups="all")',
+    "TimeShiftNoise": "FELikelihood(..., time_shifts={channel: largest shift [s]})",
+}
+_IN_MODULES = {
+    "column_damage.damage": "Damage LimitState",
+    "column_damage.measures": "DamageMeasures",
+    "column_damage.park_ang": "ParkAng",
+    "emulation.emulator": "ResponseEmulator",
+    "emulation.guide": "ResponseGuide",
+    "emulation.modes": "Mode ModeSearch find_modes",
+    "events.agreement": "Agreement",
+    "likelihood.block_likelihood": "BlockLogLikelihood",
+    "likelihood.parameters": "Parameter",
+    "likelihood.predictive_draws": "MeasuredData MeasuredHistory PredictiveDraws",
+    "models.rc_column_curves": "MaterialCurve MomentCurvature",
+    "noise.protocol": "Noise",
+    "prediction.averaging": "AveragedPrediction",
+    "prediction.fragility": "Fragility",
+    "prediction.fragility_curve": "fit_fragility",
+    "prediction.reliability": "Exceedance",
+    "prediction.score_tables": "HistoryScores QuantityScores",
+    "prediction.scores": "crps_normal crps_samples log_score_normal",
+    "priors.mixture_prior": "MixtureDistribution",
+    "priors.multivariate": "MultivariateDistribution",
+    "signals.alignment": "Alignment",
+    "signals.datasets": "Dataset",
+    "signals.events": "EventWindow",
+    "signals.measurement_readers": "ImposedTest",
+    "signals.readers": "read_at2 read_esm read_geonet read_knet read_smc read_v2",
+    "signals.response_spectrum": "ResponseSpectrum",
+    "simulation.faults": "TransientReason",
+    "simulation.local_pool": "LocalPool",
+    "simulation.model": "ContinuedResponse",
+}
+
+
+def __getattr__(name: str) -> object:
+    """A public name, loaded on first use; ImportError for one that has moved, since it is the error of an import."""
+    if name in _REPLACED:
+        raise ImportError(f"fe_likelihoods.{name} is now {_REPLACED[name]}")
+    for module, names in _IN_MODULES.items():
+        if name in names.split():
+            raise ImportError(f"{name} is imported from its module: from fe_likelihoods.{module} import {name}")
+    return _load(name)

@@ -1,6 +1,7 @@
 """An import brings no more along than it needs, and every name is there as if it did."""
 
 import ast
+import importlib
 import inspect
 import json
 import os
@@ -71,6 +72,16 @@ def test_unknown_name_is_an_attribute_error(package):
     assert not hasattr(package, "absent")
     with pytest.raises(AttributeError, match=f"No {package.__name__} attribute .*absent"):
         package.absent  # noqa: B018
+
+
+def test_names_that_have_moved_say_where_they_are():
+    with pytest.raises(ImportError, match=r'ModulatedNoise is now GaussianNoise\(level="response"'):
+        from fe_likelihoods import ModulatedNoise  # noqa: F401
+    for module, names in fe_likelihoods._IN_MODULES.items():
+        for name in names.split():
+            with pytest.raises(ImportError, match=f"from fe_likelihoods.{module} import {name}"):
+                getattr(fe_likelihoods, name)
+            assert hasattr(importlib.import_module(f"fe_likelihoods.{module}"), name)
 
 
 @pytest.mark.parametrize("name", ["SMCSampler", "TMCMCSampler"])

@@ -53,7 +53,8 @@ ROWS_PER_VERIFICATION = 1000
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
-    "cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= (or depends_on=)"
+    "likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= "
+    "(or depends_on=)"
 )
 MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
 PAUSE_SECONDS = 60.0  # shortest pause of verification after failed attempts

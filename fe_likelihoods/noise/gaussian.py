@@ -587,7 +587,8 @@ class GaussianNoise:
             terms = -counts * (HALF_LOG_TWO_PI + np.log(deviations)) - 0.5 * ratio * ratio
             if self.effective_samples is not None:
                 terms = terms * np.minimum(np.array(self.effective_samples) / counts, 1.0)
-        possible = (deviations > 0.0) & (deviations < np.inf) & np.isfinite(squares)
+        # a channel without samples in a stretch has the level zero there, which nothing is compared with
+        possible = ((deviations > 0.0) | (counts == 0)) & (deviations < np.inf) & np.isfinite(squares)
         return np.where(possible, np.where(counts > 0, terms, 0.0), -np.inf).sum(axis=(1, 2))
 
     def _deviations(self, parameters: np.ndarray, counts: np.ndarray, power: np.ndarray | None = None) -> np.ndarray:

@@ -400,3 +400,20 @@ def test_errors_and_coverage_are_over_the_samples_that_are_there(rng):
     assert len(prediction.plot(data).axes) == len(data.plot().axes) == 2
     scales = GaussianNoise(data.channels, groups="all").with_measurements(data).scales
     assert scales[0] == pytest.approx(math.sqrt(np.square(data.values[0][there[0]]).mean()))
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"groups": "all"}, {"groups": (6.0, 12.0)}, {"groups": (6.0, 12.0), "level": "response"}]
+)
+@pytest.mark.parametrize("gaps", [[(0, 20, 30)], [(1, 20, 30)], [(0, 15, 20), (1, 40, 45)], [(0, 20, 30), (1, 25, 35)]])
+def test_a_gap_in_one_channel_leaves_a_density(options, gaps, rng):
+    """A channel without samples in a stretch of time has no level there, and nothing is compared with it."""
+    there = np.ones((2, 60), dtype=bool)
+    for channel, start, stop in gaps:
+        there[channel, start:stop] = False
+    sensor = {"sensor": (1e-3, 1e-4)} if options.get("level") else {}
+    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
+    likelihood = FELikelihood(model, measured(rng, there), GaussianNoise(CHANNELS, **options, **sensor))
+    n = likelihood.ndim - 2
+    assert np.isfinite(likelihood([1.0, 1.0] + [0.1] * n))
+    assert likelihood([1.0, 1.0, -0.1] + [0.1] * (n - 1)) == -np.inf
