@@ -393,8 +393,9 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
         index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
         raise ValueError(
             f"{table.file}, line {table.lines[index + 1]}: expected a uniform time step of about {usual:g} s, got "
-            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; interpolate to a uniform step, "
-            f"or print the times with more digits"
+            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; insert rows with "
+            "empty cells where the logger has missed samples, interpolate to a uniform step, or print the times with "
+            "more digits"
         )
     tolerance /= increments.size
     rate = round(1 / step) if 1 / step < 1e15 else 0
