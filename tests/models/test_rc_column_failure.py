@@ -108,17 +108,18 @@ def weakened(column, drifts, points=30, **changes):
 def test_a_column_that_loses_the_axial_load_comes_down_and_carries_it_again(column):
     """Without the lowering, the simulation fails: the bars that remain yield in compression over open cracks."""
     late = dict(fatigue=LowCycleFatigue(cf=0.088, cd=0.389), buckling=BarBuckling(8.5), max_increment=0.04)
-    model = weakened(column, (0.02, 0.05, 0.07), points=20, axial_load=1.4e6, **late)
+    # in the middle of loads (1.50 to 1.60 MN) that give this, since last bits decide when a bar fractures
+    model = weakened(column, (0.02, 0.05, 0.07), points=24, axial_load=1.55e6, **late)
     history = model.history([1.0])
     assert history.lowerings == 1
     assert (history.bar_damage > 1.0).all()
     np.testing.assert_allclose(history["displacement"], model.loading.displacement, atol=1e-12)
     # a cantilever in linear geometry carries its load and the moment of the force at every sample, also afterwards
-    np.testing.assert_allclose(history["base axial force"], -1.4e6, rtol=1e-6)
+    np.testing.assert_allclose(history["base axial force"], -1.55e6, rtol=1e-6)
     moment = -history["force"] * model.height
     np.testing.assert_allclose(history["base moment"], moment, atol=1e-6 * np.abs(moment).max())
     # controls: neither cycles before the loss nor bars that do not fracture need it
-    early = replace(model, loading=cycles(0.02, points=20)).history([1.0])
+    early = replace(model, loading=cycles(0.02, points=24)).history([1.0])
     assert early.lowerings == 0
     assert early.bar_damage.max() < 1.0
     assert replace(model, fatigue=None).history([1.0]).lowerings == 0
