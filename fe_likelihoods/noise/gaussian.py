@@ -580,7 +580,11 @@ class GaussianNoise:
                 )
             squares, *powers = split_sums(statistics, n_channels, len(counts))
             power = powers[0] if powers else None
-        deviations = self._deviations(parameters, counts, power)
+        if self._whole and self.level == "si" and self.sensor is None and not self._scaled:
+            sigma = np.asarray(parameters, dtype=float)[:, None]  # the usual noise takes the short way
+            deviations = np.where(sigma >= 0.0, sigma, np.nan)
+        else:
+            deviations = self._deviations(parameters, counts, power)
         with np.errstate(all="ignore"):
             # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
             ratio = np.sqrt(squares) / deviations
