@@ -191,7 +191,11 @@ def _read(backend: Backend) -> dict[str, Any]:
         return getattr(backend, "tempering", {})
     with backend.open() as file:
         group = file[backend.name]
-        return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        return _tempering(group)
+
+
+def _tempering(group: h5py.Group) -> dict[str, Any]:
+    return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
@@ -220,7 +224,7 @@ def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[
             for step in zip(*parts, strict=True):
                 for part in step:
                     checksum = zlib.crc32(part.tobytes(), checksum)
-        stored = json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        stored = _tempering(group)
         parts, rest = [steps, stored.get("first_step"), stored.get("provisional")], 0
         parts += [group["accepted"][...]]
         parts += [group.attrs[name] for name in sorted(group.attrs) if name.startswith("random_state_")]

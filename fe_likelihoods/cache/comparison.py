@@ -17,6 +17,7 @@ from ..simulation.model import (
     Model,
     SimulationBatch,
     misfit_of_responses,
+    most_responses,
     simulate_batch,
 )
 from ..simulation.opened import Opened, observing
@@ -41,7 +42,6 @@ __all__ = [
 
 DEFAULT_TOLERANCE = 1e-9
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
-RESPONSE_VALUES = 2**23  # largest number of response values in memory: 64 MiB
 
 
 class VerifyingRun(NamedTuple):
@@ -115,7 +115,7 @@ def simulate_again(
 ) -> list[Simulated]:
     """New simulations; if the model's label is given, what they open is passed to the function `complete`."""
     rows = []
-    size = max(1, RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))
+    size = most_responses(run.model)
     for start in range(0, len(thetas), size):
         with observed(label, run.pool, complete):
             batch = simulate_batch(run.model, thetas[start : start + size], run.pool)

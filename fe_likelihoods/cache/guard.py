@@ -50,15 +50,15 @@ class ModelGuard:
         Label items that have changed without an effect on results.
     unchecked : list of (n, n_structural) ndarray
         Parameters simulated since the last comparison.
-    compared, seconds : int, float
-        Simulations that were repeated, and their wall time [s].
+    compared : int
+        Simulations that were repeated.
     """
 
     def __init__(self, model: Model, label: ModelLabel) -> None:
         self._fingerprint = model.fingerprint
         self.known = copy.copy(label)  # a copy, because the label of stored rows never changes
         self.changing: set[str] = label.changing
-        self.compared, self.seconds = 0, 0.0
+        self.compared = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -68,10 +68,10 @@ class ModelGuard:
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
 
     def __getstate__(self) -> tuple:
-        return self._fingerprint, self.known, self.changing, self.compared, self.seconds
+        return self._fingerprint, self.known, self.changing, self.compared
 
     def __setstate__(self, state: tuple) -> None:
-        self._fingerprint, self.known, self.changing, self.compared, self.seconds = state
+        self._fingerprint, self.known, self.changing, self.compared = state
         self._begin()
 
     def before(self, run: VerifyingRun) -> None:
@@ -166,7 +166,6 @@ class ModelGuard:
 
     def _repeat(self, run: VerifyingRun) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
-        start = time.perf_counter()
         thetas = np.array([point.theta for point in self.points])
 
         tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
@@ -181,5 +180,4 @@ class ModelGuard:
 
         agrees, new = same([point.misfit for point in self.points])
         agrees = agrees or not same(new)[0]
-        self.seconds += time.perf_counter() - start
         return agrees

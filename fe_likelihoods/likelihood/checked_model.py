@@ -1,6 +1,5 @@
 """The model of a simulator: whether it is still the same, and which stored simulations are its own."""
 
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -15,12 +14,7 @@ from ..simulation.label import ModelLabel
 from ..simulation.model import Model
 from ..simulation.opened import Opened
 
-__all__ = ["CheckedModel", "opened_cache"]
-
-
-def opened_cache(cache: SimulationCache | str | os.PathLike | None) -> SimulationCache | None:
-    """The cache on disk, opened if a path was given; None for None."""
-    return cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
+__all__ = ["CheckedModel"]
 
 
 class CheckedModel:

@@ -13,13 +13,11 @@ from ..cache.comparison import VerifyingRun
 from ..cache.guard import EarlierPoint
 from ..cache.memory import MemoryCache, ResponseMemory
 from ..cache.verification import StaleCache
-from ..simulation.model import SimulationBatch, misfit_of_responses
+from ..simulation.model import SimulationBatch, misfit_of_responses, most_responses
 from .checked_model import CheckedModel
 from .failures import FailureLog
 
-__all__ = ["KnownSimulations", "Requested", "most_responses"]
-
-_RESPONSE_VALUES = 2**23  # responses held at once where they are cached: 64 MiB
+__all__ = ["KnownSimulations", "Requested"]
 
 
 class Requested(NamedTuple):
@@ -110,7 +108,7 @@ class KnownSimulations:
         requested.cached[:] = requested.known if requested.response is None else failed
         self._name_failures(requested, np.flatnonzero(failed), run)
         left = np.flatnonzero(~requested.cached)
-        size = most_responses(run)
+        size = most_responses(run.model)
         for start in range(0, len(left), size):
             self._fill_responses(requested, left[start : start + size], run)
         self._fill_failures(requested, np.flatnonzero(~requested.cached & ~requested.known), run)
@@ -207,8 +205,3 @@ class KnownSimulations:
         outcomes = self.responses.look_up(run.model.fingerprint, [requested.keys[row] for row in rows])
         for row, outcome in zip(rows, outcomes, strict=True):
             requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
-
-
-def most_responses(run: VerifyingRun) -> int:
-    """Number of responses that are held at once where they are cached."""
-    return max(1, _RESPONSE_VALUES // (len(run.model.channels) * run.model.n_steps))

@@ -34,14 +34,15 @@ from ..simulation.model import (
     has_batch_method,
     misfit_batch,
     misfit_of_responses,
+    most_responses,
     sent_simulation,
     simulate_batch,
 )
 from ..simulation.opened import Observed, unpack
-from .checked_model import CheckedModel, opened_cache
+from .checked_model import CheckedModel
 from .failures import FailureLog
 from .inputs import check_statistic, name_of_statistic
-from .known_simulations import KnownSimulations, Requested, most_responses
+from .known_simulations import KnownSimulations, Requested
 from .running_simulations import RunningRequests, RunningSimulation, Simulated, take_all
 
 __all__ = ["COUNTS", "Simulator", "reported"]
@@ -146,7 +147,7 @@ class Simulator:
         self.n_structural = len(model.parameter_names)
         self.n_numbers = statistic_width(self.measured, statistic)
         self.pool = as_executor(pool, model)
-        self.cache = opened_cache(cache)
+        self.cache = cache if cache is None or isinstance(cache, SimulationCache) else SimulationCache(cache)
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
         self._checked = CheckedModel(model, statistic, self.cache, self.pool)
         self._key = self.simulation_key
@@ -646,7 +647,7 @@ class Simulator:
         """Smallest (all workers are busy) and largest number of simulations, of n, between two writes or reports."""
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
             return n, n
-        largest = most_responses(self._run) if self._runs_responses(responses) else n
+        largest = most_responses(self.model) if self._runs_responses(responses) else n
         if self.pool is not None:
             workers = self.pool.n_workers or n
         elif has_batch_method(self.model):

@@ -580,11 +580,7 @@ class GaussianNoise:
                 )
             squares, *powers = split_sums(statistics, n_channels, len(counts))
             power = powers[0] if powers else None
-        if self._whole and self.level == "si" and self.sensor is None and not self._scaled:
-            sigma = np.asarray(parameters, dtype=float)[:, None]  # the usual noise takes the short way
-            deviations = np.where(sigma >= 0.0, sigma, np.nan)
-        else:
-            deviations = self._deviations(parameters, counts, power)
+        deviations = self._deviations(parameters, counts, power)
         with np.errstate(all="ignore"):
             # the ratio is squared instead of sigma: the square of a tiny sigma would be zero, and 0 / 0 for zero misfit
             ratio = np.sqrt(squares) / deviations
@@ -602,6 +598,8 @@ class GaussianNoise:
         response's sums of squares.
         """
         values, levels = self._values(parameters, 1.0), np.ones(1)
+        if self.white and self.sensor is None and not self._scaled:
+            return np.where(values >= 0.0, values, np.nan)  # the usual noise takes the short way
         if self._scaled:
             levels = self._scales
         elif self._kind == "bands":

@@ -35,6 +35,7 @@ __all__ = [
     "has_batch_method",
     "misfit_batch",
     "misfit_of_responses",
+    "most_responses",
     "not_finite",
     "real_response",
     "sent_simulation",
@@ -44,7 +45,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-_RESPONSE_VALUES = 2**23  # largest number of response values in memory if only misfits are needed: 64 MiB
+_RESPONSE_VALUES = 2**23  # largest number of response values in memory at once: 64 MiB
 
 
 class SimulationFailed(FailedRun):
@@ -172,6 +173,11 @@ class Model(Protocol):
 def has_batch_method(model: Model) -> bool:
     """Whether a model has a batch method."""
     return hasattr(model, "misfit_batch") or hasattr(model, "simulate_batch")
+
+
+def most_responses(model: Model) -> int:
+    """Number of responses that are in memory at once where many are simulated one part after the other."""
+    return max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
 
 
 def first_part(model: Model, seconds: float) -> Model:
@@ -305,7 +311,7 @@ def _misfit_from_responses(
 ) -> MisfitBatch:
     """Statistics from the model's own ``simulate_batch``, in parts that limit the memory."""
     misfits, reasons = [], []
-    rows = max(1, _RESPONSE_VALUES // (len(model.channels) * model.n_steps))
+    rows = most_responses(model)
     for start in range(0, len(thetas), rows):
         batch = simulate_batch(model, thetas[start : start + rows])
         misfits += [reduce_response(response, measured, reduce) for response in batch.response]
