@@ -335,18 +335,25 @@ class FELikelihood:
             where x is not finite; never NaN.
         """
         points = as_points(x, self.parameter_names)
-        n = self.simulator.n_structural
-        if points.ndim == 1 and (misfit := self.simulator.in_memory(points[:n])) is not None:
-            (value,) = self.noise.log_likelihood(misfit, self.n_samples, points[None, n:])
-            if abs(value) < np.inf:
-                return float(value)  # most calls of a sampler that calls with single points; others take all steps
-        rows = np.atleast_2d(points)
-        possible = self.possible(rows)
-        result = np.full(len(rows), -np.inf)
+        if points.ndim == 1:
+            return self._of_point(points)
+        possible = self.possible(points)
+        result = np.full(len(points), -np.inf)
         if possible.any():
-            misfit = self.simulator.statistics(rows[possible, :n])
-            result[possible] = self.of_statistics(rows[possible], misfit)
-        return result if points.ndim == 2 else float(result[0])
+            misfit = self.simulator.statistics(points[possible, : self.simulator.n_structural])
+            result[possible] = self.of_statistics(points[possible], misfit)
+        return result
+
+    def _of_point(self, point: np.ndarray) -> float:
+        """Log-likelihood of one point (ndim,); `possible` is evaluated only if its simulation is not cached."""
+        n, row = self.simulator.n_structural, point[None]
+        misfit = self.simulator.in_memory(point[:n])
+        if misfit is None:
+            misfit = self.simulator.statistics(row[:, :n], lambda: bool(self.possible(row)[0]))
+        (value,) = self.noise.log_likelihood(misfit, self.n_samples, row[:, n:])
+        if abs(value) < np.inf:
+            return float(value)
+        return float(self.of_statistics(row, misfit)[0]) if self.possible(row)[0] else -np.inf
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""

@@ -238,7 +238,7 @@ class Simulator:
         """
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
-    def statistics(self, thetas: np.ndarray) -> np.ndarray:
+    def statistics(self, thetas: np.ndarray, is_possible: Callable[[], bool] | None = None) -> np.ndarray:
         """Statistics of the residuals that the noise needs: for white noise the sums of squares.
 
         Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped.
@@ -247,6 +247,8 @@ class Simulator:
         ----------
         thetas : (n, n_structural) float
             Structural parameters only.
+        is_possible : callable, optional
+            Called before simulations; if it returns False, nothing is simulated, and rows that are not cached are NaN.
 
         Returns
         -------
@@ -263,7 +265,7 @@ class Simulator:
             result = np.full((len(thetas), self.n_numbers), np.nan)
             finite = np.isfinite(thetas).all(axis=1)
             if finite.any():
-                result[finite] = self.statistics(thetas[finite])
+                result[finite] = self.statistics(thetas[finite], is_possible)
             return result
         # few calls of numpy, because a cached row has to cost less than 10 microseconds
         keys, distinct = distinct_keys(thetas)
@@ -274,7 +276,7 @@ class Simulator:
             new = ~np.array(known)
             left = [key for key, is_new in zip(keys, new, strict=True) if is_new]
             requested = Requested.of(left, self.n_structural, misfit[new], np.zeros(len(left), dtype=bool))
-            self._obtain(requested)
+            self._obtain(requested, is_possible)
             misfit[new] = requested.misfit
             counts = np.bincount(distinct)  # of the rows that were requested
             self.disk_hits += int(counts[new][requested.on_disk].sum())
@@ -414,11 +416,11 @@ class Simulator:
         response = np.full((len(keys), len(self.model.channels), self.model.n_steps), np.nan)
         return Requested.of(keys, self.n_structural, misfit, np.array(known, dtype=bool), response)
 
-    def _obtain(self, requested: Requested) -> None:
+    def _obtain(self, requested: Requested, is_possible: Callable[[], bool] | None = None) -> None:
         """Fill in what was requested, from the caches or by simulation."""
         self._known.fill(requested, self._run)
         left = np.flatnonzero(~requested.cached)
-        if not len(left):
+        if not len(left) or (is_possible is not None and not is_possible()):
             return
         arrived: SimpleQueue = SimpleQueue()
         keys, responses = [requested.keys[row] for row in left], requested.response is not None
