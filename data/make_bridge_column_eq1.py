@@ -12,8 +12,9 @@ from pathlib import Path
 
 from fe_likelihoods.data.ground_motion import stochastic_motion
 
-from fe_likelihoods import Record, write_dataset
+from fe_likelihoods import Record
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, BRIDGE_COLUMN_NOISE, bridge_column_measurements
+from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
 
 SEED = 17

@@ -17,12 +17,13 @@ from pathlib import Path
 from fe_likelihoods.data.ground_motion import stochastic_motion
 from fe_likelihoods.data.make_bridge_column_eq1 import DT, FILTER_DAMPING, HIGH_PASS, PEAK_TIME, SHAPE, base_motion
 
-from fe_likelihoods import Events, Record, write_dataset
+from fe_likelihoods import Events, Record
 from fe_likelihoods.problems import (
     BRIDGE_COLUMN_MEANS,
     BRIDGE_COLUMN_SENSOR_NOISE,
     bridge_column_measurements,
 )
+from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
 
 SEED = 2

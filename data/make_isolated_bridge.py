@@ -16,13 +16,14 @@ from pathlib import Path
 
 from fe_likelihoods.data.ground_motion import stochastic_motion
 
-from fe_likelihoods import Record, write_dataset
+from fe_likelihoods import Record
 from fe_likelihoods.problems import (
     ISOLATED_BRIDGE_NOISE,
     ISOLATED_BRIDGE_OUTPUTS,
     ISOLATED_BRIDGE_TRUTH,
     isolated_bridge_measurements,
 )
+from fe_likelihoods.signals.datasets import write_dataset
 
 SEED = 1994
 NOISE_SEED = 1999
