@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .estimates.control_variates import SignedSample
 from .estimates.importance import EvidenceCheck
 
 __all__ = [
@@ -214,7 +215,9 @@ class EarlyStop(NamedTuple):
     from_guide: bool = False
 
 
-Report = Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | EarlyStop | Concern
+Report = (
+    Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | SignedSample | EarlyStop | Concern
+)
 
 
 class AnnealingResult(NamedTuple):
@@ -232,6 +235,8 @@ class AnnealingResult(NamedTuple):
         Rounds of the guide.
     start : GuidedStart, optional
         Result of these rounds; None without a guide.
+    signed : SignedSample, optional
+        Known and evaluated points of these rounds for accurate expectations; None if the guide knows none.
     early_stop : EarlyStop, optional
         How the limit of simulations ended the annealing; None if it did not.
     concerns : tuple of str
@@ -249,6 +254,7 @@ class AnnealingResult(NamedTuple):
     founders: np.ndarray | None = None
     rounds: tuple[GuidedRound, ...] = ()
     start: GuidedStart | None = None
+    signed: SignedSample | None = None
     early_stop: EarlyStop | None = None
     concerns: tuple[str, ...] = ()
     basis: str = ""

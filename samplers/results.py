@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from .budget import Budget, as_limit
+from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
@@ -161,6 +162,15 @@ class RunResults:
     def rounds(self) -> tuple[GuidedRound, ...]:
         """Rounds of the guide in the last annealing of this object; empty without a guide."""
         return self._result.rounds
+
+    @property
+    def signed_sample(self) -> SignedSample | None:
+        """Expectations under the posterior, more accurate than chain averages; None if the guide knows no density.
+
+        ``sampler.signed_sample.expectation(function)`` gives an expectation and its standard error
+        (`samplers.estimates.control_variates`). Like `guide`, it belongs to the last annealing of this object.
+        """
+        return self._result.signed
 
     @property
     def max_simulations(self) -> float | None:

@@ -11,7 +11,8 @@ References
 Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from .emulator import ResponseEmulator
 from .student import StudentMixture, draw_mixture, mixture_log_density
 from .target import ResponseTarget
 
-__all__ = ["EmulatedPosterior", "Region", "effective_sample_size"]
+__all__ = ["EmulatedPosterior", "KnownDensity", "Region", "effective_sample_size"]
 
 _FREEDOM = 6.0
 _ROUNDS = 6
@@ -55,6 +56,25 @@ class Region(NamedTuple):
     covariance: np.ndarray
     emulator: ResponseEmulator | None
     log_evidence: float
+
+
+class KnownDensity(NamedTuple):
+    """The emulated posterior of the parameters, as a density with known expectations.
+
+    Attributes
+    ----------
+    log_density : callable
+        Function of parameters (n, ndim) that returns the logarithm of the normalised density (n,).
+    coords, weights : (m, ndim) float, (m,) float
+        Parameters, and their weights with sum 1.
+    log_density_error : float
+        Standard error of the logarithm of the normalising constant.
+    """
+
+    log_density: Callable[[np.ndarray], np.ndarray]
+    coords: np.ndarray
+    weights: np.ndarray
+    log_density_error: float
 
 
 def effective_sample_size(log_weights: np.ndarray) -> float:
@@ -113,6 +133,21 @@ class EmulatedPosterior:
             if len(rows):
                 result[rows] = region.emulator.log_likelihood(coords[rows])
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
+
+    @cached_property
+    def known(self) -> KnownDensity:
+        """This density of the parameters, with the pool."""
+        parameters = self._target.parameters(self._pool)
+        return KnownDensity(self._log_density_of, parameters, self._weights, self.log_evidence_error)
+
+    def _log_density_of(self, parameters: np.ndarray) -> np.ndarray:
+        """Normalised log-density (n,) of parameters (n, ndim)."""
+        coords, log_volume = self._target.to_coordinates(parameters)
+        inside = np.isfinite(log_volume)
+        result = np.full(len(parameters), -np.inf)
+        if inside.any():
+            result[inside] = self.log_density(coords[inside]) - self.log_evidence + log_volume[inside]
+        return result
 
     def _nearest(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Region (n,) that coordinates (n, ndim) belong to, and squared distances (n_regions, n) from all of them."""

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .density import EmulatedPosterior, Region
+from .density import EmulatedPosterior, KnownDensity, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
@@ -137,6 +137,11 @@ class ResponseGuide:
     def log_density_error(self) -> float:
         return 0.0 if self._emulated is None else self._emulated.log_evidence_error
 
+    @property
+    def known(self) -> KnownDensity | None:
+        """The emulated posterior, whose expectations cost no simulation; None before there is an emulator."""
+        return None if self._emulated is None else self._emulated.known
+
     # ------------------------------------------------------------------ what a sampler calls
 
     def prepare(self, session: Any) -> Iterator[None]:
@@ -185,13 +190,11 @@ class ResponseGuide:
 
     def log_density(self, parameters: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of the draws at parameters (n, ndim)."""
-        coords = self._target.coordinates(parameters)
-        log_prior = np.atleast_1d(self._posterior.log_prior(parameters))
+        coords, log_volume = self._target.to_coordinates(parameters)
+        inside = np.isfinite(log_volume)
         result = np.full(len(parameters), -np.inf)
-        inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
         if inside.any():
-            result[inside] = self._log_density(coords[inside]) + log_prior[inside]
-            result[inside] -= self._target.log_prior(coords[inside])
+            result[inside] = self._log_density(coords[inside]) + log_volume[inside]
         return result
 
     def observe(self, parameters: np.ndarray, session: Any) -> None:

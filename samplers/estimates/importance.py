@@ -43,6 +43,7 @@ from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
 __all__ = [
     "EvidenceCheck",
+    "KnownDensity",
     "PooledRounds",
     "Round",
     "draw_inside",
@@ -283,6 +284,25 @@ SIGNIFICANT = 4.0  # in errors
 FEWEST_FOR_GROWTH = 8
 
 
+class KnownDensity(NamedTuple):
+    """A normalised density whose expectations are known.
+
+    Attributes
+    ----------
+    log_density : callable
+        Function of points (n, ndim) that returns the logarithm of the normalised density (n,); -inf is allowed.
+    coords, weights : (m, ndim) float, (m,) float
+        Points of this density and their weights, with sum 1.
+    log_density_error : float
+        Standard error of the logarithm of the normalising constant.
+    """
+
+    log_density: Callable[[np.ndarray], np.ndarray]
+    coords: np.ndarray
+    weights: np.ndarray
+    log_density_error: float
+
+
 class Round(NamedTuple):
     """Draws of one proposal density.
 
@@ -292,11 +312,17 @@ class Round(NamedTuple):
         The draws and their records (log_prob, log_prior and, where there are any, blobs).
     log_weights : (n,) float
         Log-probability minus log-density of the proposal; -inf for impossible points.
+    known : KnownDensity, optional
+        A known density close to the posterior, fixed before the draws were made.
+    log_known : (n,) float, optional
+        Log-density of `known` minus log-density of the proposal.
     """
 
     coords: np.ndarray
     records: np.ndarray
     log_weights: np.ndarray
+    known: KnownDensity | None = None
+    log_known: np.ndarray | None = None
 
     @property
     def effective_sample_size(self) -> float:

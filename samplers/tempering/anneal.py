@@ -285,6 +285,8 @@ def _from_guide(
     """Draws of a guide, or recycling that starts from the draws; returns the draws if neither result is reliable."""
     size = len(population.coords)
     found = yield from draw_rounds(population, density, random, guidance)
+    if found.signed is not None:
+        yield population, found.signed
     if found.stopped:
         raise stopped_rounds(found)
     pooled = found.pooled
@@ -293,8 +295,8 @@ def _from_guide(
         resampled, distinct = _resampled(pooled.coords, pooled.records, pooled.log_weights, size, random)
         schedule.calibrate(pooled.coords, coarse_weights(pooled.log_weights), density.inside)
         yield resampled, start
-        ess, share, error = pooled.effective_sample_size, found.last.effective_share, pooled.log_evidence_error
-        yield resampled, Stage(1.0, ess, share, 0, distinct, pooled.log_evidence, error)
+        ess, share = pooled.effective_sample_size, found.last.effective_share
+        yield resampled, Stage(1.0, ess, share, 0, distinct, *found.evidence)
         return None
     impossible = pooled.log_evidence == -np.inf
     if impossible:

@@ -20,10 +20,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..budget import Budget
+from ..estimates.control_variates import SignedSample, signed_sample
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
     LARGEST_SHAPE,
     USABLE_SHARE,
+    KnownDensity,
     PooledRounds,
     Round,
     pool_rounds,
@@ -117,6 +119,8 @@ class RoundsOfGuide(NamedTuple):
         The last round.
     stopped : bool
         Whether the limit of simulations ended the rounds.
+    signed : SignedSample, or None
+        All rounds in which the guide had a known density (`samplers.estimates.control_variates`).
     """
 
     reason: str
@@ -124,6 +128,15 @@ class RoundsOfGuide(NamedTuple):
     pooled: PooledRounds | None
     last: Round | None
     stopped: bool = False
+    signed: SignedSample | None = None
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """Log-evidence and its standard error, from the signed sample where that is more accurate."""
+        signed, pooled = self.signed, self.pooled
+        if signed is not None and signed.log_evidence_error < pooled.log_evidence_error:
+            return signed.log_evidence, signed.log_evidence_error
+        return pooled.log_evidence, pooled.log_evidence_error
 
 
 class Batch:
@@ -135,10 +148,12 @@ class Batch:
         The draws.
     log_density : (n,) float
         Logarithm of the density that they were drawn from.
+    known : KnownDensity, optional
+        Density with known expectations that the guide had when the draws were made.
     """
 
-    def __init__(self, pending: PendingPoints, log_density: np.ndarray):
-        self.pending, self._log_density = pending, log_density
+    def __init__(self, pending: PendingPoints, log_density: np.ndarray, known: KnownDensity | None = None):
+        self.pending, self._log_density, self._known = pending, log_density, known
         self._learned = np.zeros(len(pending.coords), dtype=bool)
         self._observed = pending.arrived.copy()
 
@@ -162,7 +177,9 @@ class Batch:
         alive = log_prob > -np.inf
         log_density = self._log_density[self.pending.arrived]
         log_weights = np.where(alive, np.where(alive, log_prob, 0.0) - log_density, -np.inf)
-        return Round(coords, records, log_weights)
+        if self._known is None:
+            return Round(coords, records, log_weights)
+        return Round(coords, records, log_weights, self._known, self._known.log_density(coords) - log_density)
 
     def take_observable(self) -> np.ndarray:
         """Draws (m, ndim) that have arrived since the last call or the submission."""
@@ -205,7 +222,7 @@ def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, sess
         pending = density.submit(coords)
     else:
         pending = density.submit(coords, lambda points: observe(points, session))
-    return Batch(pending, log_density[: len(pending.coords)])
+    return Batch(pending, log_density[: len(pending.coords)], guide.known)
 
 
 def let_arrive(
@@ -287,7 +304,7 @@ def draw_rounds(
             if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
                 outcome = RoundsOfGuide("", "", pooled, rounds[-1] if rounds else None, True)
             if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
-                return outcome
+                return outcome and outcome._replace(signed=signed_sample(rounds))
             most = 0  # submitted draws are part of the result
 
     yield tick("search", False)
@@ -470,4 +487,4 @@ def stopped_rounds(found: RoundsOfGuide) -> StoppedEarly:
         return StoppedEarly(nothing, float("-inf"), float("inf"), 1.0, from_guide=True)
     pooled = found.pooled
     known = Population(1.0, pooled.coords, pooled.records, pooled.effective_sample_size, (), pooled.log_weights)
-    return StoppedEarly(known, pooled.log_evidence, pooled.log_evidence_error, 1.0, from_guide=True)
+    return StoppedEarly(known, *found.evidence, 1.0, from_guide=True)

@@ -2,6 +2,7 @@
 
 import time
 
+from ..estimates.control_variates import SignedSample
 from ..estimates.importance import EvidenceCheck
 from ..judgement.checks import check_evidence
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
@@ -45,6 +46,8 @@ class Recording:
             result = result._replace(rounds=(*result.rounds, report))
         elif isinstance(report, GuidedStart):
             result = result._replace(start=report)
+        elif isinstance(report, SignedSample):
+            result = result._replace(signed=report)
         elif isinstance(report, Concern):
             warn(report.message)
             result = result._replace(findings=(*result.findings, report))
