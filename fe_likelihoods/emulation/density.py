@@ -135,7 +135,7 @@ class EmulatedPosterior:
         return np.where(np.isnan(result), -np.inf, result) + self._target.log_prior(coords)
 
     @cached_property
-    def known(self) -> KnownDensity:
+    def known_density(self) -> KnownDensity:
         """This density of the parameters, with the pool."""
         parameters = self._target.parameters(self._pool)
         return KnownDensity(self._log_density_of, parameters, self._weights, self.log_evidence_error)

@@ -138,9 +138,9 @@ class ResponseGuide:
         return 0.0 if self._emulated is None else self._emulated.log_evidence_error
 
     @property
-    def known(self) -> KnownDensity | None:
+    def known_density(self) -> KnownDensity | None:
         """The emulated posterior, whose expectations cost no simulation; None before there is an emulator."""
-        return None if self._emulated is None else self._emulated.known
+        return None if self._emulated is None else self._emulated.known_density
 
     # ------------------------------------------------------------------ what a sampler calls
 

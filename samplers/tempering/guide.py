@@ -24,7 +24,7 @@ DEFAULTS = {
     "basis": "",
     "observe": None,
     "learns_from_parts": False,
-    "known": None,
+    "known_density": None,
 }
 
 
@@ -86,7 +86,7 @@ class Guide(Protocol):
         Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any concern,
         the verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is
         known to miss nothing.
-    ``known`` : KnownDensity, optional
+    ``known_density`` : KnownDensity, optional
         A density close to the posterior with known expectations, such as an emulated posterior, as it is now
         (`samplers.estimates.importance.KnownDensity`). It makes expectations under the posterior more accurate
         (`samplers.estimates.control_variates`).

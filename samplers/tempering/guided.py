@@ -222,7 +222,7 @@ def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, sess
         pending = density.submit(coords)
     else:
         pending = density.submit(coords, lambda points: observe(points, session))
-    return Batch(pending, log_density[: len(pending.coords)], guide.known)
+    return Batch(pending, log_density[: len(pending.coords)], guide.known_density)
 
 
 def let_arrive(

@@ -104,7 +104,7 @@ class KnowingGuide(FixedGuide):
         super().__init__(posterior, *args)
         normal = stats.multivariate_normal(posterior.mean + 0.1 * posterior.sd, np.diag(posterior.sd**2))
         points = normal.rvs(POOL, random_state=np.random.RandomState(5))
-        self.known = KnownDensity(normal.logpdf, points, np.full(POOL, 1.0 / POOL), 0.0)
+        self.known_density = KnownDensity(normal.logpdf, points, np.full(POOL, 1.0 / POOL), 0.0)
 
 
 def test_a_sampler_uses_what_its_guide_knows():
