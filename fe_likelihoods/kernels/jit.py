@@ -16,11 +16,17 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numba
 from numba.core import event
+from numba.core.compiler_lock import global_compiler_lock
+
+try:
+    from fcntl import LOCK_EX, LOCK_NB, LOCK_UN, flock
+except ImportError:  # Windows: processes that start together may each compile
+    flock = None
 
 __all__ = ["kernel", "CACHE_FOLDER", "KERNEL_HASH", "SUM_REORDERING"]
 
@@ -128,7 +134,11 @@ class _Announcer(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         """A function begins to be compiled."""
-        package = (event.data["dispatcher"].py_func.__module__ or "").rpartition(".")[0]
+        self.announce(event.data["dispatcher"].py_func)
+
+    def announce(self, function: Callable) -> None:
+        """Log that `function` is being compiled, here or in another process."""
+        package = (function.__module__ or "").rpartition(".")[0]
         if self._has_announced or package != __package__ or CACHE_FOLDER is None or _is_worker():
             return
         self._has_announced = True
@@ -141,7 +151,32 @@ class _Announcer(event.Listener):
         """Nothing is logged at the end: the run goes on."""
 
 
-event.register("numba:compile", _Announcer())
+_announcer = _Announcer()
+event.register("numba:compile", _announcer)
+
+
+def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
+    """Let one process at a time look for the machine code of a kernel and compile it; others wait and load the result.
+
+    Workers that start together would each compile everything. And numba numbers the files of the variants of a kernel
+    without a lock: two processes that compile different variants at the same time would write both to the same file.
+    """
+    compile_or_load = kernel.compile
+    name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}.lock"
+
+    def compile_alone(signature):
+        with global_compiler_lock, ExitStack() as held:  # the order is the same in every thread: none waits for itself
+            with suppress(OSError):  # a disk that is full or has no locks: compiled without one
+                file = held.enter_context(open(os.path.join(CACHE_FOLDER, name), "w"))
+                try:
+                    flock(file, LOCK_EX | LOCK_NB)
+                except BlockingIOError:
+                    _announcer.announce(kernel.py_func)
+                    flock(file, LOCK_EX)
+                held.callback(flock, file, LOCK_UN)  # explicitly: a process forked meanwhile shares the open file
+            return compile_or_load(signature)
+
+    kernel.compile = compile_alone
 
 
 def kernel(
@@ -162,7 +197,7 @@ def kernel(
     fastmath : set of str
         LLVM flags; this library uses `SUM_REORDERING` only.
     cache : bool
-        Keep the machine code on disk. Inlined functions are never cached separately.
+        Keep the machine code on disk, compiled by one process at a time. Inlined functions are never cached separately.
 
     Returns
     -------
@@ -171,17 +206,21 @@ def kernel(
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)
+    cache = cache and not inline and CACHE_FOLDER is not None
     before = numba.config.CACHE_DIR
     if CACHE_FOLDER is not None:
         numba.config.CACHE_DIR = CACHE_FOLDER  # numba reads it at decoration; it is restored below
     try:
-        return numba.njit(
+        compiled = numba.njit(
             nogil=True,
             error_model="numpy",
-            cache=cache and not inline and CACHE_FOLDER is not None,
+            cache=cache,
             forceinline=inline,
             fastmath=fastmath,
             _nrt=False,
         )(function)
     finally:
         numba.config.CACHE_DIR = before
+    if cache and flock is not None and compiled is not function:  # the same where numba is switched off
+        _compile_in_one_process(compiled)
+    return compiled

@@ -117,6 +117,35 @@ def test_workers_announce_no_compilation(copied, tmp_path, code, mark):
     assert any((tmp_path / "cache").rglob("*.nbc"))  # it was compiled
 
 
+CALL_AT_A_SIGN = (
+    "from kernels import caller; print('ready', flush=True); input(); caller.call(2.0)\n"
+    "print(sum(caller.call.stats.cache_misses.values()))"
+)
+
+
+def start(copied, code, cache):
+    settings = {"FE_LIKELIHOODS_CACHE": str(cache), "NUMBA_DISABLE_JIT": "0", "PYTHONPATH": str(copied.parent)}
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen([sys.executable, "-c", code], env=os.environ | settings, text=True, **pipes)
+
+
+@pytest.mark.skipif(jit.flock is None, reason="NO flock")
+def test_processes_that_start_together_compile_once(copied, tmp_path):
+    both = [start(copied, CALL_AT_A_SIGN, tmp_path / "cache") for _ in range(2)]
+    for process in both:
+        assert process.stdout.readline() == "ready\n"
+    (folder,) = (tmp_path / "cache").iterdir()
+    with open(folder / "kernels.caller.call.lock", "w") as held:
+        jit.flock(held, jit.LOCK_EX)
+        for process in both:
+            process.stdin.write("\n")
+            process.stdin.flush()
+            assert process.stderr.readline().startswith("Compiling the kernels, once: ")  # also where it is awaited
+        assert not list(folder.rglob("*.nbi"))
+    results = [process.communicate(timeout=120) for process in both]
+    assert sorted(results) == [("0\n", ""), ("1\n", "")]
+
+
 @pytest.mark.parametrize("change", ["content", "name", "new file"])
 def test_any_change_of_the_sources_changes_the_hash(copied, change):
     before = result_of_hash(copied)
