@@ -4,6 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 NEWER_PYTHON ?= python3.13
 READY := $(VENV)/.ready
+WITH_ARVIZ := tests/test_imports.py tests/reporting/test_arviz_data.py tests/reporting/test_noise_of_response.py \
+	tests/contract/test_emcee_contract.py tests/contract/test_ladder_and_storage.py
+
+# tests start hundreds of interpreters, and pytest rewrites 200 files: bytecode is kept whatever the machine's setting
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help update size test test-newer test-slow clients tutorials bench docs figures lint format data clean
 
@@ -27,8 +32,8 @@ test: $(READY)   ## run the quick tests on all cores
 	.venv-newer/bin/python -m pip install --quiet --disable-pip-version-check --editable . pytest pytest-timeout pytest-xdist
 	@touch $@
 
-test-newer: .venv-newer/.ready ## tests of samplers and reports with arviz 1, by NEWER_PYTHON (from 3.12 on)
-	.venv-newer/bin/python -m pytest -n auto --dist worksteal tests/contract tests/reporting
+test-newer: .venv-newer/.ready ## tests that use arviz, with arviz 1 and NEWER_PYTHON (from 3.12 on)
+	.venv-newer/bin/python -m pytest -n auto --dist worksteal $(WITH_ARVIZ)
 
 test-slow: $(READY) ## run the slow tests
 	$(BIN)/python -m pytest -m slow --timeout 7200

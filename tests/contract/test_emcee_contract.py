@@ -184,18 +184,19 @@ def test_args_and_kwargs(Sampler):
     assert not hasattr(sampler, "args")  # arviz would take it for data
 
 
-def of_names(x):
-    return Gaussian(3)(np.array([x["x0"], *x["rest"]]))
+def of_names(x, density=Gaussian(3)):
+    return density(np.array([x["x0"], *(x["rest"] if "rest" in x else (x["x1"], x["x2"]))]))
 
 
 def prior_of_names(x):
-    return Gaussian(3).log_prior(np.array([x["x0"], *x["rest"]]))
+    return of_names(x, Gaussian(3).log_prior)
 
 
 @every
-def test_parameter_names(Sampler):
+@pytest.mark.parametrize("names", [["x0", "x1", "x2"], {"x0": 0, "rest": [1, 2]}], ids=["list", "groups"])
+def test_parameter_names(Sampler, names):
     extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": prior_of_names}
-    sampler = Sampler(N, 3, of_names, parameter_names={"x0": 0, "rest": [1, 2]}, **extra)
+    sampler = Sampler(N, 3, of_names, parameter_names=names, **extra)
     sampler.run_mcmc(start(Gaussian()), STEPS)
     assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(sampler.get_chain(flat=True)))
 
@@ -254,18 +255,6 @@ def test_pickle(Sampler, make_backend):
 
 
 @every
-def test_reset_and_go_on(Sampler, make_backend):
-    posterior = Gaussian()
-    sampler = Sampler(N, 3, posterior, backend=make_backend())
-    state = sampler.run_mcmc(start(posterior), STEPS)
-    sampler.reset()
-    assert sampler.iteration == 0
-    sampler.run_mcmc(state, 2)
-    sampler.run_mcmc(None, 3)
-    assert sampler.get_chain().shape == (5, N, 3)
-
-
-@every
 def test_random_state(Sampler, make_backend):
     sampler = run(Sampler, make_backend())
     kept = sampler.random_state
@@ -312,25 +301,6 @@ def test_arviz_from_emcee(Sampler):
     sampler = run(Sampler)
     data = arviz.from_emcee(sampler, var_names=sampler.log_prob_fn.f.parameter_names)
     assert dict(data["posterior"]["x1"].sizes) == {"chain": N, "draw": STEPS}  # arviz 1 has draws first
-
-
-@every
-@pytest.mark.parametrize(
-    "moves",
-    [
-        emcee.moves.StretchMove(),
-        emcee.moves.DEMove(),
-        [emcee.moves.DEMove(), emcee.moves.WalkMove()],
-        [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)],
-        emcee.moves.GaussianMove(0.01),
-        emcee.moves.KDEMove(),
-    ],
-    ids=["stretch", "de", "list", "weighted", "gaussian", "kde"],
-)
-def test_emcees_moves_are_kernels(Sampler, moves):
-    sampler = run(Sampler, moves=moves)
-    assert sampler.get_chain().shape == (STEPS, N, 3)
-    assert 0 < sampler.acceptance_fraction.mean() <= 1
 
 
 def test_our_moves_are_emcees():

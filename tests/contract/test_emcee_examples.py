@@ -5,7 +5,6 @@ additions for `SMCSampler` and `TMCMCSampler`. The table of docs/from_emcee.rst 
 """
 
 import functools
-import multiprocessing
 
 import emcee
 import numpy as np
@@ -96,16 +95,6 @@ def test_fitting_a_line(Sampler):
         )  # the stages of 32 walkers scatter by 0.6, and half a difference is stated
 
 
-@every
-def test_keyword_arguments_of_the_function(Sampler):
-    x, y, yerr = line_data()
-    kwargs = {"y": y, "yerr": yerr}
-    sampler = Sampler(NWALKERS, 3, line_log_probability, args=[x], kwargs=kwargs, **extra(Sampler, line_log_prior))
-    sampler.run_mcmc(line_start(Sampler), 5)
-    point = sampler.get_chain()[-1, 7]
-    assert np.isclose(sampler.get_log_prob()[-1, 7], line_log_probability(point, x, y, yerr), rtol=1e-13)
-
-
 # ---------------------------------------------------------------- the quickstart: state, reset, go on
 
 NDIM = 3
@@ -177,32 +166,6 @@ def test_saving_and_monitoring_progress(Sampler, tmp_path):
     assert np.allclose(reader.get_blobs()[-1], [log_prior(x) for x in reader.get_chain()[-1]], rtol=1e-12)
 
 
-@every
-def test_a_stored_run_is_extended(Sampler, tmp_path):
-    filename, given = str(tmp_path / "tutorial.h5"), extra(Sampler, log_prior)
-    backend = emcee.backends.HDFBackend(filename)
-    first = Sampler(NWALKERS, NDIM, log_prob_and_prior, backend=backend, **given)
-    first.run_mcmc(prior_draws(), 7)
-    kept = first.get_chain()
-
-    new_backend = emcee.backends.HDFBackend(filename)
-    assert new_backend.iteration == 7
-    new_sampler = Sampler(NWALKERS, NDIM, log_prob_and_prior, backend=new_backend, **given)
-    new_sampler.run_mcmc(None, 5)
-    assert new_backend.iteration == 12
-    assert np.array_equal(new_sampler.get_chain()[:7], kept)
-
-
-@every
-def test_two_runs_in_one_file(Sampler, tmp_path):
-    filename, given = str(tmp_path / "tutorial.h5"), extra(Sampler, log_prior)
-    for name, steps in (("first", 4), ("second", 6)):
-        backend = emcee.backends.HDFBackend(filename, name=name)
-        Sampler(NWALKERS, NDIM, log_prob, backend=backend, **given).run_mcmc(prior_draws(), steps)
-    shapes = [emcee.backends.HDFBackend(filename, name=name).get_chain().shape[0] for name in ("first", "second")]
-    assert shapes == [4, 6]
-
-
 # ---------------------------------------------------------------- blobs
 
 
@@ -228,35 +191,12 @@ def test_several_blobs_with_names(Sampler, stored, tmp_path):
 
 
 @every
-def test_several_blobs_without_names(Sampler):
-    sampler = Sampler(NWALKERS, NDIM, with_two_blobs, **extra(Sampler, log_prior))
-    sampler.run_mcmc(prior_draws(), 10)
-    assert sampler.get_blobs().shape == (10, NWALKERS, 2)
-    assert np.array_equal(sampler.get_blobs()[..., 1], sampler.get_chain().mean(axis=-1))
-
-
-@every
 def test_a_dictionary_as_blob(Sampler):
     sampler = Sampler(NWALKERS, NDIM, with_dictionary, blobs_dtype=object, **extra(Sampler, log_prior))
     sampler.run_mcmc(prior_draws(), 10)
     blobs = sampler.get_blobs()
     assert blobs.shape == (10, NWALKERS)
     assert blobs[-1, 3]["first"] == sampler.get_chain()[-1, 3, 0]
-
-
-# ---------------------------------------------------------------- parallelization
-
-
-@every
-def test_a_pool_of_processes(Sampler):
-    given = extra(Sampler, log_prior)
-    serial = Sampler(NWALKERS, NDIM, log_prob, **given)
-    serial.run_mcmc(prior_draws(), 5)
-    np.random.seed(42)  # noqa: NPY002
-    with multiprocessing.get_context("fork").Pool(2) as pool:
-        parallel = Sampler(NWALKERS, NDIM, log_prob, pool=pool, **given)
-        parallel.run_mcmc(prior_draws(), 5)
-    assert np.array_equal(parallel.get_chain(), serial.get_chain())
 
 
 # ---------------------------------------------------------------- moves and proposals of the user's own
@@ -293,37 +233,3 @@ def test_moves(Sampler, moves):
     samples = sampler.get_chain(discard=50, flat=True)
     assert np.all(np.abs(samples.mean(axis=0) - 0.5 / (1 + 0.2**2)) < 0.1)
     assert np.allclose(samples.std(axis=0), 0.2 / np.sqrt(1 + 0.2**2), rtol=0.25)
-
-
-# ---------------------------------------------------------------- parameter names
-
-
-def named_log_prior(params):
-    return log_prior(np.array([params["a"], params["b"], params["c"]]))
-
-
-def named_log_prob(params):
-    return log_prob(np.array([params["a"], params["b"], params["c"]]))
-
-
-def grouped_log_prior(params):
-    return log_prior(np.array([params["a"], *params["rest"]]))
-
-
-def grouped_log_prob(params):
-    return log_prob(np.array([params["a"], *params["rest"]]))
-
-
-@every
-@pytest.mark.parametrize(
-    ("names", "function", "prior"),
-    [
-        (["a", "b", "c"], named_log_prob, named_log_prior),
-        ({"a": 0, "rest": [1, 2]}, grouped_log_prob, grouped_log_prior),
-    ],
-    ids=["list", "groups"],
-)
-def test_parameter_names(Sampler, names, function, prior):
-    sampler = Sampler(NWALKERS, NDIM, function, parameter_names=names, **extra(Sampler, prior))
-    sampler.run_mcmc(prior_draws(), 5)
-    assert np.isclose(sampler.get_log_prob()[-1, 3], log_prob(sampler.get_chain()[-1, 3]), rtol=1e-12)

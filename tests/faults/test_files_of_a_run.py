@@ -358,8 +358,9 @@ def test_damaged_files_are_kept_under_different_names(whole, tmp_path):
     path = copied(path, tmp_path)
     for number in ("", ".2"):
         os.truncate(path, path.stat().st_size // 2)
+        halved = path.read_bytes()
         make(path, kind)
-        assert Path(f"{path}.damaged{number}").exists()
+        assert Path(f"{path}.damaged{number}").read_bytes() == halved
 
 
 def test_names_of_groups_and_files_that_are_alike(tmp_path):
