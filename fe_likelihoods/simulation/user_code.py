@@ -67,6 +67,7 @@ def _distributions() -> Mapping[str, list[str]]:
     return importlib.metadata.packages_distributions()
 
 
+@functools.cache  # of what this process has imported; reading it takes milliseconds, and labels ask again and again
 def package_version(top: str) -> str:
     """Version of an installed package, by the name of its top-level module; empty for other modules."""
     try:
