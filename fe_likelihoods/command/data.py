@@ -205,7 +205,7 @@ def within(measurements: Measurements, record: Record) -> Measurements:
             raise ValueError(
                 f"channel {channel.name!r} was measured from {times[0]:g} to {times[-1]:g} s and has no sample within "
                 f"the record, 0 to {end:g} s; set zero in [measurements] to the time in the file at which the base "
-                "motion begins"
+                'motion begins (a clock time such as "10:32:07" where the file has clock times)'
             )
         share = f"{used} of {found} samples of {channel.name} lie within the record"
         if outside and used < FEWEST_SAMPLES:

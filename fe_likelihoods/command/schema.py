@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from ..signals.clock_times import is_clock
 from ..units import DIMENSIONS, to_si
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "MODELS",
     "PARTS",
     "SECTIONS",
+    "USER",
     "Key",
     "did_you_mean",
     "read_keys",
@@ -25,6 +27,7 @@ __all__ = [
     "split_number",
 ]
 
+_ZERO = "time or clock time"
 SMALLEST_STRESS = 1e4  # [Pa]; a smaller plain number is in another unit
 
 
@@ -36,8 +39,8 @@ class Key(NamedTuple):
     name : str
         The key.
     kind : str
-        A name in `_KINDS`, or a dimension of `fe_likelihoods.units.DIMENSIONS`: a text with number and unit
-        (``"1.22 m"``), or a number in SI units.
+        A name in `_KINDS`, a dimension of `fe_likelihoods.units.DIMENSIONS`, which stands for a text with number and
+        unit (``"1.22 m"``) or a number in SI units, or "time or clock time".
     meaning : str
         What it is, for the documentation.
     required : bool
@@ -134,15 +137,21 @@ PARTS: dict[str, dict[str, tuple[Key, ...]]] = {
 }
 """Tables below ``[model]`` by the kind of the model; a key that is left out has the value of the built-in structure."""
 
-_USER = (
+USER = (
     Key("parameters", "texts", "names of the structural parameters, in the order of theta", True),
     Key("channels", "table of texts", 'channels of the response: name = "quantity [unit]", in order', True),
     Key("dt", "time", "time step of the response; by default that of the record"),
     Key("n_steps", "whole number >= 1", "number of samples of the response, for a model without a record"),
-    Key("time_limit", "time", "longest duration of a run; a longer one is stopped and counts as failed"),
+    Key(
+        "time_limit",
+        "time",
+        "longest duration of a run; a longer one is stopped and counts as failed (a program needs it)",
+    ),
     Key("depends_on", "texts", "files that the response depends on besides the code"),
     Key("version", "text", "text that stands for the code in the cache; change it when the results change"),
 )
+"""Keys of ``[model]`` that all models of the user have."""
+
 MODELS: dict[str, tuple[Key, ...]] = {
     "column": (
         Key("diameter", "displacement", "diameter of the section"),
@@ -189,17 +198,17 @@ MODELS: dict[str, tuple[Key, ...]] = {
     ),
     "function": (
         Key("function", "text", 'the function, as "file.py:name"', True),
-        *_USER,
+        *USER,
         Key("isolated", "yes or no", "whether it runs in a process of its own"),
     ),
-    "opensees": (Key("function", "text", 'the function that builds and runs, as "file.py:name"', True), *_USER),
+    "opensees": (Key("function", "text", 'the function that builds and runs, as "file.py:name"', True), *USER),
     "executable": (
         Key("command", "texts", "program and its arguments", True),
         Key("templates", "table of texts", "input files: name in the folder of the run = template", True),
         Key("output", "text", "name of the file with the response", True),
         Key("columns", "whole numbers", "columns of this file that are the channels, counted from 0"),
         Key("files", "table of texts", "further files: name in the folder of the run = file"),
-        *_USER,
+        *(key._replace(required=True) if key.name == "time_limit" else key for key in USER),
     ),
 }
 """Keys of ``[model]`` by its ``kind``."""
@@ -232,7 +241,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("time_unit", "text", "unit of the times, if the file does not state it"),
         Key("dt", "time", "time step, for a file without times"),
         Key("skip", "whole number >= 0", "lines above the table, if they are not found"),
-        Key("zero", "time", "time in the file at which the base motion begins"),
+        Key("zero", _ZERO, "time in the file at which the base motion begins"),
         Key("missing", "numbers", "numbers that stand for missing samples"),
     ),
     "noise": (
@@ -300,7 +309,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 EVENT: tuple[Key, ...] = (
     *(key for key in SECTIONS["record"] if key.name != "every"),
     Key("measured", "text", "measured response in this event, to be compared: a file as in [measurements]"),
-    Key("zero", "time", "time in this file at which the base motion begins; by default as in [measurements]"),
+    Key("zero", _ZERO, "time in this file at which the base motion begins; by default as in [measurements]"),
     Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),
     Key("rest", "time", 'pause before the motion, for "end" (10 s)'),
 )
@@ -459,6 +468,11 @@ def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict
     values = {}
     for name, value in given.items():
         kind = known[name].kind
+        if kind == _ZERO:
+            if isinstance(value, str) and is_clock(value):
+                values[name] = value
+                continue
+            kind = "time"
         if kind in DIMENSIONS:
             try:
                 values[name] = read_quantity(value, kind)

@@ -11,6 +11,7 @@ TEMPLATES = {
     "bridge": ("bridge.toml",),
     "function": ("function.toml", "my_function.py", *_DATA),
     "opensees": ("opensees.toml", "my_opensees.py", *_DATA),
+    "executable": ("executable.toml", "my_program.py", "my_input.txt", "synthetic_logger.csv"),
 }
 """Files of each kind, in the folder ``templates`` of the bundled data."""
 

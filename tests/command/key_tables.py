@@ -1,9 +1,11 @@
 """Tables of the keys of the TOML file: ``python -m tests.command.key_tables`` writes them into docs/command.rst."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
+from fe_likelihoods.command.models import USER_MODELS
 from fe_likelihoods.command.priors import FORMS
-from fe_likelihoods.command.schema import EVENT, MODELS, PARTS, SECTIONS, Key
+from fe_likelihoods.command.schema import EVENT, MODELS, PARTS, SECTIONS, USER, Key
 from fe_likelihoods.units import DIMENSIONS
 
 __all__ = ["PAGE", "key_tables"]
@@ -13,32 +15,47 @@ START, END = ".. keys begin\n", ".. keys end\n"
 
 
 def _kind(key: Key) -> str:
-    name = {"displacement": "length", "rotation": "angle"}.get(key.kind, key.kind)
-    return f"{name} [{DIMENSIONS[key.kind]}]" if key.kind in DIMENSIONS else name
+    return f"[{DIMENSIONS[key.kind]}]" if key.kind in DIMENSIONS else key.kind
 
 
-def _table(title: str, keys: tuple[Key, ...]) -> str:
-    lines = [f".. list-table:: ``{title}``", "   :header-rows: 1", "   :widths: 22 22 56", ""]
-    lines += ["   * - key", "     - value", "     - meaning"]
+def _cell(text: str) -> str:
+    quoted = text.replace('"', '""')
+    return f'"{quoted}"' if set(text) & set(',"') else text
+
+
+def _table(title: str, keys: Iterable[Key]) -> str:
+    lines = [f".. csv-table:: {title}", "   :header: key, value, meaning", "   :widths: 22 22 56", ""]
     for key in keys:
-        required = " (required)" if key.required else ""
-        lines += [f"   * - ``{key.name}``", f"     - {_kind(key)}", f"     - {key.meaning}{required}"]
+        cells = f"``{key.name}``", _kind(key), key.meaning + (" (required)" if key.required else "")
+        lines.append(f"   {', '.join(map(_cell, cells))}")
     return "\n".join(lines) + "\n"
 
 
+def _without(keys: Iterable[Key], others: Iterable[Key]) -> list[Key]:
+    names = {key.name for key in others}
+    return [key for key in keys if key.name not in names]
+
+
 def key_tables() -> str:
-    """All tables as reStructuredText."""
+    """All tables as reStructuredText; keys that several sections have are in one of them."""
     blocks = []
     for kind, keys in MODELS.items():
-        blocks.append(_table(f'[model] kind = "{kind}"', keys))
+        blocks.append(_table(f'``[model] kind = "{kind}"``', _without(keys, USER if kind in USER_MODELS else ())))
         seen = {}
         for part, part_keys in PARTS.get(kind, {}).items():
-            seen.setdefault(part_keys, []).append(f"[model.{part}]")
+            seen.setdefault(part_keys, []).append(f"``[model.{part}]``")
         blocks += [_table(", ".join(parts), part_keys) for part_keys, parts in seen.items()]
-    blocks += [_table(f"[{section}]", keys) for section, keys in SECTIONS.items()]
-    blocks.append(_table("[events.NAME]", EVENT))
-    forms = tuple(Key(name, "text", form) for name, (form, _) in FORMS.items())
-    blocks.append(_table("[priors]", forms).replace("   * - key\n     - value", "   * - distribution\n     - value"))
+    kinds = ", ".join(f'``"{kind}"``' for kind in USER_MODELS)
+    blocks.append(_table(f"``[model]`` of the kinds {kinds}", USER))
+    blocks += [_table(f"``[{section}]``", keys) for section, keys in SECTIONS.items()]
+    blocks.append(
+        _table(
+            "``[events.NAME]``: the keys of ``[record]`` without ``every``, and these",
+            _without(EVENT, SECTIONS["record"]),
+        )
+    )
+    forms = "".join(f"* {form}\n" for form, _ in FORMS.values())
+    blocks.append(f"Distributions of ``[priors]``:\n\n{forms}")
     return "\n".join(blocks)
 
 

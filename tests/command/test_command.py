@@ -129,20 +129,19 @@ def test_new_writes_files_that_can_be_read(kind, tmp_path):
     assert "already contains" in call("new", kind, str(tmp_path / "a"), code=1)
 
 
-@pytest.mark.parametrize("kind", ["function", "opensees"])
+@pytest.mark.parametrize("kind", ["function", "opensees", "executable"])
 def test_templates_find_the_true_values_of_their_data(kind, tmp_path):
     """One step of Gauss and Newton from the true values stays within 3 standard errors; a long time step does not."""
     if kind == "opensees":
         require_opensees()
     shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
-    text = (tmp_path / f"my_{kind}.py").read_text()
+    code = "my_program" if kind == "executable" else f"my_{kind}"
+    text = (tmp_path / f"{code}.py").read_text()
     shifts = []
     for name, coarse in (("fine", text), ("coarse", re.sub(r"(?m)^SUBSTEPS = \d+", "SUBSTEPS = 1", text))):
-        module = f"my_{kind}_{name}"
-        (tmp_path / f"{module}.py").write_text(coarse)
-        (tmp_path / f"{name}.toml").write_text(
-            (tmp_path / f"{kind}.toml").read_text().replace(f"my_{kind}.py", f"{module}.py")
-        )
+        (tmp_path / f"{code}_{name}.py").write_text(coarse)
+        settings = (tmp_path / f"{kind}.toml").read_text().replace(f"{code}.py", f"{code}_{name}.py")
+        (tmp_path / f"{name}.toml").write_text(settings)
         likelihood = make_problem(read_job(tmp_path / f"{name}.toml")).posterior.likelihood
         true, step = np.array([1.15, 0.85]), 1e-3
         points = [true, *(true + step * np.eye(2))]
@@ -153,6 +152,28 @@ def test_templates_find_the_true_values_of_their_data(kind, tmp_path):
         errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
         shifts.append(np.abs(np.linalg.lstsq(slopes, -weighted[0])[0] / errors).max())
     assert shifts[0] < 3.0 < shifts[1]
+
+
+def test_a_program_needs_a_time_limit_and_zero_may_be_a_clock_time(tmp_path):
+    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
+    settings = (tmp_path / "executable.toml").read_text()
+
+    def measured(old, new):
+        (tmp_path / "other.toml").write_text(settings.replace(old, new))
+        return make_problem(read_job(tmp_path / "other.toml")).posterior.likelihood.measurements
+
+    usual = measured("", "")
+    for zero in ("2024-05-14 10:32:07.000", "37927 s"):
+        np.testing.assert_array_equal(measured('"10:32:07"', f'"{zero}"').values, usual.values)
+    later = measured('"10:32:07"', '"10:32:08"').values
+    np.testing.assert_array_equal(later[:, :-50], usual.values[:, 50:])  # 1 s at 0.02 s
+    for old, new, message in (
+        ('zero = "10:32:07"', "", 'a clock time such as "10:32:07"'),
+        ('"10:32:07"', '"10.32.07"', "zero: expected a number in s"),
+        ('time_limit = "20 s"', "", "time_limit: this key is missing"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            measured(old, new)
 
 
 def test_check_says_what_was_read_and_what_a_run_costs(folder):
