@@ -147,11 +147,16 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     squares = np.array([np.mean(np.square(differences)) for _, differences, _ in found])
     squares = squares + SMOOTHING * np.average(squares, weights=sizes) + np.finfo(float).eps ** 2
     shares = sizes / squares / np.sum(sizes / squares)
-    coords, weights, numbers = [], [], []
+    coords, weights, numbers, known = [], [], [], {}
     for number, ((r, differences, _), share) in enumerate(zip(found, shares, strict=True), start=1):
-        coords += [r.coords, r.known.coords]
-        weights += [share * differences / len(differences), share * r.known.weights]
-        numbers += [np.full(len(differences), number), np.zeros(len(r.known.weights), dtype=int)]
+        coords.append(r.coords)
+        weights.append(share * differences / len(differences))
+        numbers.append(np.full(len(differences), number))
+        known[id(r.known)] = r.known, share + known.get(id(r.known), (None, 0.0))[1]
+    for density, share in known.values():  # rounds may share their known density
+        coords.append(density.coords)
+        weights.append(share * density.weights)
+        numbers.append(np.zeros(len(density.weights), dtype=int))
     log_evidence, error = _evidence(found, shares)
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
 

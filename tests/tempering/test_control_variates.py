@@ -76,6 +76,13 @@ def test_exact_knowledge_leaves_the_error_of_its_points(rng):
     assert np.allclose(sample.expectation().error, 1.0 / np.sqrt(POOL), rtol=0.1)
 
 
+def test_rounds_that_share_a_known_density_count_its_points_once(rng):
+    first, second = rounds_of(rng, 30, 2, 0.0, 1.0)
+    sample = signed_sample([first, second._replace(known=first.known)])
+    assert len(sample.coords) == 60 + POOL
+    assert np.allclose(sample.expectation().error, 1.0 / np.sqrt(POOL), rtol=0.1)
+
+
 def test_rounds_without_knowledge_are_left_out(rng):
     made = rounds_of(rng, 30, 2)
     without = [r._replace(known=None, log_known=None) for r in made]
