@@ -36,7 +36,7 @@ from .evaluation.returned_values import ErrorCapturing
 from .evaluation.user_functions import UserFunctions
 from .interrupts import deferred_interrupts
 from .judgement.failures import judged_failures
-from .judgement.verdict import describe_early_stop, independent_points, judge
+from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.kernels import GuideMove, RandomWalkMove, calibrate_move
 from .output import Output
@@ -389,7 +389,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.random_state = stored.random_state
         if store and missing > 0 and self.backend.iteration == self._output.first_step:
             self._output.store_provisional_step(stored)
-        warn(describe_early_stop(self.verdict, self._budget.limit, self._result, new, missing))
+        text = describe_early_stop(self.verdict, self._budget.limit, self._result, new, missing)
+        # only steps at beta = 1 are missing in a converged run: nothing to be warned of
+        logger.info(text) if self.verdict.status == CONVERGED else warn(text)
         if new == 0 and missing > 0:
             yield stored
 
