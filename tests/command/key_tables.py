@@ -1,4 +1,4 @@
-"""Tables of the keys of the TOML file: ``python -m tests.command.key_tables`` writes them into docs/command.rst."""
+"""Tables of the keys of the TOML file: ``python -m tests.command.key_tables`` writes them into docs/keys.rst."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +10,7 @@ from fe_likelihoods.units import DIMENSIONS
 
 __all__ = ["PAGE", "key_tables"]
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "command.rst"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "keys.rst"
 START, END = ".. keys begin\n", ".. keys end\n"
 
 
