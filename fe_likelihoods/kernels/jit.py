@@ -15,9 +15,11 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import IO
 
 import numba
 from numba.core import event
@@ -155,6 +157,23 @@ _announcer = _Announcer()
 event.register("numba:compile", _announcer)
 
 
+_patience = [60.0]
+"""Seconds that this process still waits for kernels that others compile, about as long as all of them take."""
+
+
+def _lock(file: IO, function: Callable) -> None:
+    """Lock a file; OSError where that is impossible, or where another process (perhaps a stopped one) keeps it."""
+    while True:
+        try:
+            return flock(file, LOCK_EX | LOCK_NB)
+        except BlockingIOError:
+            _announcer.announce(function)
+        if _patience[0] <= 0.0:
+            raise TimeoutError(f"another process compiles {function.__name__}")
+        time.sleep(0.05)
+        _patience[0] -= 0.05
+
+
 def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
     """Let one process at a time look for the machine code of a kernel and compile it; others wait and load the result.
 
@@ -166,13 +185,9 @@ def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
 
     def compile_alone(signature):
         with global_compiler_lock, ExitStack() as held:  # the order is the same in every thread: none waits for itself
-            with suppress(OSError):  # a disk that is full or has no locks: compiled without one
+            with suppress(OSError):  # compiled without a lock
                 file = held.enter_context(open(os.path.join(CACHE_FOLDER, name), "w"))
-                try:
-                    flock(file, LOCK_EX | LOCK_NB)
-                except BlockingIOError:
-                    _announcer.announce(kernel.py_func)
-                    flock(file, LOCK_EX)
+                _lock(file, kernel.py_func)
                 held.callback(flock, file, LOCK_UN)  # explicitly: a process forked meanwhile shares the open file
             return compile_or_load(signature)
 

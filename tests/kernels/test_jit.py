@@ -142,6 +142,10 @@ def test_processes_that_start_together_compile_once(copied, tmp_path):
             process.stdin.flush()
             assert process.stderr.readline().startswith("Compiling the kernels, once: ")  # also where it is awaited
         assert not list(folder.rglob("*.nbi"))
+        # one that has waited long enough, for a process that may have been stopped, compiles by itself
+        impatient = start(copied, "from kernels import jit\njit._patience[0] = 0.1\n" + CALL_AT_A_SIGN, folder.parent)
+        assert impatient.communicate("\n", timeout=120)[0] == "ready\n1\n"
+        shutil.rmtree(next(path for path in folder.iterdir() if path.is_dir()))
     results = [process.communicate(timeout=120) for process in both]
     assert sorted(results) == [("0\n", ""), ("1\n", "")]
 
