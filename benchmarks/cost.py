@@ -14,7 +14,7 @@ import emcee
 import numpy as np
 
 from samplers import SMCSampler
-from samplers.moves.kernels import RandomWalkMove
+from samplers.moves.population_moves import RandomWalkMove
 from tests.contract.targets import Gaussian
 
 from .rows import Row

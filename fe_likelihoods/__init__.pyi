@@ -8,7 +8,7 @@ from .column_damage.park_ang import park_ang_constants
 from .data.make_isolated_bridge import table_motion
 from .events.agreement import compare_tests
 from .events.hierarchical_posterior import HierarchicalPosterior, Varying
-from .events.hierarchy import Hierarchy
+from .events.hierarchy_result import Hierarchy
 from .events.leave_one_out import leave_one_out
 from .events.ratios import EventRatios, LevelRatios
 from .events.stored_posterior import StoredPosterior

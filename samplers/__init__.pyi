@@ -1,7 +1,7 @@
 from . import presets
 from .cost import estimate_cost
 from .judgement.verdict import Verdict
-from .moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
+from .moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals
 from .reporting.model_comparison import compare_models

@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from .moves.kernels import RandomWalkMove
+from .moves.population_moves import RandomWalkMove
 
 __all__ = ["CHING_CHEN_2007", "RAMANCHA_2022_CONSTANT", "RAMANCHA_2022_LITERAL"]
 

@@ -18,7 +18,7 @@ from emcee import State
 from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
-from .moves.kernels import describe
+from .moves.population_moves import describe
 from .output import DAMAGED, is_whole, make_group, run_of_file
 from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings

@@ -12,7 +12,7 @@ Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walke
 from collections.abc import Collection
 from typing import Any
 
-from .moves.kernels import MixtureMove
+from .moves.population_moves import MixtureMove
 from .settings import MOVES, Settings
 from .tempered import TemperedSampler
 
@@ -30,7 +30,7 @@ class SMCSampler(TemperedSampler):
     ----------
     nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, start_density, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
-        `samplers.moves.kernels.MixtureMove`: three kernels from a mixture fitted to every stage.
+        `samplers.moves.population_moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional
         Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves if the result cannot be
         trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given

@@ -38,7 +38,7 @@ from .interrupts import deferred_interrupts
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
-from .moves.kernels import GuideMove, RandomWalkMove, calibrate_move
+from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move
 from .output import Output
 from .proposals.starting import StartingProposal
 from .record import EvaluatedBatch, RunStart

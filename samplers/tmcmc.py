@@ -14,7 +14,7 @@ Wu, Angelikopoulos, Papadimitriou & Koumoutsakos 2018, doi:10.1115/1.4037450).
 from collections.abc import Collection
 from typing import Any
 
-from .moves.kernels import MixtureMove
+from .moves.population_moves import MixtureMove
 from .settings import MOVES, Settings
 from .tempered import TemperedSampler
 from .tempering.mutation import needs_many_walkers
@@ -33,7 +33,7 @@ class TMCMCSampler(TemperedSampler):
     ----------
     nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, start_density, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
-        `samplers.moves.kernels.MixtureMove`.
+        `samplers.moves.population_moves.MixtureMove`.
     coefficient_of_variation : float, optional
         Coefficient of variation of the incremental weights, which determines the next exponent. By default 1, which is
         an effective sample size of half the walkers.

@@ -54,14 +54,14 @@ def test_control_the_reader_of_imports_finds_what_breaks_the_rules(tmp_path):
     bad = tmp_path / "samplers" / "tempering" / "bad.py"
     bad.parent.mkdir(parents=True)
     bad.write_text(
-        "from typing import TYPE_CHECKING\nfrom ..moves.kernels import RandomWalkMove\nfrom . import weights\n"
+        "from typing import TYPE_CHECKING\nfrom ..moves.population_moves import RandomWalkMove\nfrom . import weights\n"
         "if TYPE_CHECKING:\n    from ..smc import SMCSampler\ndef f():\n    import arviz\n"
     )
     (bad.parent / "weights.py").write_text("from . import bad\n")
     (tmp_path / "samplers" / "smc.py").write_text("from .tempering.bad import f\n")
     (tmp_path / "samplers" / "moves.py").write_text("")
     assert imports(bad, tmp_path)[1:] == [
-        ("samplers.moves.kernels.RandomWalkMove", True),
+        ("samplers.moves.population_moves.RandomWalkMove", True),
         ("samplers.tempering.weights", True),
         ("samplers.smc.SMCSampler", False),
         ("arviz", False),

@@ -16,7 +16,7 @@ from ..cache.simulation_cache import SimulationCache
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
-from ..models.external import UserModel
+from ..models.user_model import UserModel
 from ..priors.distributions import Distribution, HalfNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record

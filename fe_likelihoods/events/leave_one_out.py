@@ -35,8 +35,8 @@ import numpy as np
 from ..priors.points import as_points
 from ..text_tables import NamedResults, number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
-from .hierarchy import Hierarchy
 from .hierarchy_checks import ends_within
+from .hierarchy_result import Hierarchy
 from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
 __all__ = ["LeftOut", "leave_one_out"]

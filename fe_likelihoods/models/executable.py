@@ -26,7 +26,7 @@ from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
 from .dependencies import content_digest
-from .external import UserModel
+from .user_model import UserModel
 from .validation import positive_float
 
 __all__ = ["ExecutableModel"]

@@ -15,7 +15,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.opened import Observed, note
 from ..simulation.sandbox import Sandbox
-from .external import UserModel
+from .user_model import UserModel
 from .validation import positive_float
 
 __all__ = ["FunctionModel"]

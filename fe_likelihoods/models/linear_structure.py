@@ -29,8 +29,8 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
 from .equivalent_linear import EquivalentLinear
-from .external import ExternalModel
 from .linear_system import Parts, complex_modes, superpose
+from .user_model import ExternalModel
 
 __all__ = ["LinearStructure"]
 

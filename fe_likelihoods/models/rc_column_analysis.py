@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_failure, concrete04, reinforcing_steel
+from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import Column
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
@@ -331,7 +331,7 @@ def set_materials(
     if fatigue is not None or buckling is not None:
         coefficients = (values["Cf"], fatigue.alpha, values["Cd"]) if fatigue is not None else (0.0, 1.0, 1.0)
         support = (values["slenderness"], buckling.alpha) if buckling is not None else (0.0, 1.0)
-        bar_failure.constants(sections.steel, values["fy"], *coefficients, *support, sections.failure)
+        bar_fatigue_buckling.constants(sections.steel, values["fy"], *coefficients, *support, sections.failure)
 
 
 def _by_section(sections: np.ndarray) -> np.ndarray:
@@ -349,7 +349,7 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     reason = f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"
     if sections.failure.shape[0] == 0:
         return reason
-    broken = sections.steel_memory[:, :, bar_failure.FRACTURED]
+    broken = sections.steel_memory[:, :, bar_fatigue_buckling.FRACTURED]
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason

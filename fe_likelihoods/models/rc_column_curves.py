@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ..kernels import bar_failure, concrete04, reinforcing_steel
+from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import allocate
 from ..simulation.model import SimulationFailed
@@ -265,7 +265,7 @@ def _sections(column: RCColumn, theta: np.ndarray) -> tuple[Sections, dict[str, 
 def _bar_stress(strain: np.ndarray, memory: np.ndarray, sections: Sections, stress: np.ndarray) -> None:
     """Take one bar through `strain`, write its `stress`, and advance its `memory`."""
     if sections.failure.size:
-        bar_failure.stress_history(strain, memory, sections.steel, sections.failure, stress)
+        bar_fatigue_buckling.stress_history(strain, memory, sections.steel, sections.failure, stress)
     else:
         reinforcing_steel.stress_history(strain, memory, sections.steel, stress)
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_failure
+from ..kernels import bar_fatigue_buckling
 from ..kernels.frame import Column, allocate
 from ..kernels.newmark import Dynamics, committed_state
 from ..kernels.static import Iteration
@@ -132,7 +132,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
     damage = None
     if model.fatigue is not None:
-        damage = column.sections.steel_memory[:, :, bar_failure.DAMAGE].max(axis=0)
+        damage = column.sections.steel_memory[:, :, bar_fatigue_buckling.DAMAGE].max(axis=0)
     history = checked_history(model, model.steel, model.bar_circle_radius, analysis, theta, damage)
     return ColumnRun(history, outputs, end)
 

@@ -19,7 +19,7 @@ from ..simulation.umbridge_servers import (
     UMBridgeServers,
     Unavailable,
 )
-from .external import ExternalModel
+from .user_model import ExternalModel
 from .validation import positive_float
 
 __all__ = ["UMBridgeModel"]

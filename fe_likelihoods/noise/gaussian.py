@@ -27,7 +27,6 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from ..signals.events import EventWindow, events_of, find_events
 from .groups import BandSums, EventSums, GroupSums, Layout, PartSums, split_sums, stretches
-from .levels import Excited, excited_parts, local_level, squared_levels
 from .options import (
     PerChannel,
     as_number,
@@ -39,6 +38,7 @@ from .options import (
     shown,
     weighted,
 )
+from .response_level import Excited, excited_parts, local_level, squared_levels
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]

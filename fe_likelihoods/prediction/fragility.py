@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from ..events.hierarchy import Hierarchy
+from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import EventRatios, LevelRatios
 from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..noise.protocol import follows_response

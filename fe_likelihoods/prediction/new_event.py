@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..events.hierarchy import Hierarchy
+from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import EventRatios, LevelRatios
 from ..events.spread import EventSpread
 from ..signals.records import Record

@@ -21,7 +21,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .truncated_normal import quantile_of_normal, score_of_quantile, standard_moments
+from .truncated_normal_integrals import quantile_of_normal, score_of_quantile, standard_moments
 
 __all__ = ["Distribution", "HalfNormal", "LogNormal", "RandomState", "TruncatedNormal", "Uniform", "uniform_numbers"]
 

@@ -24,7 +24,6 @@ __all__ = [
     "coarse_weights",
     "effective_sample_size",
     "log_mean_weight",
-    "next_beta",
     "normalised_weights",
 ]
 
@@ -32,7 +31,6 @@ WHERE_TO_LOOK = (
     "check the model and the prior, and see the failures that log_prob_fn reports (posterior.report() for a posterior "
     "of fe_likelihoods)"
 )
-BISECTIONS = 20
 WEIGHT_GRID = 4096.0
 
 
@@ -90,66 +88,6 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
     """Logarithm of the mean weight from log-weights (n,); -inf if all weights are zero."""
     weights, top = _scaled(log_weights)
     return top if top == -np.inf else top + float(np.log(weights.mean()))
-
-
-def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
-    """Largest next exponent whose incremental weights keep the effective sample size at `target`.
-
-    Points of zero likelihood are lost at any larger exponent, so the target refers to the other points: it is
-    multiplied by the share of finite log-likelihoods. The step is halved until the target is met, and then bisected to
-    a relative tolerance of 1e-6. The bisection uses a fixed dyadic grid, so that rounding errors of the log-likelihood
-    do not change the exponent.
-
-    Parameters
-    ----------
-    log_likelihood : (n,) float
-        At the points of the population; -inf is allowed.
-    beta : float
-        Exponent of the population, 0 <= beta < 1.
-    target : float
-        Effective sample size wanted, 0 < target < n.
-    base : (n,) float, optional
-        Log-weights of the points at `beta`; equal by default. If given, the target is not scaled, and it must be met at
-        `beta`.
-
-    Returns
-    -------
-    float
-        In (beta, 1]; 1 if the full step keeps the target, as with a flat likelihood.
-
-    Raises
-    ------
-    ValueError
-        If no log-likelihood is finite.
-    """
-    top = np.max(log_likelihood)
-    if top == -np.inf:
-        raise ValueError(f"no point of the population has a finite log-likelihood; {WHERE_TO_LOOK}")
-    alive = log_likelihood > -np.inf
-    relative = log_likelihood[alive] - top
-    if base is None:
-        carried = 0.0
-        target = target * len(relative) / len(log_likelihood)
-    else:
-        carried = base[alive]
-
-    def meets(step: float) -> bool:
-        return effective_sample_size(carried + step * relative) >= target
-
-    step = 1.0 - beta
-    if meets(step):
-        return 1.0
-    while step > 0.0 and not meets(step):
-        step *= 0.5
-    low, high = step, 2.0 * step
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if meets(middle):
-            low = middle
-        else:
-            high = middle
-    # a step smaller than the rounding error of beta becomes the next representable number, so that annealing ends
-    return min(max(beta + low, float(np.nextafter(beta, 2.0))), 1.0)
 
 
 class EvidenceError:

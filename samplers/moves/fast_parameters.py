@@ -22,7 +22,7 @@ from emcee.model import Model
 from emcee.moves import Move
 
 from ..proposals.mixture import Mixture
-from .kernels import Inside, MixtureMove, RandomWalkMove, calibrate_move
+from .population_moves import Inside, MixtureMove, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
@@ -126,7 +126,7 @@ class WithFastSweeps(Move):
             self.move.cover_basins(coords, log_target)
 
     def expect_independence(self) -> None:
-        """See `samplers.moves.kernels.MixtureMove.expect_independence`; without effect on other moves."""
+        """See `samplers.moves.population_moves.MixtureMove.expect_independence`; without effect on other moves."""
         if isinstance(self.move, MixtureMove):
             self.move.expect_independence()
 

@@ -15,7 +15,7 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
 from ..moves.fast_parameters import WithFastSweeps
-from ..moves.kernels import MixtureMove, calibrate_move
+from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
 from ..reports import Sweep
 from ..settings import Settings

@@ -33,12 +33,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
-from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, next_beta
+from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
 from ..reports import Report, Stage, Sweep
 from .early_stop import StoppedEarly, stop_at
+from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 

@@ -32,7 +32,6 @@ from ..estimates.weights import (
     coarse_weights,
     effective_sample_size,
     log_mean_weight,
-    next_beta,
     normalised_weights,
 )
 from ..judgement.checks import check_stages
@@ -41,6 +40,7 @@ from ..settings import Settings
 from .early_stop import stop_at
 from .leaders import grow_chains
 from .mutation import MoveSchedule, Mutated, VisitedPoints, move_together
+from .next_beta import next_beta
 from .population import Density, Population
 
 __all__ = ["anneal_by_moves", "move"]

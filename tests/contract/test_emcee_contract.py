@@ -306,7 +306,7 @@ def test_arviz_from_emcee(Sampler):
 def test_our_moves_are_emcees():
     """A plain EnsembleSampler does not calibrate moves; they fit themselves to the first ensemble."""
     from samplers.moves.fast_parameters import WithFastSweeps
-    from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
+    from samplers.moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove
 
     posterior = Gaussian()
     followed = [WithFastSweeps(move, (2,)) for move in (MixtureMove(), emcee.moves.StretchMove())]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.moves.kernels import RandomWalkMove
+from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from samplers.record import Record
 from samplers.reporting.arviz_data import to_arviz

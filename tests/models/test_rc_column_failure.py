@@ -21,7 +21,7 @@ from fe_likelihoods import (
     material_curves,
     moment_curvature,
 )
-from fe_likelihoods.kernels import bar_failure
+from fe_likelihoods.kernels import bar_fatigue_buckling
 from fe_likelihoods.problems import bridge_column_data
 from fe_likelihoods.units import G0
 from tests.kernels import golden
@@ -227,14 +227,14 @@ def test_material_and_section_curves_include_the_failure(column):
     model = replace(column, fatigue=WEAK, buckling=SLENDER)
     strains = [0.03, -0.03] * 6
     curves = [material_curves(m, [1.0], steel=strains)[2].stress for m in (column, model)]
-    stress, state = np.empty_like(curves[1]), np.zeros(bar_failure.N_STATE)
+    stress, state = np.empty_like(curves[1]), np.zeros(bar_fatigue_buckling.N_STATE)
     values = model.physical_values(np.ones(1))
     s = column.steel
     moduli = (values[name] for name in ("fy", "fu", "Es", "Esh"))
     c = golden.steel_constants((*moduli, s.hardening_strain, s.ultimate_strain))
-    f = np.zeros(bar_failure.N_FAILURE)
-    bar_failure.constants(c, values["fy"], 0.09, 0.506, 0.389, 10.0, 1.0, f)
-    bar_failure.stress_history(material_curves(model, [1.0], steel=strains)[2].strain, state, c, f, stress)
+    f = np.zeros(bar_fatigue_buckling.N_FAILURE)
+    bar_fatigue_buckling.constants(c, values["fy"], 0.09, 0.506, 0.389, 10.0, 1.0, f)
+    bar_fatigue_buckling.stress_history(material_curves(model, [1.0], steel=strains)[2].strain, state, c, f, stress)
     np.testing.assert_array_equal(curves[1], stress)
     assert np.abs(curves[0] - curves[1]).max() > 50e6
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from samplers import SMCSampler
 from samplers.moves.fast_parameters import FastWalk
-from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove, _first_half
+from samplers.moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove, _first_half
 from tests.statistics.test_tails import SCALE, StudentProduct
 
 N = 40

@@ -20,7 +20,7 @@ from fe_likelihoods import (
     TruncatedNormal,
     propagate,
 )
-from fe_likelihoods.noise.levels import imposed_deformation
+from fe_likelihoods.noise.response_level import imposed_deformation
 
 FORCE = (Channel("force", "lateral force", "kN"),)
 HEIGHT, WINDOW, SENSOR, GROWTH = 2.0, 12.0, 50.0, 0.5

@@ -11,7 +11,7 @@ from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.gaussian import GaussianNoise
-from fe_likelihoods.noise.levels import local_level
+from fe_likelihoods.noise.response_level import local_level
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import rms
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal

@@ -9,7 +9,7 @@ from scipy import special, stats
 from scipy.fft import dct
 
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.events.hierarchy import Hierarchy
+from fe_likelihoods.events.hierarchy_result import Hierarchy
 from fe_likelihoods.events.ratios import EventRatios, LevelRatios
 from fe_likelihoods.events.stored_posterior import StoredPosterior
 from fe_likelihoods.likelihood.likelihood import FELikelihood

@@ -6,7 +6,7 @@ from scipy import stats
 
 from fe_likelihoods import GaussianNoise
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
-from fe_likelihoods.events.hierarchy import Hierarchy
+from fe_likelihoods.events.hierarchy_result import Hierarchy
 from fe_likelihoods.events.ratios import EventRatios
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.moves.kernels import RandomWalkMove
+from samplers.moves.population_moves import RandomWalkMove
 from tests.contract.targets import Box, Gaussian
 from tests.statistics.test_mean_error import TwoModes, scores
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within

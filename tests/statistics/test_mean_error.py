@@ -8,7 +8,7 @@ from scipy import stats
 
 from samplers import SMCSampler
 from samplers.estimates.genealogy import standard_error_of_mean, trace_founders
-from samplers.moves.kernels import RandomWalkMove
+from samplers.moves.population_moves import RandomWalkMove
 from samplers.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
 from tests.statistics.test_posteriors import MODES, runs

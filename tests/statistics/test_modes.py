@@ -8,7 +8,7 @@ from emcee.moves import StretchMove
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.moves.kernels import MixtureMove
+from samplers.moves.population_moves import MixtureMove
 from samplers.tempering import recycling
 from tests.statistics import analytic_posteriors as analytic
 from tests.statistics import analytic_runs

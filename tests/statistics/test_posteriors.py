@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.moves.kernels import MixtureMove, RandomWalkMove, StudentTMove
+from samplers.moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
 from tests.contract.targets import Box, Gaussian
 

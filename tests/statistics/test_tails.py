@@ -5,7 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from samplers import SMCSampler
-from samplers.moves.kernels import MixtureMove
+from samplers.moves.population_moves import MixtureMove
 from samplers.proposals import mixture
 from tests.contract.targets import Gaussian
 

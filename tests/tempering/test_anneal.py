@@ -5,7 +5,7 @@ import pytest
 
 from samplers.estimates.importance import EvidenceCheck
 from samplers.moves.fast_parameters import WithFastSweeps
-from samplers.moves.kernels import MixtureMove
+from samplers.moves.population_moves import MixtureMove
 from samplers.reports import AnnealingResult, Concern, Restart, Stage, Sweep
 from samplers.settings import Settings
 from samplers.tempering import recycling

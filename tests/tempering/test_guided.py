@@ -18,7 +18,7 @@ from samplers.estimates.importance import (
     tail_variance,
     tails_are_light,
 )
-from samplers.moves.kernels import GuideMove
+from samplers.moves.population_moves import GuideMove
 from tests.contract.targets import Gaussian
 from tests.tempering.guides import FixedGuide, LearningGuide, SearchingGuide
 

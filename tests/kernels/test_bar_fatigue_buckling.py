@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import bar_failure, reinforcing_steel
-from fe_likelihoods.kernels.bar_failure import DAMAGE, FRACTURED, HALF_CYCLES, N_FAILURE, N_STATE
+from fe_likelihoods.kernels import bar_fatigue_buckling, reinforcing_steel
+from fe_likelihoods.kernels.bar_fatigue_buckling import DAMAGE, FRACTURED, HALF_CYCLES, N_FAILURE, N_STATE
 from tests.opensees_bar import bar_stresses
 from tests.opensees_column import require_opensees
 
@@ -26,7 +26,7 @@ def path(*turns, n=200):
 def failure(cf=0.0, slenderness=0.0, alpha_b=1.0, cd=CD):
     """Constants of the law and of its failure."""
     c, f = golden.steel_constants(STEEL), np.zeros(N_FAILURE)
-    bar_failure.constants(c, FY, cf, ALPHA, cd, slenderness, alpha_b, f)
+    bar_fatigue_buckling.constants(c, FY, cf, ALPHA, cd, slenderness, alpha_b, f)
     return c, f
 
 
@@ -35,7 +35,7 @@ def follow(strain, **options):
     c, f = failure(**options)
     state, out = np.zeros(N_STATE), np.empty((3, len(strain)))
     for i, eps in enumerate(strain):
-        out[0, i], out[1, i] = bar_failure.update(eps, state, c, f)
+        out[0, i], out[1, i] = bar_fatigue_buckling.update(eps, state, c, f)
         out[2, i] = state[DAMAGE]
     return out
 
@@ -226,7 +226,7 @@ def test_compression_after_tension_begins_at_the_unloaded_point():
     ratio = follow(strain, slenderness=12.0)[0][-1] / lawful(strain)[-1]
     c, f = failure(slenderness=12.0)
     x, s = natural(strain[200], lawful(strain)[200])
-    expected, _ = bar_failure.buckling_factor(x - s / MODULUS, c, f)
+    expected, _ = bar_fatigue_buckling.buckling_factor(x - s / MODULUS, c, f)
     assert ratio == pytest.approx(expected, rel=1e-12)
     assert expected < 0.7
 
@@ -273,15 +273,15 @@ def test_tangent_is_the_derivative(rng, options):
         state = np.zeros(N_STATE)
         strain = random_turns(rng, 8)
         for eps in strain:
-            bar_failure.update(eps, state, c, f)
+            bar_fatigue_buckling.update(eps, state, c, f)
         direction = np.sign(strain[-1] - strain[-2])
         for ahead in (1e-3, 4e-3, 1e-2):
             eps, step = strain[-1] + direction * ahead, 1e-7
-            values = [bar_failure.stress_tangent(eps + k * step, state, c, f, trial) for k in (-1, 0, 1)]
+            values = [bar_fatigue_buckling.stress_tangent(eps + k * step, state, c, f, trial) for k in (-1, 0, 1)]
             branches = []
             for k in (-1, 1):
                 copy = state.copy()
-                bar_failure.update(eps + k * step, copy, c, f)
+                bar_fatigue_buckling.update(eps + k * step, copy, c, f)
                 branches.append((copy[reinforcing_steel.BRANCH], copy[FRACTURED]))
             if branches[0] != branches[1] or branches[0][1] or state[FRACTURED]:
                 continue
@@ -296,19 +296,19 @@ def test_a_trial_leaves_the_memory_as_it_was(rng):
     state, trial = np.zeros(N_STATE), np.zeros(N_STATE)
     for eps in random_turns(rng, 15):
         before, copy = state.copy(), state.copy()
-        tried = bar_failure.stress_tangent(eps + 1e-3, state, c, f, trial)
+        tried = bar_fatigue_buckling.stress_tangent(eps + 1e-3, state, c, f, trial)
         np.testing.assert_array_equal(state, before)
-        assert tried == bar_failure.update(eps + 1e-3, copy, c, f)
-        bar_failure.update(eps, state, c, f)
+        assert tried == bar_fatigue_buckling.update(eps + 1e-3, copy, c, f)
+        bar_fatigue_buckling.update(eps, state, c, f)
 
 
 def test_kernels_equal_pure_python(rng):
     c, f = failure(cf=0.1, slenderness=10.0)
     state, pure = np.zeros(N_STATE), np.zeros(N_STATE)
     for eps in random_turns(rng, 12)[::4]:
-        compiled = bar_failure.update(eps, state, c, f)
-        assert bar_failure.update.py_func(eps, pure, c, f) == pytest.approx(compiled, rel=1e-11, abs=1.0)
+        compiled = bar_fatigue_buckling.update(eps, state, c, f)
+        assert bar_fatigue_buckling.update.py_func(eps, pure, c, f) == pytest.approx(compiled, rel=1e-11, abs=1.0)
     np.testing.assert_allclose(pure[HALF_CYCLES:], state[HALF_CYCLES:], rtol=1e-9, atol=1e-9)
     out = np.zeros(N_FAILURE)
-    bar_failure.constants.py_func(c, FY, 0.1, ALPHA, CD, 10.0, 1.0, out)
+    bar_fatigue_buckling.constants.py_func(c, FY, 0.1, ALPHA, CD, 10.0, 1.0, out)
     np.testing.assert_allclose(out, f, rtol=1e-14)
