@@ -3,7 +3,6 @@
 from dataclasses import replace
 from importlib import resources
 
-import emcee
 import h5py
 import numpy as np
 import pytest
@@ -255,20 +254,6 @@ def test_measurements_must_fit(data, strong):
     with pytest.raises(ValueError, match="geometry"):
         bridge_column(duration=2.0, geometry="lineal")
     assert bridge_column(record=record, measurements=measurements).ndim == 7
-
-
-def test_six_lines_of_emcee():
-    """Any Bayesian client can call the posterior."""
-    posterior = bridge_column(every=8, duration=5)
-    sampler = emcee.EnsembleSampler(16, posterior.ndim, posterior, vectorize=True)
-    sampler.run_mcmc(posterior.sample_prior(16, rng=1), 4, progress=False)
-    log_prob = sampler.get_log_prob()
-    assert sampler.get_chain().shape == (4, 16, 7)
-    assert not np.isnan(log_prob).any() and np.isfinite(log_prob).any()
-    assert sampler.acceptance_fraction.max() > 0
-    chain = sampler.get_chain(flat=True)[-5:]
-    np.testing.assert_array_equal(posterior(chain), sampler.get_log_prob(flat=True)[-5:])
-    assert posterior.report()["simulations"] > 16
 
 
 def test_posteriors_of_different_problems_have_different_fingerprints(strong):

@@ -109,15 +109,6 @@ def test_the_cache_is_bounded(rng):
     assert len(likelihood.simulator.memory_cache) == 10
 
 
-def test_without_a_cache():
-    model = Line()
-    likelihood = likelihood_of(model, memory_rows=0)
-    for _ in range(2):
-        likelihood.misfit([[0.0, 0.5], [0.0, 0.5]])
-    assert len(model.runs) == likelihood.simulations == 2
-    assert likelihood.simulator.cache_hits == 0
-
-
 @pytest.mark.parametrize("rows", [-1, 2.5, None, True])
 def test_invalid_sizes(rows):
     with pytest.raises(ValueError, match="memory_rows must be the number of simulations"):

@@ -45,7 +45,9 @@ def test_finite_densities_differ_only_where_the_posterior_is_zero(posterior):
         assert posterior.finite_log_likelihood(row) == value and isinstance(posterior.negative_log_prob(row), float)
 
 
-@pytest.mark.parametrize("density", ["log_prob", "log_likelihood", "finite_log_likelihood", "negative_log_prob"])
+@pytest.mark.parametrize(
+    "density", ["log_prob", "log_prior", "log_likelihood", "finite_log_likelihood", "negative_log_prob"]
+)
 @pytest.mark.parametrize("shape", [(), (3,), (2, 5), (1, 2, 4)])
 def test_errors_of_wrong_shapes_name_the_parameters(posterior, density, shape):
     with pytest.raises(ValueError, match="4 parameters stiffness, damping, sigma_acceleration, sigma_displacement"):

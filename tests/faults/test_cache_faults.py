@@ -448,15 +448,6 @@ def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
     assert (likelihood.simulations, likelihood.simulator.cache.damaged) == (2, 2)
 
 
-def test_a_damaged_response_is_missing(path, thetas):
-    likelihood = likelihood_of(SimulationCache(path, responses=True))
-    likelihood.misfit([[1.0, 1.0]])
-    assert likelihood.simulator.cache.look_up_responses(MODEL, [[1.0, 1.0]])[0] is not None
-    likelihood.simulator.cache.file.connection().execute("UPDATE responses SET response = zeroblob(160)")
-    assert likelihood.simulator.cache.look_up_responses(MODEL, [[1.0, 1.0]]) == [None]
-    assert (likelihood.simulator.cache.damaged, likelihood.simulator.cache.info().responses) == (1, 0)
-
-
 def test_programs_that_find_a_damaged_file_at_once(filled):
     """It is set aside once, and all use the new one."""
     zeros(filled)

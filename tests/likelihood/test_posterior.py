@@ -4,7 +4,6 @@ import logging
 import math
 import multiprocessing
 import pickle
-import signal
 import warnings
 from multiprocessing.pool import ThreadPool
 
@@ -85,8 +84,6 @@ class Polynomial:
             return response[:, :-1]
         if offset == 6.0:
             return None
-        if offset == 7.0:
-            signal.raise_signal(signal.SIGINT)
         if offset == 8.0:
             response *= 1e200
         if offset == 9.0:
@@ -223,13 +220,6 @@ def test_prior_of_other_parameters_is_refused(oscillator, measurements, prior):
         Posterior(likelihood, None)
 
 
-@pytest.mark.parametrize("shape", [(3,), (5,), (2, 3), (2, 2, 4), ()])
-def test_wrong_length_is_refused(posterior, shape):
-    for density in (posterior, posterior.log_prior, posterior.log_likelihood):
-        with pytest.raises(ValueError, match=r"4 parameters stiffness, damping, .*got shape"):
-            density(np.ones(shape))
-
-
 def test_coarse_posterior(posterior, oscillator, measurements, prior):
     assert posterior.coarse is None
     assert Posterior(posterior.likelihood, prior, coarse=posterior).coarse is posterior
@@ -268,15 +258,6 @@ def test_measurements_that_do_not_fit_are_refused(oscillator, measurements):
             FELikelihood(oscillator, case)
     with pytest.raises(ValueError, match="map"):
         FELikelihood(oscillator, measurements, pool="four")
-
-
-def test_fingerprint_knows_model_and_measurements(oscillator, measurements):
-    likelihood = FELikelihood(oscillator, measurements)
-    assert likelihood.fingerprint == FELikelihood(oscillator, measurements).fingerprint
-    other = Measurements(measurements.channels, measurements.dt, measurements.values * 1.01)
-    model = LinearOscillator(oscillator.record, 0.7)
-    fingerprints = {FELikelihood(oscillator, other).fingerprint, FELikelihood(model, measurements).fingerprint}
-    assert len(fingerprints | {likelihood.fingerprint}) == 3
 
 
 def test_data_fingerprint_knows_the_measurements_only(oscillator, measurements, prior):
@@ -347,12 +328,6 @@ def test_a_failed_simulation_is_minus_infinity_with_its_reason(threads, caplog):
     assert posterior(x[0]) == -np.inf
     assert type(posterior.log_likelihood(x[0])) is float
     assert len(caplog.records) == 1
-
-
-def test_an_interrupt_is_passed_on():
-    posterior = polynomial_posterior(Polynomial())
-    with pytest.raises(KeyboardInterrupt):
-        posterior([7.0, 0.1, 0.5, 1.0])
 
 
 def test_records_of_failures_are_bounded():
@@ -506,14 +481,6 @@ def test_an_empty_batch():
 
 
 # pools, pickles, clients ----------------------------------------------------------------------------------------------
-
-
-def test_threads_give_the_same_bits(posterior, oscillator, measurements, prior):
-    x = posterior.sample_prior(40, 3)
-    with ThreadPool(2) as pool:
-        pooled = Posterior(FELikelihood(oscillator, measurements, pool=pool), prior)
-        np.testing.assert_array_equal(pooled(x), posterior(x))
-        assert pooled.report()["simulations"] == 40
 
 
 def test_spawned_processes_give_the_same_bits(posterior, oscillator, measurements, prior):

@@ -434,12 +434,6 @@ def test_a_batch_equals_its_rows_on_any_number_of_threads(column, rng, threads):
     assert column.misfit_batch(np.empty((0, 5)), measured).misfit.shape == (0, 2)
 
 
-def test_runs_are_independent(column):
-    first = column.simulate(PAPER)
-    column.simulate(2.0 * NOMINAL)
-    np.testing.assert_array_equal(column.simulate(PAPER), first)
-
-
 def test_copies_in_other_processes_give_the_same_response(column, pushed):
     for model, theta in ((column, PAPER), (pushed, PAPER[[0, 1, 4]])):
         copy = pickle.loads(pickle.dumps(model))

@@ -236,10 +236,11 @@ class TestCSV:
         path.write_text("time_s,acc_g\n" + "".join(f"{k * step:.{digits}f},0\n" for k in range(4000)))
         assert read_csv(path).dt == step
 
-    def test_single_precision_times_are_accepted(self, tmp_path):
+    @pytest.mark.parametrize("form", ["", ".6f"])
+    def test_single_precision_times_are_accepted(self, tmp_path, form):
         path = tmp_path / "a.csv"
         times = (np.arange(4000) * np.float32(0.01)).astype(np.float32)
-        path.write_text("time_s,acc_g\n" + "".join(f"{float(time)!r},0\n" for time in times))
+        path.write_text("time_s,acc_g\n" + "".join(f"{float(time):{form}},0\n" for time in times))
         assert read_csv(path).dt == 0.01
 
     @pytest.mark.parametrize("first", [0.0, 43200.0, 1.7e9])
@@ -251,12 +252,6 @@ class TestCSV:
         path.write_text("\n".join(["time_s,acc_g", *rows[:1000], *rows[1500:]]))
         with pytest.raises(ValueError, match="line 1002: expected a uniform time step"):
             read_csv(path)
-
-    def test_rounded_single_precision_times_are_accepted(self, tmp_path):
-        path = tmp_path / "a.csv"
-        times = (np.arange(4000) * np.float32(0.01)).astype(np.float32)
-        path.write_text("time_s,acc_g\n" + "".join(f"{time:.6f},0\n" for time in times))
-        assert read_csv(path).dt == 0.01
 
     @pytest.mark.parametrize("names", ["Time_A [s],a_g,Time_B [s],b_g", "time1,a_g,time2,b_g"])
     def test_two_columns_of_times(self, tmp_path, names):
