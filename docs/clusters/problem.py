@@ -1,6 +1,6 @@
-"""The posterior that the other scripts of this folder sample: put your own model here, and leave the rest.
+"""The posterior that the other scripts of this folder sample: put your own model here.
 
-The model is a function of a module, so that worker processes can import it. Its measurements are synthetic.
+The measurements are synthetic.
 """
 
 import emcee

@@ -1,5 +1,6 @@
 """Tables of the keys of the TOML file: ``python -m tests.command.key_tables`` writes them into docs/keys.rst."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,6 +19,11 @@ def _kind(key: Key) -> str:
     return f"[{DIMENSIONS[key.kind]}]" if key.kind in DIMENSIONS else key.kind
 
 
+def _literal(meaning: str) -> str:
+    """Texts in quotes as they are typed, not as typographic quotes."""
+    return re.sub(r'("[^"]+")', r"``\1``", meaning)
+
+
 def _cell(text: str) -> str:
     quoted = text.replace('"', '""')
     return f'"{quoted}"' if set(text) & set(',"') else text
@@ -26,7 +32,7 @@ def _cell(text: str) -> str:
 def _table(title: str, keys: Iterable[Key]) -> str:
     lines = [f".. csv-table:: {title}", "   :header: key, value, meaning", "   :widths: 22 22 56", ""]
     for key in keys:
-        cells = f"``{key.name}``", _kind(key), key.meaning + (" (required)" if key.required else "")
+        cells = f"``{key.name}``", _kind(key), _literal(key.meaning) + (" (required)" if key.required else "")
         lines.append(f"   {', '.join(map(_cell, cells))}")
     return "\n".join(lines) + "\n"
 
