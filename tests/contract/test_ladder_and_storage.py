@@ -1,7 +1,5 @@
 """What the samplers add to emcee's contract: ladder, evidence, their storage, errors and warnings."""
 
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 
@@ -12,7 +10,6 @@ import pytest
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
-from samplers.record import Record
 from samplers.reporting.arviz_data import to_arviz
 from samplers.reporting.run_figure import plot_run
 from samplers.reporting.summary import comparison_table, ladder_table, summary
@@ -290,30 +287,6 @@ def test_an_exception_leaves_the_finished_stages(tmp_path, error):
     posterior.after = np.inf
     sampler.run_mcmc(None, 1)
     assert sampler.ladder[-1].beta == 1 and sampler.iteration == 1
-
-
-def test_a_killed_run_leaves_a_readable_file(tmp_path):
-    path = tmp_path / "run.h5"
-    code = f"""
-import time, emcee
-from samplers import SMCSampler
-from tests.contract.targets import Gaussian
-class Slow(Gaussian):
-    def __call__(self, x):
-        time.sleep(0.005)
-        if self.calls >= 20 * {N}:
-            print("under way", flush=True)
-        return super().__call__(x)
-SMCSampler({N}, 3, Slow(sd=1e-6), vectorize=True, recycle=False,
-    backend=emcee.backends.HDFBackend({str(path)!r})).run_mcmc(None, 999)
-"""
-    root = Path(__file__).parents[2]
-    with subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "under way\n"
-        process.kill()
-    assert Record(tmp_path / "run.h5.mcmc.record").count >= 19 * N
-    backend = emcee.backends.HDFBackend(str(path), read_only=True)
-    assert backend.iteration == 0 and SMCSampler(N, 3, Gaussian(sd=1e-6), vectorize=True, backend=backend).ladder == ()
 
 
 # ---------------------------------------------------------------- errors, warnings
