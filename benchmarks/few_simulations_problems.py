@@ -18,8 +18,8 @@ from fe_likelihoods import (
     Posterior,
     TruncatedNormal,
     problems,
-    read_csv,
 )
+from fe_likelihoods.signals.readers import read_csv
 from tests import opensees_frame
 
 from . import tested_column

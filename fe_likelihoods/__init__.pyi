@@ -1,7 +1,5 @@
 from . import problems
-from .adapters import nautilus_prior, serve, to_bilby, to_pints, to_pymc
 from .cache.simulation_cache import SimulationCache
-from .cache.verification import StaleCache
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
@@ -12,7 +10,6 @@ from .events.hierarchy_result import Hierarchy
 from .events.leave_one_out import leave_one_out
 from .events.ratios import EventRatios, LevelRatios
 from .events.stored_posterior import StoredPosterior
-from .likelihood.failures import TooManyFailures
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -20,67 +17,60 @@ from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel
 from .models.isolated_bridge import IsolatedBridge
-from .models.isolated_bridge_parts import Bearing, Damper, Pier, Rubber
 from .models.linear_oscillator import LinearOscillator
 from .models.linear_structure import LinearStructure
 from .models.linear_structure_parts import BridgeDeck, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
-from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
+from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.steel_coupon import SteelCoupon
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
-from .noise.residuals import ResidualChecks, effective_samples, innovations, plot_residuals, residual_checks
+from .noise.residuals import effective_samples, plot_residuals, residual_checks
 from .plots.damage import plot_damage
-from .plots.histories import plot_histories, plot_loop
+from .plots.histories import plot_loop
 from .plots.materials import plot_material, plot_moment_curvature
 from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
 from .prediction.averaging import average_predictions
-from .prediction.fragility import fragility, peak_ground_acceleration
+from .prediction.fragility import fragility
 from .prediction.held_out import score_left_out
 from .prediction.new_event import event_level, event_ratio, predict_from_median, predict_new_event
-from .prediction.prediction import Prediction
 from .prediction.propagation import fit_measures, propagate
 from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
 from .prediction.reliability import exceedance
 from .prediction.scores import interval_score, share_within
-from .priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
+from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
 from .priors.mixture_prior import fit_mixture
-from .priors.multivariate import MultivariateNormal, TruncatedMultivariateNormal
+from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
-from .signals.datasets import read_dataset, write_dataset
 from .signals.durations import growing_durations
 from .signals.error_measures import rrmse
 from .signals.events import Events
 from .signals.fits import plot_fit
 from .signals.measurement_readers import read_columns, read_imposed_test
-from .signals.readers import read_csv, read_record
+from .signals.readers import read_record
 from .signals.records import DisplacementHistory, Record
-from .signals.response_spectrum import response_spectrum
 from .simulation.dask_executor import DaskExecutor
-from .simulation.model import Model, SimulationFailed
+from .simulation.model import SimulationFailed
 from .units import from_si, to_si
 
 __all__ = [
     "AutoregressiveNoise",
     "BarBuckling",
     "Bars",
-    "Bearing",
     "BridgeDeck",
     "Channel",
     "Concrete",
-    "Damper",
     "DaskExecutor",
     "DisplacementHistory",
-    "Distribution",
     "EquivalentLinear",
     "EventRatios",
     "Events",
@@ -102,28 +92,19 @@ __all__ = [
     "LowCycleFatigue",
     "Measurements",
     "ModalModel",
-    "Model",
     "MultivariateNormal",
     "OpenSeesModel",
-    "Patches",
-    "Pier",
     "Posterior",
-    "Prediction",
     "Prior",
     "RCColumn",
     "Record",
-    "ResidualChecks",
-    "Rubber",
     "ShearFlexuralBeam",
     "ShearFrame",
     "SimulationCache",
     "SimulationFailed",
-    "StaleCache",
     "Steel",
     "SteelCoupon",
     "StoredPosterior",
-    "TooManyFailures",
-    "TruncatedMultivariateNormal",
     "TruncatedNormal",
     "UMBridgeModel",
     "Uniform",
@@ -146,21 +127,17 @@ __all__ = [
     "fragility",
     "from_si",
     "growing_durations",
-    "innovations",
     "interval_score",
     "leave_one_out",
     "limit_states",
     "material_curves",
     "moment_curvature",
-    "nautilus_prior",
     "park_ang_constants",
     "peak",
-    "peak_ground_acceleration",
     "plot_bands",
     "plot_damage",
     "plot_fit",
     "plot_fragility",
-    "plot_histories",
     "plot_loop",
     "plot_material",
     "plot_moment_curvature",
@@ -172,22 +149,14 @@ __all__ = [
     "problems",
     "propagate",
     "read_columns",
-    "read_csv",
-    "read_dataset",
     "read_imposed_test",
     "read_record",
     "report",
     "residual_checks",
-    "response_spectrum",
     "rms",
     "rrmse",
     "score_left_out",
-    "serve",
     "share_within",
     "table_motion",
-    "to_bilby",
-    "to_pints",
-    "to_pymc",
     "to_si",
-    "write_dataset",
 ]

@@ -38,7 +38,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fe_likelihoods import (
-    Bearing,
     exceedance,
     fit_measures,
     fragility,
@@ -49,6 +48,7 @@ from fe_likelihoods import (
     propagate,
     table_motion,
 )
+from fe_likelihoods.models.isolated_bridge_parts import Bearing
 from samplers import (
     SamplingWarning,
     SMCSampler,

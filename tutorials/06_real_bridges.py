@@ -43,7 +43,6 @@ from fe_likelihoods import (
     HalfNormal,
     LinearStructure,
     Measurements,
-    Prediction,
     Record,
     Uniform,
     from_si,
@@ -54,6 +53,7 @@ from fe_likelihoods import (
     residual_checks,
     rrmse,
 )
+from fe_likelihoods.prediction.prediction import Prediction
 from samplers import compare_models, plot_corner
 
 SOURCE = "https://www.strongmotioncenter.org (CESMD): the processed data of the station in the name of the file"

@@ -58,7 +58,6 @@ from fe_likelihoods import (
     LowCycleFatigue,
     Measurements,
     Posterior,
-    Prediction,
     Prior,
     RCColumn,
     TruncatedNormal,
@@ -68,6 +67,7 @@ from fe_likelihoods import (
     rrmse,
     to_si,
 )
+from fe_likelihoods.prediction.prediction import Prediction
 
 SOURCE = "https://github.com/kuanshi/ductile-fracture"
 FILES = {

@@ -30,18 +30,17 @@ from fe_likelihoods import (
     HalfNormal,
     Measurements,
     Posterior,
-    Prediction,
     Prior,
-    ResidualChecks,
     SimulationCache,
     Uniform,
     effective_samples,
-    innovations,
     plot_residuals,
     propagate,
     residual_checks,
     rrmse,
 )
+from fe_likelihoods.noise.residuals import ResidualChecks, innovations
+from fe_likelihoods.prediction.prediction import Prediction
 from samplers import SMCSampler, plot_corner, summary
 
 

@@ -8,17 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe_likelihoods import (
-    AutoregressiveNoise,
-    Distribution,
-    FELikelihood,
-    GaussianNoise,
-    Measurements,
-    Model,
-    Posterior,
-    Prior,
-    Uniform,
-)
+from fe_likelihoods import AutoregressiveNoise, FELikelihood, GaussianNoise, Measurements, Posterior, Prior, Uniform
+from fe_likelihoods.priors.distributions import Distribution
+from fe_likelihoods.simulation.model import Model
 from samplers import SMCSampler, summary
 
 FAST = bool(os.environ.get("FAST"))

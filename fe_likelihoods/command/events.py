@@ -4,7 +4,6 @@ import logging
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,6 @@ from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
 from .data import read_base_motion, read_measured
-from .hints import in_toml_terms
 from .job import Job
 from .models import Problem, reduce_data
 from .results import write_csv
@@ -113,7 +111,7 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
 def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
     """The result of `propagate`, without the warnings that the result keeps as remarks.
 
-    The command says and writes the remarks, which are in the words of the TOML file. All other warnings, such as
+    The command says and writes the remarks. All other warnings, such as
     warnings by a user's model, are given after the prediction.
     """
     from ..prediction.propagation import propagate
@@ -130,13 +128,7 @@ def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str,
         for each in caught:
             if str(each.message) not in kept:
                 warnings.warn_explicit(each.message, each.category, each.filename, each.lineno, registry=shown)
-    if isinstance(found, Mapping):
-        return {name: _in_toml_terms(each) for name, each in found.items()}
-    return _in_toml_terms(found)
-
-
-def _in_toml_terms(prediction: Prediction) -> Prediction:
-    return replace(prediction, remarks=tuple(map(in_toml_terms, prediction.remarks)))
+    return found
 
 
 def predict_events(
@@ -253,7 +245,7 @@ def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
         lines += ["", "Peaks", text_table([("quantity", "unit", "median", "5 %", "95 %"), *rows])]
     if found.histories:
         lines += ["", "Histories against the measurements", *map(str, found.histories)]
-    paths[0].write_text(in_toml_terms("\n".join(lines), f"[events.{found.name}]") + "\n", encoding="utf-8")
+    paths[0].write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = []
     for channel, row in zip(found.predictions["peaks"].channels, found.numbers, strict=True):
         values = {"q05": row.ends[0], "q25": row.quartiles[0], "median": row.median}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .priors import parse_prior
-from .schema import EVENT, FREE_SECTIONS, MODELS, PARTS, SECTIONS, Key, did_you_mean, read_keys
+from .schema import EVENT, FREE_SECTIONS, MODEL_KINDS, SECTIONS, Key, did_you_mean, model_keys, part_keys, read_keys
 
 __all__ = ["Job", "parse_job", "read_job"]
 
@@ -25,7 +25,7 @@ class Job:
     folder : Path
         Folder that files in it are relative to.
     kind : str
-        Kind of the model, a key of `fe_likelihoods.command.schema.MODELS`.
+        Kind of the model, one of `fe_likelihoods.command.schema.MODEL_KINDS`.
     model, record, measurements, noise, sampler, budget, prediction : dict
         Keys of the sections.
     priors : dict of str to str
@@ -158,22 +158,20 @@ def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:
 
 def _read_model(given: dict[str, Any], file: str) -> tuple[str, dict[str, Any]]:
     kind = given.get("kind")
-    if kind not in MODELS:
-        known = f"known are {', '.join(MODELS)}" if not isinstance(kind, str) else did_you_mean(kind, tuple(MODELS))
+    if kind not in MODEL_KINDS:
+        known = did_you_mean(kind, MODEL_KINDS) if isinstance(kind, str) else f"known are {', '.join(MODEL_KINDS)}"
         raise ValueError(f"{file}: [model] kind: expected the kind of the structure; got {kind!r}; {known}")
-    parts = PARTS.get(kind, {})
-    keys = (*MODELS[kind], Key("kind", "text", "kind of the structure"), *(Key(name, "text", "") for name in parts))
+    parts = part_keys(kind)
+    keys = (*model_keys(kind), Key("kind", "text", "Kind of the structure", True))
+    known = (*(key.name for key in keys), *parts)  # the names of parts are proposed as well
     plain = {name: value for name, value in given.items() if name not in parts}
-    for name in plain:  # the names of parts are proposed as well
-        if name not in {key.name for key in keys}:
-            raise ValueError(
-                f"{file}: [model] {name}: unknown key of kind {kind}; {did_you_mean(name, [key.name for key in keys])}"
-            )
-    values = read_keys(plain, (*MODELS[kind], Key("kind", "text", "kind of the structure", True)), f"{file}: [model]")
-    for name, part_keys in parts.items():
+    if unknown := [name for name in plain if name not in known]:
+        raise ValueError(f"{file}: [model] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
+    values = read_keys(plain, keys, f"{file}: [model]")
+    for name, keys in parts.items():
         if name in given:
             if not isinstance(given[name], dict):
                 raise ValueError(f"{file}: [model] {name}: expected a section [model.{name}]; got {given[name]!r}")
-            values[name] = read_keys(given[name], part_keys, f"{file}: [model.{name}]")
+            values[name] = read_keys(given[name], keys, f"{file}: [model.{name}]")
     values.pop("kind")
     return kind, values

@@ -6,9 +6,11 @@ Exit codes: 0 when a command has done its work, 1 for an error in the file, the 
 ended and its verdict is "not usable", 130 after Ctrl-C.
 """
 
+import contextlib
 import shlex
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,22 @@ _FILE = click.Path(path_type=Path)
 _KINDS = ("column", "bridge", "opensees", "function", "executable")
 
 
+@contextlib.contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print warnings for users as sentences, without the file and the line of the library that issued them."""
+    usual = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, UserWarning):
+            click.echo(f"Warning: {message}", err=True)
+        else:
+            usual(message, category, *place, **options)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
 class _Commands(click.Group):
     """A group whose errors are one message without a traceback, unless ``--debug`` is given."""
 
@@ -30,10 +48,8 @@ class _Commands(click.Group):
         return super().main(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        from .hints import plain_warnings
-
         try:
-            with plain_warnings():
+            with _plain_warnings():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
             message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
@@ -42,9 +58,7 @@ class _Commands(click.Group):
         except (ValueError, OSError, RuntimeError, ImportError) as error:
             if ctx.params["debug"] or isinstance(error, RuntimeError) and type(error).__module__.startswith("click"):
                 raise
-            from .hints import in_toml_terms
-
-            click.echo(f"Error: {in_toml_terms(str(error))}", err=True)
+            click.echo(f"Error: {error}", err=True)
             ctx.exit(ERROR)
 
 
@@ -122,9 +136,8 @@ def check(file: Path, out: Path | None) -> None:
     their band.
     """
     from .checking import check_job
-    from .hints import in_toml_terms
 
-    check_job(file, out or Path(f"check-{file.stem}.png"), lambda line: click.echo(in_toml_terms(line)))
+    check_job(file, out or Path(f"check-{file.stem}.png"), click.echo)
 
 
 @main.command()

@@ -25,7 +25,7 @@ from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job
 from .noises import make_noise
 from .priors import parse_prior
-from .schema import PARTS, did_you_mean
+from .schema import did_you_mean, part_keys
 
 __all__ = ["USER_MODELS", "NotRun", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
@@ -151,7 +151,7 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
 
         off = {"fatigue": LowCycleFatigue(), "buckling": BarBuckling()}  # a section switches them on
         usual = RCColumn.lhpost(record)
-        for part in PARTS["column"]:
+        for part in part_keys("column"):
             if part in values:
                 values[part] = _changed(job, part, getattr(usual, part) or off[part], values[part])
         if "units" in values:

@@ -16,7 +16,6 @@ from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
 from ..simulation.model import SimulationFailed
-from .hints import in_toml_terms
 from .models import NotRun
 
 __all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
@@ -76,9 +75,9 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
     """Evidence and verdict, or the length of a Markov chain, as lines of text."""
     if run.tempered:
         value, error = run.sampler.log_evidence, run.sampler.log_evidence_error
-        return [f"log-evidence {value:.2f} +- {error:.2f}", in_toml_terms(str(run.verdict))]
+        return [f"log-evidence {value:.2f} +- {error:.2f}", str(run.verdict)]
     if isinstance(run.posterior.likelihood.model, NotRun):
-        return [f"{len(run.samples)} samples; the model was not run.", *map(in_toml_terms, evidence(run))]
+        return [f"{len(run.samples)} samples; the model was not run.", *evidence(run)]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "

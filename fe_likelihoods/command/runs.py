@@ -30,7 +30,6 @@ from .events import (
     read_events,
     write_events,
 )
-from .hints import in_toml_terms
 from .job import Job, parse_job, read_job
 from .models import NotRun, Problem, make_problem
 from .results import write_report, write_samples, write_tables
@@ -231,9 +230,8 @@ def _write(
     report = write_report(page, run, prediction, again, truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
-    cautions = [in_toml_terms(caution) for caution in cautions]
     for each in described:
-        cautions += [in_toml_terms(f"event {each.name}: {remark}", f"[events.{each.name}]") for remark in each.remarks]
+        cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
     return (report, *tables, samples, *pictures), tuple(cautions), not run.is_inconclusive
 
 

@@ -5,30 +5,38 @@ file, the section and the key, and propose the nearest known key for an unknown 
 """
 
 import difflib
+import importlib
+import inspect
 import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from ..models.executable import ExecutableModel
+from ..models.function import FunctionModel
+from ..noise.gaussian import GaussianNoise
 from ..signals.clock_times import is_clock
+from ..signals.readers import read_csv
 from ..units import DIMENSIONS, to_si
 
 __all__ = [
     "EVENT",
     "FREE_SECTIONS",
-    "MODELS",
-    "PARTS",
+    "MODEL_KINDS",
     "SECTIONS",
     "USER",
     "Key",
     "did_you_mean",
+    "documented_keys",
+    "model_keys",
+    "part_keys",
     "read_keys",
     "read_quantity",
     "split_number",
 ]
 
-_ZERO = "time or clock time"
 SMALLEST_STRESS = 1e4  # [Pa]; a smaller plain number is in another unit
+_ZERO = "time or clock time"
 
 
 class Key(NamedTuple):
@@ -53,196 +61,160 @@ class Key(NamedTuple):
     required: bool = False
 
 
-_CONCRETE = (
-    Key("fc", "stress", "compressive strength"),
-    Key("ec", "stress", "initial modulus"),
-    Key("ft", "stress", "tensile strength"),
-    Key("peak_strain", "number", "strain at fc; 2 fc/ec by default"),
-    Key("ultimate_strain", "number", "strain beyond which the cover carries no stress"),
-    Key("softening_strain", "number", "strain over which the stress in tension decreases"),
-    Key("softening_ratio", "number", "stress at the end of softening, as a share of ft"),
-)
-_STEEL = (
-    Key("fy", "stress", "yield strength"),
-    Key("fu", "stress", "ultimate strength"),
-    Key("es", "stress", "elastic modulus"),
-    Key("esh", "stress", "modulus at the onset of hardening"),
-    Key("hardening_strain", "number", "strain at the onset of hardening"),
-    Key("ultimate_strain", "number", "strain at fu"),
-)
-_BARS = (
-    Key("number", "whole number", "number of bars"),
-    Key("diameter", "displacement", "diameter of one bar"),
-    Key("area", "number", "area of one bar [m²]; by default from its diameter"),
-    Key("first_angle", "rotation", "angle of the first bar"),
-)
-_HOOPS = (
-    Key("diameter", "displacement", "diameter of the hoop bar"),
-    Key("spacing", "displacement", "distance between hoops"),
-    Key("fy", "stress", "yield strength"),
-    Key("area", "number", "area of one set [m²]; by default from its diameter"),
-    Key("ultimate_strain", "number", "strain at fracture"),
-    Key("spiral", "yes or no", "whether it is a spiral"),
-)
-_FATIGUE = (
-    Key("cf", "number", "plastic strain of a half cycle that breaks a bar (0.26)"),
-    Key("alpha", "number", "exponent of Coffin and Manson (0.506)"),
-    Key("cd", "number", "coefficient of the loss of strength (0.389)"),
-)
-_BUCKLING = (
-    Key(
-        "slenderness",
-        "number",
-        "unsupported bar length divided by the diameter; by default from the hoop spacing",
-    ),
-    Key("alpha", "number", "1 for steel that hardens linearly (the default), 0.75 for steel that does not"),
-)
-_PIER = (
-    Key("modulus", "stress", "modulus of elasticity"),
-    Key("inertia", "number", "second moment of area [m⁴]"),
-    Key("length", "displacement", "length of the pier"),
-    Key("height", "displacement", "height of the block"),
-    Key("center", "displacement", "height of the centre of mass of the block"),
-    Key("mass", "number", "mass of the block [kg]"),
-    Key("rotary_inertia", "number", "rotational inertia of the block [kg m²]"),
-    Key("damping_ratio", "number", "ratio of critical damping"),
-)
-_BEARING = (
-    Key("load", "force", "weight on the bearing"),
-    Key("f_min", "number", "coefficient of friction at rest"),
-    Key("df", "number", "increase of the coefficient at high velocity"),
-    Key("a", "number", "rate of this increase with velocity [s/m]"),
-    Key("yield_displacement", "displacement", "displacement at which sliding begins"),
-    Key("gamma", "number", "constant of the Bouc-Wen law"),
-)
-_DAMPER = (
-    Key("stiffness", "number", "stiffness of the spring [N/m]"),
-    Key("viscosity", "number", "coefficient of the dashpot [N s/m]"),
-    Key("count", "whole number", "number of dampers"),
-)
-PARTS: dict[str, dict[str, tuple[Key, ...]]] = {
-    "column": {
-        "concrete": _CONCRETE,
-        "steel": _STEEL,
-        "bars": _BARS,
-        "hoops": _HOOPS,
-        "fatigue": _FATIGUE,
-        "buckling": _BUCKLING,
-    },
-    "bridge": {
-        **{f"pier_{i}": _PIER for i in (1, 2)},
-        **{f"bearing_{i}": _BEARING for i in (1, 2)},
-        **{f"damper_{i}": _DAMPER for i in (1, 2)},
-    },
+def documented_keys(
+    owner: Any, names: str = "", *, without: str = "", required: str = "", **kinds: str
+) -> tuple[Key, ...]:
+    """Keys for the arguments of a class or function, from its docstring: names, kinds, units and meanings.
+
+    Parameters
+    ----------
+    owner : class or callable
+        A class or function with a numpydoc section "Parameters" or "Attributes". A float with a unit in its
+        description, such as ``[m]``, is a quantity of this dimension.
+    names : str
+        Arguments that are keys, separated by blanks; by default all.
+    without : str
+        Arguments that are no keys.
+    required : str
+        Keys without a default.
+    **kinds : str
+        Kinds of arguments whose type does not say it.
+
+    Returns
+    -------
+    tuple of Key
+        The meaning is the first sentence of a description, and the sentence that begins with "Default".
+    """
+    text = inspect.getdoc(owner)
+    if text is None:
+        raise RuntimeError("docstrings describe the keys of the TOML file: start Python without the option -OO")
+    section = re.search(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\w[^\n]*\n-+$|\Z)", text, re.M | re.S)
+    found = {}
+    for group, form, text in re.findall(r"^(\w[\w, ]*) : (.+)\n((?:    .*\n?)+)", section[1], re.M):
+        first, *others = re.split(r"(?<=\.) (?=[A-Z])", " ".join(text.split()))
+        kind = _kind(form, first)
+        unit = f" [{DIMENSIONS[kind]}]".replace("2", "²") if kind in DIMENSIONS else ""
+        choices = form.removesuffix(", optional").replace("{", "").replace("}", "") + ": " if "{" in form else ""
+        default = next((f"; d{each[1:]}" for each in others if each.startswith("Default")), "")
+        first = first[0].lower() + first[1:] if choices else first
+        meaning = f"{choices}{first.removesuffix('.').replace(unit, '')}{default.removesuffix('.')}"
+        for name in group.split(", "):
+            found[name] = Key(name, kinds.get(name) or kind, meaning, name in required.split())
+    return tuple(found[name] for name in names.split() or found if name not in without.split())
+
+
+def _kind(form: str, meaning: str) -> str:
+    """Kind of a key from the type and the unit that a docstring states; empty if no kind fits."""
+    form = re.split(r" or |, optional", form)[0]
+    if form == "float":
+        unit = next((unit for unit in re.findall(r"\[([^\];]+)[\];]", meaning)), "")
+        dimensions = (name for name, si in DIMENSIONS.items() if si == unit.replace("²", "2"))
+        return next(dimensions, "number")
+    return "text" if form.startswith("{") else _KINDS_OF_TYPES.get(form, "")
+
+
+_KINDS_OF_TYPES = {
+    "int": "whole number",
+    "bool": "yes or no",
+    "str": "text",
+    "tuple of str": "texts",
+    "sequence of str": "texts",
+    "sequence of int": "whole numbers",
+    "sequence of float": "numbers",
 }
-"""Tables below ``[model]`` by the kind of the model; a key that is left out has the value of the built-in structure."""
-
 USER = (
-    Key("parameters", "texts", "names of the structural parameters, in the order of theta", True),
-    Key("channels", "table of texts", 'channels of the response: name = "quantity [unit]", in order', True),
-    Key("dt", "time", "time step of the response; by default that of the record"),
-    Key("n_steps", "whole number >= 1", "number of samples of the response, for a model without a record"),
-    Key(
-        "time_limit",
-        "time",
-        "longest duration of a run; a longer one is stopped and counts as failed (a program needs it)",
-    ),
-    Key("depends_on", "texts", "files that the response depends on besides the code"),
-    Key("version", "text", "text that stands for the code in the cache; change it when the results change"),
+    Key("parameters", "texts", "Names of the structural parameters, in the order of theta", True),
+    Key("channels", "table of texts", 'Channels of the response: name = "quantity [unit]", in order', True),
+    *documented_keys(FunctionModel, "dt n_steps time_limit", n_steps="whole number >= 1"),
+    Key("depends_on", "texts", "Files that the response depends on besides the code"),
+    Key("version", "text", "Text that stands for the code in the cache; change it when the results change"),
 )
-"""Keys of ``[model]`` that all models of the user have."""
+"""Keys of ``[model]`` that all models of the user have; a program needs a `time_limit`."""
 
-MODELS: dict[str, tuple[Key, ...]] = {
-    "column": (
-        Key("diameter", "displacement", "diameter of the section"),
-        Key("height", "displacement", "from the foundation to the centre of the mass"),
-        Key("cover", "displacement", "clear cover, to the outside of the hoops"),
-        Key("mass", "number", "mass at the top [kg]"),
-        Key("axial_load", "force", "gravity load at the top; by default the weight of the mass"),
-        Key("rotational_inertia", "number", "rotational inertia of the mass [kg m²]"),
-        Key("vertical_mass", "yes or no", "whether the mass also acts vertically"),
-        Key("a0", "number", "mass-proportional damping [1/s]"),
-        Key("a1", "number", "stiffness-proportional damping [s]"),
-        Key("penetration", "displacement", "length of strain penetration into the foundation"),
-        Key("parameters", "texts", "names of the parameters that are updated"),
-        Key("n_elements", "whole number", "number of elements"),
-        Key("n_points", "whole number", "integration points per element"),
-        Key("mesh", "whole number", "number of strips of the section"),
-        Key("geometry", "text", '"corotational" or "linear"'),
-        Key("substeps", "whole number", "integration steps per step of the record"),
-        Key("units", "table of texts", "units in which channels are shown"),
-        Key("tolerance", "number", "norm of the last Newton correction [m and rad]"),
-        Key("element_tolerance", "number", "work of the last correction of an element [J]"),
-        Key("max_iterations", "whole number", "most Newton iterations per step"),
-        Key("halvings", "whole number", "how often a step that does not converge is halved"),
-    ),
-    "bridge": (
-        Key("deck_mass", "number", "mass of the deck [kg]"),
-        Key("parameters", "texts", "names of the parameters that are updated"),
-        Key("friction", "text", '"bouc-wen", "elastic-plastic" or "coulomb"'),
-        Key("step", "time", "integration step"),
-        Key("p_delta", "yes or no", "whether the piers have the geometric stiffness of the weight"),
-        Key("gravity", "number", "acceleration of gravity [m/s²]"),
-        Key("tolerance", "number", "last correction of the isolator forces, relative to the bearing load"),
-        Key("max_iterations", "whole number", "most Newton iterations per step"),
-    ),
-    "oscillator": (
-        Key("period", "time", "nominal undamped period", True),
-        Key("damping_ratio", "number", "nominal ratio of critical damping"),
-    ),
-    "frame": (
-        Key("floors", "table of whole numbers", "channel = floor that it is on, counted from 1", True),
-        Key("masses", "numbers", "nominal mass of each floor [kg]", True),
-        Key("stiffnesses", "numbers", "nominal stiffness of each storey [N/m]", True),
-        Key("free_masses", "whole numbers", "floors whose masses are parameters"),
-    ),
-    "function": (
-        Key("function", "text", 'the function, as "file.py:name"', True),
-        *USER,
-        Key("isolated", "yes or no", "whether it runs in a process of its own"),
-    ),
-    "opensees": (Key("function", "text", 'the function that builds and runs, as "file.py:name"', True), *USER),
+_FUNCTION = Key("function", "text", 'The function, as "file.py:name"', True)
+_OWN = {
+    "function": (_FUNCTION, *USER, *documented_keys(FunctionModel, "isolated")),
+    "opensees": (_FUNCTION, *USER),
     "executable": (
-        Key("command", "texts", "program and its arguments", True),
-        Key("templates", "table of texts", "input files: name in the folder of the run = template", True),
-        Key("output", "text", "name of the file with the response", True),
-        Key("columns", "whole numbers", "columns of this file that are the channels, counted from 0"),
-        Key("files", "table of texts", "further files: name in the folder of the run = file"),
+        *documented_keys(ExecutableModel, "command", required="command"),
+        Key("templates", "table of texts", "Input files: name in the folder of the run = template", True),
+        Key("output", "text", "Name of the file with the response", True),
+        *documented_keys(ExecutableModel, "columns"),
+        Key("files", "table of texts", "Further files: name in the folder of the run = file"),
         *(key._replace(required=True) if key.name == "time_limit" else key for key in USER),
     ),
 }
-"""Keys of ``[model]`` by its ``kind``."""
+_COLUMN_PARTS = dict(
+    concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue", buckling="BarBuckling"
+)
+_BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
+_BUILT_IN: dict[str, tuple[str, dict[str, str]]] = {
+    "column": (
+        "rc_column.RCColumn",
+        dict(without=f"loading outputs max_increment {' '.join(_COLUMN_PARTS)}", units="table of texts"),
+    ),
+    "bridge": (
+        "isolated_bridge.IsolatedBridge",
+        dict(without="record piers bearings dampers rubber outputs every vertical"),
+    ),
+    "oscillator": ("linear_oscillator.LinearOscillator", dict(without="record", required="period")),
+    "frame": (
+        "linear_structure_parts.ShearFrame",
+        dict(required="floors masses stiffnesses", floors="table of whole numbers"),
+    ),
+}
+_PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
+MODEL_KINDS = (*_BUILT_IN, *_OWN)
+"""Kinds of ``[model]``."""
 
+
+def _in_models(name: str) -> Any:
+    """A class of `fe_likelihoods.models`, imported where a file needs it: some import numba."""
+    module, _, name = name.partition(".")
+    return getattr(importlib.import_module(f"fe_likelihoods.models.{module}"), name)
+
+
+def model_keys(kind: str) -> tuple[Key, ...]:
+    """Keys of ``[model]`` for one of `MODEL_KINDS`."""
+    if kind in _OWN:
+        return _OWN[kind]
+    name, options = _BUILT_IN[kind]
+    return documented_keys(_in_models(name), **options)
+
+
+def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
+    """Keys of the tables below ``[model]`` by name; a key that is left out has the value of the built-in structure."""
+    module, names = _PARTS.get(kind, ("", {}))
+    return {part: documented_keys(_in_models(f"{module}.{name}")) for part, name in names.items()}
+
+
+_TABLE = documented_keys(read_csv, "time_unit dt skip", skip="whole number >= 0")
 SECTIONS: dict[str, tuple[Key, ...]] = {
     "record": (
         Key(
             "file",
             "text",
-            "acceleration of the base: AT2, V2, SMC, GeoNet, K-NET, ESM, CSV, Excel, or a data set (.h5)",
+            "Acceleration of the base: AT2, V2, SMC, GeoNet, K-NET, ESM, CSV, Excel, or a data set (.h5)",
         ),
-        Key("bundled", "text", "a bundled synthetic motion, instead of a file"),
-        Key("format", "text", "at2, v2, smc, geonet, knet, esm, csv or dataset; by default it is recognised"),
-        Key("column", "text", "column of a CSV file or workbook, or component (GeoNet)"),
-        Key("channel", "whole number", "channel of a V2 file"),
-        Key("units", "text", "unit of the acceleration, if the file does not state it"),
-        Key("time_unit", "text", "unit of the times of a CSV file, if the file does not state it"),
-        Key("dt", "time", "time step, for a CSV file without times"),
-        Key("skip", "whole number >= 0", "lines above the table of a CSV file, if they are not found"),
-        Key("scale", "number", "factor by which the record is multiplied"),
-        Key("duration", "time", "length of the first part that is used"),
-        Key("every", "whole number >= 1", "keep every n-th sample: a faster simulation with a longer step"),
+        Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
+        Key("format", "text", "One of at2, v2, smc, geonet, knet, esm, csv and dataset; by default it is recognised"),
+        Key("column", "text", "Column of a CSV file or workbook, or component (GeoNet)"),
+        Key("channel", "whole number", "Channel of a V2 file"),
+        Key("units", "text", "Unit of the acceleration, if the file does not state it"),
+        *_TABLE,
+        Key("scale", "number", "Factor by which the record is multiplied"),
+        Key("duration", "time", "Length of the first part that is used"),
+        Key("every", "whole number >= 1", "Keep every n-th sample: a faster simulation with a longer step"),
     ),
     "measurements": (
-        Key("file", "text", "measured response: CSV, Excel, or a data set (.h5)"),
-        Key("bundled", "text", "bundled synthetic measurements, instead of a file"),
-        Key("columns", "table of texts", "channel = name of its column in the file"),
-        Key("units", "table of texts", "channel = unit, if the file does not state it"),
-        Key("channels", "texts", "channels to use; by default all"),
-        Key("time_unit", "text", "unit of the times, if the file does not state it"),
-        Key("dt", "time", "time step, for a file without times"),
-        Key("skip", "whole number >= 0", "lines above the table, if they are not found"),
-        Key("zero", _ZERO, "time in the file at which the base motion begins"),
-        Key("missing", "numbers", "numbers that stand for missing samples"),
+        Key("file", "text", "Measured response: CSV, Excel, or a data set (.h5)"),
+        Key("bundled", "text", "Bundled synthetic measurements, instead of a file"),
+        Key("columns", "table of texts", "Channel = name of its column in the file"),
+        Key("units", "table of texts", "Channel = unit, if the file does not state it"),
+        Key("channels", "texts", "Channels to use; by default all"),
+        *_TABLE,
+        Key("zero", _ZERO, "Time in the file at which the base motion begins"),
+        Key("missing", "numbers", "Numbers that stand for missing samples"),
     ),
     "noise": (
         Key(
@@ -251,56 +223,37 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
             '"gaussian" (the default), or "autoregressive": each error depends on the one before, with a correlation '
             "per channel; takes sensor only",
         ),
-        Key(
-            "groups",
-            "text or numbers",
-            'what has a level: "channel" (the default), "all" for one level in root mean squares of the measured '
-            'channels, "event" for each channel and event, or frequencies between bands [Hz], ascending, for each '
-            "channel and band, so that errors are correlated in time",
+        *documented_keys(
+            GaussianNoise, "groups level sensor window local", groups="text or numbers", sensor="table of quantities"
         ),
-        Key(
-            "level",
-            "text",
-            'what a level is: "si" (the default), a standard deviation in the unit of the channel; "measured", a share '
-            "of the root mean square of the measured channel, in predictions of the simulated response; "
-            '"response", a share of the level of the simulated response, which follows it in time or per band',
-        ),
-        Key("sensor", "table of quantities", "channel = known standard deviation of the noise of its sensor"),
-        Key("window", "time", 'level "response" or "measured": length of the window in which the level is taken'),
-        Key(
-            "local",
-            "number",
-            'level "response": 0 to 1 (0.25); 1: the noise follows the response in each window, 0: one level for the '
-            "record",
-        ),
-        Key("marginal", "yes or no", "integrate the levels out (no); for levels in SI units without bands and sensor"),
+        Key("marginal", "yes or no", "Integrate the levels out (no); for levels in SI units without bands and sensor"),
     ),
     "sampler": (
         Key("kind", "text", '"smc" (the default), "tmcmc" or "emcee"'),
-        Key("walkers", "whole number >= 1", "number of walkers (500; emcee: 4 per parameter, 32 or more)"),
+        Key("walkers", "whole number >= 1", "Number of walkers (500; emcee: 4 per parameter, 32 or more)"),
         Key(
-            "steps", "whole number >= 1", "sweeps at beta = 1, each of which stores all walkers (4); emcee: iterations"
+            "steps", "whole number >= 1", "Sweeps at beta = 1, each of which stores all walkers (4); emcee: iterations"
         ),
-        Key("discard", "whole number >= 0", "emcee: iterations that are left out as burn-in (half of steps)"),
-        Key("seed", "whole number >= 0", "seed (1)"),
-        Key("guide", "yes or no", "find the posterior from the responses, with hundreds of simulations (no)"),
+        Key("discard", "whole number >= 0", "Emcee: iterations that are left out as burn-in (half of steps)"),
+        Key("seed", "whole number >= 0", "Seed (1)"),
+        Key("guide", "yes or no", "Find the posterior from the responses, with hundreds of simulations (no)"),
         Key("preset", "text", '"ramancha2022", "ramancha2022-constant" or "ching-chen-2007": settings of papers'),
-        Key("runs", "whole number >= 1", "runs of recycling that must agree (1)"),
-        Key("recycle", "yes or no", "reuse every evaluated point; by default with 150 walkers or more"),
-        Key("ess_ratio", "number", "share of effective walkers wanted at each stage, without recycling"),
-        Key("min_moves", "whole number", "fewest sweeps per stage"),
-        Key("max_moves", "whole number >= 1", "most sweeps per stage"),
-        Key("max_failure_share", "number", "share of failed evaluations at which the run stops (0.5)"),
+        Key("runs", "whole number >= 1", "Runs of recycling that must agree (1)"),
+        Key("recycle", "yes or no", "Reuse every evaluated point; by default with 150 walkers or more"),
+        Key("ess_ratio", "number", "Share of effective walkers wanted at each stage, without recycling"),
+        Key("min_moves", "whole number", "Fewest sweeps per stage"),
+        Key("max_moves", "whole number >= 1", "Most sweeps per stage"),
+        Key("max_failure_share", "number", "Share of failed evaluations at which the run stops (0.5)"),
     ),
     "budget": (
-        Key("max_simulations", "whole number >= 1", "most simulations; the run can be continued with more"),
-        Key("workers", "whole number >= 1", "processes, for a model of your own (1); built-in models use all cores"),
-        Key("cache", "yes or no", "keep every simulation in a file of the folder (yes)"),
+        Key("max_simulations", "whole number >= 1", "Most simulations; the run can be continued with more"),
+        Key("workers", "whole number >= 1", "Processes, for a model of your own (1); built-in models use all cores"),
+        Key("cache", "yes or no", "Keep every simulation in a file of the folder (yes)"),
     ),
     "prediction": (
-        Key("draws", "whole number >= 0", "draws of the posterior whose response is predicted (100); 0 for none"),
-        Key("noise", "yes or no", "predict measurements, with their noise (no)"),
-        Key("quantiles", "probabilities", "of the quantiles ([0.05, 0.5, 0.95])"),
+        Key("draws", "whole number >= 0", "Draws of the posterior whose response is predicted (100); 0 for none"),
+        Key("noise", "yes or no", "Predict measurements, with their noise (no)"),
+        Key("quantiles", "probabilities", "Probabilities of the quantiles ([0.05, 0.5, 0.95])"),
     ),
 }
 """Keys of the sections besides ``[model]`` and ``[priors]``."""
@@ -308,10 +261,10 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 
 EVENT: tuple[Key, ...] = (
     *(key for key in SECTIONS["record"] if key.name != "every"),
-    Key("measured", "text", "measured response in this event, to be compared: a file as in [measurements]"),
-    Key("zero", _ZERO, "time in this file at which the base motion begins; by default as in [measurements]"),
+    Key("measured", "text", "Measured response in this event, to be compared: a file as in [measurements]"),
+    Key("zero", _ZERO, "Time in this file at which the base motion begins; by default as in [measurements]"),
     Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),
-    Key("rest", "time", 'pause before the motion, for "end" (10 s)'),
+    Key("rest", "time", 'Pause before the motion, for "end" (10 s)'),
 )
 """Keys of ``[events.NAME]``, which are predicted after the run."""
 
@@ -431,6 +384,7 @@ _EXAMPLES = {
     "stress": "42 MPa",
     "moment": "100 kN m",
     "curvature": "0.01 1/m",
+    "energy": "1 kJ",
     "strain": "100 microstrain",
     "rotation": "5 deg",
     "time": "20 s",
@@ -464,7 +418,7 @@ def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict
             raise ValueError(f"{where} {name}: unknown key; {did_you_mean(name, tuple(known))}")
     for key in keys:
         if key.required and key.name not in given:
-            raise ValueError(f"{where} {key.name}: this key is missing; it is {key.meaning}")
+            raise ValueError(f"{where} {key.name}: this key is missing: {key.meaning}")
     values = {}
     for name, value in given.items():
         kind = known[name].kind

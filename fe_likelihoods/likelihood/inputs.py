@@ -76,7 +76,7 @@ def match_measurements(model: Model, measurements: Measurements) -> Measurements
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in measurements.channels]
     if sorted(expected) != sorted(got):
-        advice = "select the common ones with Measurements.select(names) and in the model"
+        advice = "select the common ones in the measurements (Measurements.select) and in the model"
         common = tuple(name for name in got if name in expected)
         if common and hasattr(model, "outputs"):  # of the library's models, whose channels have the names of outputs
             advice = f"make the model with outputs={common!r}"

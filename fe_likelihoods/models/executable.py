@@ -62,11 +62,11 @@ class ExecutableModel(UserModel):
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
     dt : float, optional
-        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+        Time step of the response [s]; with a record a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of response samples. With a record it follows from `dt`.
+        Number of response samples; with a record it follows from `dt`.
     time_limit : float
-        Longest duration of a run [s]. A longer run is stopped and counts as failed.
+        Longest duration of a run [s]; a longer run is stopped and counts as failed.
     columns : sequence of int, optional
         Columns of the output file that are the channels, counted from 0. By default the file has one column per channel
         and no others.

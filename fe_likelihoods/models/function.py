@@ -45,9 +45,9 @@ class FunctionModel(UserModel):
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
     dt : float, optional
-        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+        Time step of the response [s]; with a record a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of response samples. With a record it follows from `dt`.
+        Number of response samples; with a record it follows from `dt`.
     record : Record, optional
         Excitation, which the function receives as its second argument. The model can then be simulated under other
         records (`with_record`, ``propagate(..., record=)``, `fragility`).
@@ -62,9 +62,9 @@ class FunctionModel(UserModel):
         Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
         or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
     isolated : bool
-        Run the function in a separate process. Each setting below implies it.
+        Run the function in a separate process. Limits and `runs_per_process` imply it.
     time_limit : float, optional
-        Longest duration of a run [s]. A longer run is stopped and counts as failed.
+        Longest duration of a run [s]; a longer run is stopped and counts as failed.
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
     runs_per_process : int, optional

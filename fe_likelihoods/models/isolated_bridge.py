@@ -106,14 +106,14 @@ class IsolatedBridge(ThreadedModel):
         Names of the channels (see the notes), or the size of a measured set: 5 for the channels of pier 1, 6 for these
         and ``Ub_2``, 10 for the channels of both piers. None: all twelve channels that are not means.
     parameters : tuple of str
-        Names of the parameters that make up theta, in this order (see the notes).
+        Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
     friction : str
         "bouc-wen" (regularised, the default), "elastic-plastic" (the slider law in other codes), or "coulomb" (exact
         stick and slip, with isolator forces that are constant over a step, hence of first order).
-    step : float or None
-        Integration step [s]; it divides the step of the record. None: the longest such step up to 0.25 ms for
-        "bouc-wen", 0.05 ms for "elastic-plastic" and 0.025 ms for "coulomb" (`integration_step`; see the notes for the
-        accuracy).
+    step : float, optional
+        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms for
+        "bouc-wen", 0.05 ms for "elastic-plastic" and 0.025 ms for "coulomb" (accuracy:
+        ``docs/theory/time_integration.rst``).
     every : int
         The response has one sample per `every` samples of the record.
     p_delta : bool
@@ -406,7 +406,7 @@ class IsolatedBridge(ThreadedModel):
             raise invalid(
                 "a Record of the table acceleration",
                 type(self.record).__name__,
-                "read one with fe_likelihoods.read_csv, read_at2 or read_v2",
+                "read one with fe_likelihoods.read_record",
             )
         pairs = (("piers", self.piers, Pier), ("bearings", self.bearings, Bearing), ("dampers", self.dampers, Damper))
         for name, pair, kind in pairs:

@@ -22,14 +22,20 @@ class Pier:
 
     Attributes
     ----------
-    modulus, inertia, length : float
-        Elastic modulus [Pa], second moment of area [m⁴] and length [m] of the cantilever.
+    modulus : float
+        Elastic modulus of the cantilever [Pa].
+    inertia : float
+        Second moment of area of the cantilever [m⁴].
+    length : float
+        Length of the cantilever [m].
     height : float
         Height of the block [m]; the isolators are on its top.
     center : float
         Height of the block's centre of mass above its bottom [m].
-    mass, rotary_inertia : float
-        Mass of the block [kg], and its rotary inertia about its centre of mass [kg m²].
+    mass : float
+        Mass of the block [kg].
+    rotary_inertia : float
+        Rotary inertia of the block about its centre of mass [kg m²].
     damping_ratio : float
         Damping ratio of the pier alone in its first mode; damping is proportional to the stiffness.
     """
@@ -89,10 +95,12 @@ class Bearing:
     ----------
     load : float
         Weight on the bearing [N].
-    f_min, df : float
-        Friction coefficient at rest, and its increase at high velocity.
+    f_min : float
+        Friction coefficient at rest.
+    df : float
+        Increase of the friction coefficient at high velocity.
     a : float
-        Rate of the increase with velocity [s/m].
+        Rate of this increase with velocity [s/m].
     yield_displacement : float
         Displacement over which the regularised laws reverse the friction force [m]. It is a physical property, not a
         numerical setting: peak pier accelerations differ by a third between 0.13 mm and zero.

@@ -49,9 +49,9 @@ class OpenSeesModel(FunctionModel):
     channels : sequence of Channel
         Channels of the response, in the order of its rows.
     dt : float, optional
-        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
+        Time step of the response [s]; with a record a whole multiple of its step, by default that step.
     n_steps : int, optional
-        Number of response samples. With a record it follows from `dt`.
+        Number of response samples; with a record it follows from `dt`.
     record : Record, optional
         Excitation, which the function receives as its third argument. The model can then be simulated under other
         records (`with_record`, ``propagate(..., record=)``, `fragility`).
@@ -59,7 +59,7 @@ class OpenSeesModel(FunctionModel):
         Whether the response to an excitation depends on earlier excitations. False for a linear structure: predictions
         under another record then need no `from_state`.
     time_limit : float, optional
-        Longest duration of a run [s]. A longer run is stopped and counts as failed.
+        Longest duration of a run [s]; a longer run is stopped and counts as failed.
     memory_limit : int, optional
         Largest address space of the process [bytes]. Allocations beyond it fail.
     runs_per_process : int or None

@@ -90,8 +90,10 @@ class RCColumn(ThreadedModel):
     ----------
     loading : Record or DisplacementHistory
         Base acceleration, or lateral displacement of the top.
-    diameter, height : float
-        Diameter of the section, and height from the fixed base to the mass [m].
+    diameter : float
+        Diameter of the section [m].
+    height : float
+        Height from the fixed base to the mass [m].
     cover : float
         Clear cover, measured to the outside of the hoops [m].
     concrete : Concrete
@@ -104,16 +106,18 @@ class RCColumn(ThreadedModel):
         Transverse reinforcement.
     mass : float
         Mass at the top [kg].
-    axial_load : float or None
-        Gravity load at the top, positive downwards [N]. None: the weight of `mass`.
+    axial_load : float, optional
+        Gravity load at the top, positive downwards [N]. Default: the weight of `mass`.
     rotational_inertia : float
         Rotational inertia of the mass [kg m²]. The default is zero.
     vertical_mass : bool
         Whether the mass also acts vertically.
-    a0, a1 : float
-        Rayleigh damping: factor of the mass [1/s], and of the tangent stiffness of the last converged step [s].
+    a0 : float
+        Rayleigh damping: factor of the mass [1/s].
+    a1 : float
+        Rayleigh damping: factor of the tangent stiffness of the last converged step [s].
     penetration : float
-        Length of strain penetration below the base [m]: the deformations of the base section continue over this
+        Length of strain penetration below the base [m]. The deformations of the base section continue over this
         length, because the bars slip out of the foundation, and the rotation and elongation over this length are added
         to the column deformations. Zero is a rigid anchorage. A common estimate is 0.022 fy d [MPa, m] (Priestley,
         Seible & Calvi, Seismic Design and Retrofit of Bridges, 1996). With 2 elements of 3 points, this estimate
@@ -124,9 +128,11 @@ class RCColumn(ThreadedModel):
     buckling : BarBuckling or None
         Buckling of the bars. None: bars in compression stay straight.
     parameters : tuple of str
-        Names of the parameters that make up theta, in this order (see the notes).
-    n_elements, n_points : int
-        Number of elements, and number of Gauss-Lobatto points per element (2 to 7).
+        Names of the parameters that make up theta, in this order (`RCColumn` lists them).
+    n_elements : int
+        Number of elements.
+    n_points : int
+        Number of Gauss-Lobatto points per element, 2 to 7.
     mesh : int or Patches
         Number of strips (even), or rings and wedges.
     geometry : str
@@ -139,10 +145,14 @@ class RCColumn(ThreadedModel):
         Names of the channels, that is, of the sensors (see the notes). None: the default channels at the top.
     units : dict or tuple of pairs
         Display units of the channels, by name or by the part of the name before the ``@``.
-    tolerance, element_tolerance : float
-        Norm of the last Newton correction [m and rad]; work of the last correction of an element [J].
-    max_iterations, halvings : int
-        Newton iterations per attempt; how often a step may be halved before the simulation counts as failed.
+    tolerance : float
+        Norm of the last Newton correction [m and rad].
+    element_tolerance : float
+        Work of the last correction of an element [J].
+    max_iterations : int
+        Newton iterations per attempt.
+    halvings : int
+        How often a step may be halved before the simulation counts as failed.
 
     Raises
     ------

@@ -222,7 +222,7 @@ def check_loading(loading: object, height: float) -> None:
         raise invalid(
             "a Record or a DisplacementHistory as loading",
             type(loading).__name__,
-            "read a Record with fe_likelihoods.read_csv, read_at2 or read_v2",
+            "read a Record with fe_likelihoods.read_record",
         )
     if isinstance(loading, DisplacementHistory):
         largest = float(np.abs(loading.displacement).max())

@@ -24,10 +24,14 @@ class Concrete:
 
     Attributes
     ----------
-    fc, ec, ft : float
-        Compressive strength (positive), initial modulus and tensile strength [Pa].
-    peak_strain : float or None
-        Strain at fc (positive). None: 2 fc/Ec, which follows an updated Ec. With a fixed strain below fc/Ec the
+    fc : float
+        Compressive strength [Pa], positive.
+    ec : float
+        Initial modulus [Pa].
+    ft : float
+        Tensile strength [Pa].
+    peak_strain : float, optional
+        Strain at `fc`, positive. Default: 2 fc/Ec, which follows an updated Ec. With a fixed strain below fc/Ec the
         envelope does not depend on Ec.
     ultimate_strain : float
         Strain beyond which the cover carries no stress (positive). The model uses at least 1.5 times the peak strain.
@@ -67,10 +71,18 @@ class Steel:
 
     Attributes
     ----------
-    fy, fu, es, esh : float
-        Yield strength, ultimate strength, elastic modulus and modulus at the onset of hardening [Pa].
-    hardening_strain, ultimate_strain : float
-        Strains at the onset of hardening and at fu.
+    fy : float
+        Yield strength [Pa].
+    fu : float
+        Ultimate strength [Pa].
+    es : float
+        Elastic modulus [Pa].
+    esh : float
+        Modulus at the onset of hardening [Pa].
+    hardening_strain : float
+        Strain at the onset of hardening.
+    ultimate_strain : float
+        Strain at `fu`.
     """
 
     fy: float
@@ -128,10 +140,12 @@ class LowCycleFatigue:
 
     Attributes
     ----------
-    cf, alpha : float
-        Coefficient and exponent of Coffin and Manson, for the plastic strain of a half cycle from one reversal to the
-        next. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests
+    cf : float
+        Coefficient of Coffin and Manson: plastic strain of a half cycle, from one reversal to the next, that breaks a
+        bar. The defaults are the starting values that OpenSees documents for its material ReinforcingSteel, from tests
         of Brown & Kunnath (2000) with bars whose slenderness was 6.
+    alpha : float
+        Exponent of Coffin and Manson, at most 1.
     cd : float
         Coefficient of strength loss, at least `cf`; a large coefficient means no loss before fracture.
     """
@@ -156,12 +170,12 @@ class BarBuckling:
 
     Attributes
     ----------
-    slenderness : float or None
-        Unsupported length of the bars divided by their diameter. None: the hoop spacing divided by the bar diameter.
+    slenderness : float, optional
+        Unsupported length of the bars divided by their diameter. Default: the hoop spacing divided by the bar diameter.
         Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
     alpha : float
-        1 for steel that hardens linearly, 0.75 for steel that does not (``docs/theory/reinforcing_steel.rst`` has a
-        formula for steels between them).
+        1 for steel that hardens linearly (the default), 0.75 for steel that does not
+        (``docs/theory/reinforcing_steel.rst`` has a formula for steels between them).
     """
 
     slenderness: float | None = None
@@ -181,8 +195,8 @@ class Bars:
         Number of bars, at least 3.
     diameter : float
         Diameter of one bar [m].
-    area : float or None
-        Area of one bar [m²]. None: from `diameter`.
+    area : float, optional
+        Area of one bar [m²]. Default: from `diameter`.
     first_angle : float
         Angle between the direction of negative displacements and the first bar [rad]. It matters only where the bars
         are not symmetric to the axis of bending, such as an odd number of bars.
@@ -216,8 +230,8 @@ class Hoops:
         Distance between the centres of adjacent sets [m].
     fy : float
         Yield strength [Pa].
-    area : float or None
-        Area of one set [m²]; bundled hoops have more than one bar. None: one bar, from `diameter`.
+    area : float, optional
+        Area of one set [m²]; bundled hoops have more than one bar. Default: one bar, from `diameter`.
     ultimate_strain : float
         Strain at fracture.
     spiral : bool

@@ -33,7 +33,7 @@ __all__ = [
     "positive_float",
 ]
 
-_ADVICE = "give one number in SI units (fe_likelihoods.units.to_si converts)"
+_ADVICE = "give one number in SI units"
 
 
 def invalid(expected: str, got: object, advice: str) -> ValueError:

@@ -62,11 +62,11 @@ class GaussianNoise:
         The measured channels, in the order of the model.
     groups : {"channel", "all", "event"} or sequence of float
         What has a level: each channel; all channels together; each channel in each event, for a model whose excitation
-        is `fe_likelihoods.Events`; or each channel in each frequency band. Bands are given by the ascending frequencies
-        between them [Hz]: ``(1, 5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
+        is `fe_likelihoods.Events`; or each channel in each frequency band, between ascending frequencies [Hz]. ``(1,
+        5)`` makes the bands below 1 Hz, from 1 to 5 Hz, and above.
     level : {"si", "measured", "response"}
-        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root mean square;
-        or a share of the simulated response level.
+        What a level is: a standard deviation in the SI unit of the channel; a share of the measured root mean square,
+        in predictions of the simulated one; or a share of the simulated response level.
     window : float, optional
         Length of the moving window for the root mean square of the response [s; steps in a test without time]. Longer
         than a period of the response, shorter than the strong part of the motion. Needed for ``level="response"``

@@ -184,7 +184,8 @@ def remark_on_white_peaks(predictions: Iterable[Prediction], peaks: Peaks, sourc
         f"the predicted peaks with noise=True are larger than the response peaks: {', '.join(added.values())}. The "
         "noise is drawn independently at each sample, and the largest of many draws adds to the peak. Sensor noise "
         "adds to measured peaks as well, but model errors change as slowly as the response. "
-        'Predict peaks of the structure with noise="model" (docs/predictions.rst)'
+        'Predict peaks of the structure with noise="model" in Python, noise = false in a TOML file '
+        "(docs/predictions.rst)"
     )
 
 
@@ -345,7 +346,7 @@ def _contradiction(noise: Any, channels: Sequence[Channel], residuals: np.ndarra
         )
         if is_wrong
     )
-    what, other = "residuals", "AutoregressiveNoise or effective_samples="
+    what, other = "residuals", 'AutoregressiveNoise (kind = "autoregressive" in a TOML file) or effective_samples='
     if autoregressive:
         what, other = "innovations", "fewer samples, GaussianNoise with bands of frequency, or effective_samples="
     elif whitened:

@@ -137,7 +137,7 @@ class Measurements:
         if empty:
             raise ValueError(
                 f"a channel needs at least one sample, all samples of {', '.join(map(repr, empty))} are missing (NaN); "
-                "leave these channels out with Measurements.select"
+                "leave these channels out (Measurements.select, or channels in a TOML file)"
             )
         values.flags.writeable = False
         steps = [check_step(dt, "the measurements") for dt in _per_channel(self.dt, len(names), "time step")]

@@ -279,9 +279,9 @@ def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
     if not fits:
         raise ValueError(
             f"the response has {n_steps} samples with a step of {dt} s and ends at {end:g} s, the measurements have "
-            f"{measurements.n_steps} with a step of {measurements.dt} s and end at {last:g} s; make them equal with "
-            "Record.trim(start, stop) and Measurements.trim(start, stop), correct the step, or fill times that were "
-            "not measured with NaN"
+            f"{measurements.n_steps} with a step of {measurements.dt} s and end at {last:g} s; use the same part "
+            "of record and measurements (trim in Python, duration in a TOML file), correct the step, or fill times "
+            "that were not measured with NaN"
         )
 
 

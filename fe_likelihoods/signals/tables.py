@@ -264,8 +264,8 @@ def column_values(table: Table, place: int, missing: Sequence[float] | None = No
             numbers = ", ".join(f"{number:g}" for number in (*listed, sentinel))
             raise ValueError(
                 f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
-                f"{found.size} rows, which usually stands for a missing sample; give missing=({numbers},) to read it "
-                "as NaN, or missing=() if it was measured"
+                f"{found.size} rows, which usually stands for a missing sample; give missing=[{numbers}] to read it "
+                "as NaN, or missing=[] if it was measured"
             )
     return values
 
@@ -294,7 +294,7 @@ def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
 def csv_series(
     table: Table, column: str | None = None, dt: float | None = None, missing: Sequence[float] | None = None
 ) -> Series:
-    """Return one column of a table as a series, checked against the comments (see `fe_likelihoods.read_csv`)."""
+    """Return one column of a table as a series, checked against the comments (see `read_csv`)."""
     place = value_column(table, column)
     stated = re.search(r"\bnpts\s*=\s*(\d+)", table.comments)
     if stated:

@@ -26,10 +26,10 @@ __all__ = ["SIMULATION_FAILED", "TRANSIENT_FAILURE", "ServerError", "ServerTimeo
 logger = logging.getLogger(__name__)
 
 TRANSIENT_FAILURE = "TransientFailure"
-"""Error type with which `fe_likelihoods.serve` reports a failure whose cause is not the model."""
+"""Error type with which `fe_likelihoods.adapters.serve` reports a failure whose cause is not the model."""
 
 SIMULATION_FAILED = "SimulationFailed"
-"""Error type with which `fe_likelihoods.serve` reports other failures."""
+"""Error type with which `fe_likelihoods.adapters.serve` reports other failures."""
 
 _CONNECT_SECONDS = 10.0  # longest time until a server accepts a connection
 _LONGEST_WAIT = 60.0  # [s] between two attempts

@@ -28,8 +28,7 @@ __all__ = [
 ]
 
 WHERE_TO_LOOK = (
-    "check the model and the prior, and see the failures that log_prob_fn reports (posterior.report() for a posterior "
-    "of fe_likelihoods)"
+    "check the model and the prior, and see the failures that the model reports (posterior.report() in fe_likelihoods)"
 )
 WEIGHT_GRID = 4096.0
 

@@ -341,8 +341,8 @@ def describe_early_stop(verdict: Verdict, limit: float, result: AnnealingResult,
     if verdict.status == CONVERGED:
         return f"{ended}. The chain holds draws of the posterior: no further simulation is necessary"
     return (
-        f"{ended}. {verdict} To go on from here, set the attribute max_simulations of the sampler to a larger number, "
-        "or make a new sampler with the same file, and call run_mcmc again"
+        f"{ended}. {verdict} To go on from here, set max_simulations to a larger number and run again, "
+        "with the same file or folder"
     )
 
 

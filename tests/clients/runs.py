@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe_likelihoods import Posterior, nautilus_prior, to_bilby, to_pints, to_pymc
+from fe_likelihoods import Posterior
+from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
 
 from .scoring import Found, chains, replicates, weighted
 

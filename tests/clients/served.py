@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fe_likelihoods import Channel, FunctionModel, SimulationFailed, serve
+from fe_likelihoods import Channel, FunctionModel, SimulationFailed
+from fe_likelihoods.adapters import serve
 from fe_likelihoods.simulation.faults import TransientReason
 
 __all__ = ["CHANNELS", "DT", "KINDS", "NAMES", "TIME", "Process", "line", "line_model", "runs_of"]

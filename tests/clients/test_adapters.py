@@ -6,16 +6,8 @@ import pickle
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    HalfNormal,
-    LogNormal,
-    TruncatedNormal,
-    Uniform,
-    nautilus_prior,
-    to_bilby,
-    to_pints,
-    to_pymc,
-)
+from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
 
 from .problem import PRIOR, make_posterior
 

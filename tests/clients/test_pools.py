@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from fe_likelihoods import to_bilby
+from fe_likelihoods.adapters import to_bilby
 
 from .problem import make_posterior
 

@@ -32,8 +32,8 @@ from fe_likelihoods import (
     SimulationFailed,
     TruncatedNormal,
     UMBridgeModel,
-    serve,
 )
+from fe_likelihoods.adapters import serve
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
 from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler
@@ -228,7 +228,7 @@ def test_served_model_with_a_pool():
 def test_serve_ends_with_ctrl_c(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "from fe_likelihoods import serve\n"
+        "from fe_likelihoods.adapters import serve\n"
         "from tests.clients.served import line_model\n"
         f"serve(line_model(), port={(port := free_port())})\n"
         "print('done')\n"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fe_likelihoods.command.models import USER_MODELS
 from fe_likelihoods.command.priors import FORMS
-from fe_likelihoods.command.schema import EVENT, MODELS, PARTS, SECTIONS, USER, Key
+from fe_likelihoods.command.schema import EVENT, MODEL_KINDS, SECTIONS, USER, Key, model_keys, part_keys
 from fe_likelihoods.units import DIMENSIONS
 
 __all__ = ["PAGE", "key_tables"]
@@ -45,12 +45,13 @@ def _without(keys: Iterable[Key], others: Iterable[Key]) -> list[Key]:
 def key_tables() -> str:
     """All tables as reStructuredText; keys that several sections have are in one of them."""
     blocks = []
-    for kind, keys in MODELS.items():
+    for kind in MODEL_KINDS:
+        keys = model_keys(kind)
         blocks.append(_table(f'``[model] kind = "{kind}"``', _without(keys, USER if kind in USER_MODELS else ())))
         seen = {}
-        for part, part_keys in PARTS.get(kind, {}).items():
-            seen.setdefault(part_keys, []).append(f"``[model.{part}]``")
-        blocks += [_table(", ".join(parts), part_keys) for part_keys, parts in seen.items()]
+        for part, keys in part_keys(kind).items():
+            seen.setdefault(keys, []).append(f"``[model.{part}]``")
+        blocks += [_table(", ".join(parts), keys) for keys, parts in seen.items()]
     kinds = ", ".join(f'``"{kind}"``' for kind in USER_MODELS)
     blocks.append(_table(f"``[model]`` of the kinds {kinds}", USER))
     blocks += [_table(f"``[{section}]``", keys) for section, keys in SECTIONS.items()]

@@ -9,20 +9,12 @@ import warnings
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    LinearOscillator,
-    Measurements,
-    SimulationCache,
-    SimulationFailed,
-    from_si,
-    propagate,
-    read_csv,
-)
-from fe_likelihoods.command.hints import in_toml_terms
+from fe_likelihoods import LinearOscillator, Measurements, SimulationCache, SimulationFailed, from_si, propagate
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
 from fe_likelihoods.prediction.prediction import Prediction
+from fe_likelihoods.signals.readers import read_csv
 from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
 
@@ -280,9 +272,3 @@ def test_measurements_that_end_between_two_steps_of_the_model_are_scored(events)
     told = (events / "r" / "event-weaker.txt").read_text()
     assert "no scores" not in said + told and "Histories against the measurements" in told
     assert "150 samples at 0.04 s" in told
-
-
-def test_measurements_that_cannot_be_compared_name_the_section_of_the_event():
-    message = "make them equal with Record.trim(start, stop) and Measurements.trim(start, stop)"
-    assert in_toml_terms(message).endswith("`duration` in [record]")
-    assert in_toml_terms(message, "[events.weaker]").endswith("`duration` in [events.weaker]")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import AutoregressiveNoise, GaussianNoise
-from fe_likelihoods.command.hints import in_toml_terms
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from tests.command.test_command import OSCILLATOR, ROOT, call, folder, write_oscillator  # noqa: F401
@@ -94,22 +93,6 @@ def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
     (folder / "oscillator.toml").write_text(f'{PLAIN}[noise]\nlevel = "response"\nwindow = "1 s"\n{SENSOR}')
     output = call("run", "oscillator.toml", "--quiet", code=1)
     assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
-
-
-def test_messages_about_noises_are_in_the_words_of_the_file():
-    for words, told in (
-        ("Calibrate with AutoregressiveNoise or effective_samples=", 'Set kind = "autoregressive" in [noise]'),
-        (
-            'Predict peaks of the structure with noise="model"',
-            'Compare the peaks with noise = false in [prediction], or in Python noise="model"',
-        ),
-    ):
-        assert in_toml_terms(f"the bands. {words} x") == f"the bands. {told} x"
-    source = (ROOT / "fe_likelihoods" / "prediction" / "transfer_checks.py").read_text()
-    assert (
-        "AutoregressiveNoise or effective_samples=" in source
-        and 'Predict peaks of the structure with noise="model"' in source
-    )
 
 
 def test_emcee_runs_and_goes_on_with_more_steps(folder):  # noqa: F811

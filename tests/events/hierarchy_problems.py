@@ -15,7 +15,6 @@ import numpy as np
 from scipy import stats
 
 from fe_likelihoods import (
-    Distribution,
     HalfNormal,
     HierarchicalPosterior,
     Hierarchy,
@@ -27,6 +26,7 @@ from fe_likelihoods import (
     Varying,
 )
 from fe_likelihoods.events.hierarchy_checks import HierarchyChecks
+from fe_likelihoods.priors.distributions import Distribution
 
 __all__ = ["RIGHT", "WRONG", "Problem", "Result", "problem", "solve"]
 

@@ -23,17 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe_likelihoods import (
-    Channel,
-    Measurements,
-    Record,
-    read_columns,
-    read_csv,
-    read_dataset,
-    read_record,
-    write_dataset,
-)
-from fe_likelihoods.signals.readers import read_at2, read_esm, read_geonet, read_knet, read_smc, read_v2
+from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
+from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from tests.signals.network_files import esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 

@@ -6,8 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, Measurements, Record, read_csv, read_dataset, write_dataset
-from fe_likelihoods.signals.readers import read_at2, read_v2
+from fe_likelihoods import Channel, Measurements, Record
+from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
 from tests.faults.fuzz_readers import fuzz, zipped
 from tests.signals.test_readers import cosmos
 

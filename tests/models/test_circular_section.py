@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import Patches, RCColumn, Record, to_si
+from fe_likelihoods import RCColumn, Record, to_si
 from fe_likelihoods.models.circular_section import (
     bar_circle,
     circular_patches,
@@ -14,6 +14,7 @@ from fe_likelihoods.models.circular_section import (
     gauss_lobatto,
     mander_confinement,
 )
+from fe_likelihoods.models.rc_column_parts import Patches
 
 INCH, KSI = to_si(1.0, "in").item(), to_si(1.0, "ksi").item()
 RADIUS, CORE_RADIUS = 24.0, 43.375 / 2  # of the tested column [in]

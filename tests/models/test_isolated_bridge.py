@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import lsim, lti
 
-from fe_likelihoods import Bearing, Damper, IsolatedBridge, Pier, Record, Rubber, SimulationFailed
+from fe_likelihoods import IsolatedBridge, Record, SimulationFailed
 from fe_likelihoods.models.isolated_bridge import PARAMETERS
 from fe_likelihoods.models.isolated_bridge_channels import CHANNEL_SETS, CHANNELS
+from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier, Rubber
 
 PART = Path(__file__).parents[1] / "kernels" / "data" / "isolated_bridge.npz"
 LIMIT = 1e-3

@@ -21,14 +21,12 @@ from fe_likelihoods import (
     Hoops,
     LowCycleFatigue,
     Measurements,
-    Patches,
     Posterior,
     RCColumn,
     Record,
     SimulationFailed,
     Steel,
     TruncatedNormal,
-    read_csv,
     rrmse,
     to_si,
 )
@@ -38,7 +36,9 @@ from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from fe_likelihoods.kernels.static import Iteration
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column import PARAMETERS
+from fe_likelihoods.models.rc_column_parts import Patches
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
+from fe_likelihoods.signals.readers import read_csv
 from fe_likelihoods.units import G0
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
 

@@ -8,16 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    DisplacementHistory,
-    FELikelihood,
-    Measurements,
-    Patches,
-    RCColumn,
-    read_columns,
-)
+from fe_likelihoods import DisplacementHistory, FELikelihood, Measurements, RCColumn, read_columns
 from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
+from fe_likelihoods.models.rc_column_parts import Patches
 from fe_likelihoods.problems import bridge_column, bridge_column_data
 
 SENSORS = ("base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@0.3:-0.55", "rotation@0:0.6")

@@ -20,7 +20,6 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
     effective_samples,
-    innovations,
     plot_residuals,
     propagate,
     residual_checks,
@@ -28,7 +27,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.noise.marginal import MarginalNoise
-from fe_likelihoods.noise.residuals import autocorrelation, lag_one_sums
+from fe_likelihoods.noise.residuals import autocorrelation, innovations, lag_one_sums
 from fe_likelihoods.noise.sample_counts import SampleCounts, count_samples
 from fe_likelihoods.simulation.model import SimulationBatch
 from tests.emulation.problems import CHANNELS as MODES_CHANNELS

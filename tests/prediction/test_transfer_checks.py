@@ -148,7 +148,7 @@ def test_correlated_residuals_under_white_noise_are_said_once(rng):
     posterior, samples = calibrated(rng, rho=0.9)
     (text,) = said(propagate, posterior, samples, noise=True, seed=1)
     assert "residuals of the calibration are not independent" in text and "600 samples are worth" in text
-    assert "Calibrate with AutoregressiveNoise or effective_samples=" in text
+    assert 'AutoregressiveNoise (kind = "autoregressive" in a TOML file) or effective_samples=' in text
     lag = float(text.split("(correlation ")[1].split()[0])
     assert lag == pytest.approx(0.9, abs=0.08)
     assert not said(propagate, posterior, samples, noise=True, seed=1)

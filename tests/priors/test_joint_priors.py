@@ -12,12 +12,12 @@ from fe_likelihoods import (
     MultivariateNormal,
     Posterior,
     Prior,
-    TruncatedMultivariateNormal,
     TruncatedNormal,
     Uniform,
     fit_mixture,
-    nautilus_prior,
 )
+from fe_likelihoods.adapters import nautilus_prior
+from fe_likelihoods.priors.multivariate import TruncatedMultivariateNormal
 from samplers import SMCSampler
 from tests.likelihood.linear_gaussian import exact_log_evidence, likelihood_of
 

@@ -12,10 +12,9 @@ from fe_likelihoods import (
     LinearOscillator,
     Measurements,
     Record,
-    read_dataset,
-    write_dataset,
 )
 from fe_likelihoods.signals.comparison import Comparison, compare_with
+from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
 
 CHANNELS = (Channel("top", "acceleration", "g"), Channel("drift", "displacement", "mm"))

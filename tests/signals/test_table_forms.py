@@ -5,7 +5,8 @@ import datetime
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, read_columns, read_csv, read_record
+from fe_likelihoods import Channel, read_columns, read_record
+from fe_likelihoods.signals.readers import read_csv
 from fe_likelihoods.signals.tables import column_unit
 from fe_likelihoods.units import G0
 
@@ -152,7 +153,7 @@ def test_numbers_for_missing_samples_in_a_record(path):
     with pytest.raises(ValueError, match="an excitation needs all samples, 1 are missing"):
         read_record(path, missing=(-9999.0,))
     assert read_record(path, missing=()).acceleration[1] == -9999 * G0
-    with pytest.raises(ValueError, match=r"got -9999 in 1 rows.* missing=\(-999, -9999,\)"):
+    with pytest.raises(ValueError, match=r"got -9999 in 1 rows.* missing=\[-999, -9999\]"):
         read_record(path, missing=(-999.0,))  # known and not listed
     with pytest.raises(ValueError, match="missing must be finite numbers"):
         read_record(path, missing=["-9999"])

@@ -14,7 +14,6 @@ import numpy as np
 from fe_likelihoods import (
     AutoregressiveNoise,
     Channel,
-    Distribution,
     FELikelihood,
     FunctionModel,
     GaussianNoise,
@@ -24,6 +23,7 @@ from fe_likelihoods import (
     SimulationFailed,
     Uniform,
 )
+from fe_likelihoods.priors.distributions import Distribution
 
 __all__ = ["HardPosterior"]
 

@@ -11,7 +11,8 @@ models of this module cannot be shortened (there is no method ``first``), and mo
 
 import numpy as np
 
-from fe_likelihoods import Distribution, LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods import LogNormal, TruncatedNormal, Uniform
+from fe_likelihoods.priors.distributions import Distribution
 
 from .case import HardPosterior
 from .late_posteriors import LATE_CASES
