@@ -1,8 +1,7 @@
 """Make data/isolated_bridge.h5 and data/isolated_bridge_means.h5: synthetic tests of the isolated bridge.
 
 The records and responses of the tests are not public, and most nominal values of the model are assumed. The table
-motion is stochastic (`ground_motion`), at the time scale of a quarter-scale model (15 s). Its parameters are
-**assumed** and give bearing displacements of about 35 mm. The responses are those of the model with a fifth of the
+motion is stochastic and **assumed** (`table_motion`). The responses are those of the model with a fifth of the
 default integration step, at parameters that differ from the nominal values, at every second sample (100 Hz). White
 noise is added, with a given fraction of the root mean square of each channel.
 
@@ -14,14 +13,12 @@ Run the script with ``make data``. It writes the same files every time.
 
 from pathlib import Path
 
-from fe_likelihoods.data.ground_motion import stochastic_motion
-
-from fe_likelihoods import Record
 from fe_likelihoods.problems import (
     ISOLATED_BRIDGE_NOISE,
     ISOLATED_BRIDGE_OUTPUTS,
     ISOLATED_BRIDGE_TRUTH,
     isolated_bridge_measurements,
+    table_motion,
 )
 from fe_likelihoods.signals.datasets import write_dataset
 
@@ -31,27 +28,9 @@ NOISE_SEED = 1999
 of the truth. Tests of calibration use many draws of the noise."""
 
 
-def table_motion(seed: int = SEED) -> Record:
-    """Make the acceleration of the table: 15 s at 200 Hz, 0.8 g."""
-    motion = stochastic_motion(
-        seed,
-        dt=0.005,
-        duration=15.005,
-        peak=8.0,
-        peak_time=4.0,
-        shape=3.0,
-        frequencies=(6.0, 3.0),
-        drift_time=12.0,
-        filter_damping=0.30,
-        high_pass=0.30,
-    )
-    source = "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters, quarter-scale time"
-    return Record("synthetic table motion", 0.005, motion, source)
-
-
 def main() -> None:
     """Write the files."""
-    record = table_motion()
+    record = table_motion(SEED)
     for data, name in (("twin", "isolated_bridge"), ("means", "isolated_bridge_means")):
         measurements = isolated_bridge_measurements(
             record,

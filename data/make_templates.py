@@ -1,8 +1,8 @@
 """Make ``templates/synthetic_*.csv``, the SYNTHETIC data of the function, OpenSees and executable templates.
 
-The motion is the synthetic table motion of the isolated bridge, `fe_likelihoods.table_motion`. The measurements are the
-response of ``my_function.py`` with a four times smaller step, plus white noise of 0.03 g and 2 mm (seed 1). The logger
-file has both, with clock times, after five seconds of noise before the motion.
+The motion is the synthetic table motion of the isolated bridge, `fe_likelihoods.problems.table_motion`. The
+measurements are the response of ``my_function.py`` with a four times smaller step, plus white noise of 0.03 g and 2 mm
+(seed 1). The logger file has both, with clock times, after five seconds of noise before the motion.
 """
 
 import datetime
@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fe_likelihoods import Record, from_si, table_motion
+from fe_likelihoods import Record, from_si
+from fe_likelihoods.problems import table_motion
 
 TRUTH = (1.15, 0.85)
 START = datetime.datetime(2024, 5, 14, 10, 32, 7)  # of the logger

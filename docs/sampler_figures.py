@@ -22,8 +22,8 @@ from fe_likelihoods import (
     Uniform,
     plot_residuals,
     problems,
-    table_motion,
 )
+from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler, TMCMCSampler, plot_corner
 
 __all__ = ["bridge", "column", "correlated_errors"]

@@ -49,6 +49,7 @@ _IN_MODULES = {
     "priors.distributions": "Distribution",
     "priors.mixture_prior": "MixtureDistribution",
     "priors.multivariate": "MultivariateDistribution TruncatedMultivariateNormal",
+    "problems": "table_motion",
     "signals.alignment": "Alignment",
     "signals.datasets": "Dataset read_dataset write_dataset",
     "signals.events": "EventWindow",

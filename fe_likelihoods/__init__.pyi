@@ -3,7 +3,6 @@ from .cache.simulation_cache import SimulationCache
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
-from .data.make_isolated_bridge import table_motion
 from .events.agreement import compare_tests
 from .events.hierarchical_posterior import HierarchicalPosterior, Varying
 from .events.hierarchy_result import Hierarchy
@@ -157,6 +156,5 @@ __all__ = [
     "rrmse",
     "score_left_out",
     "share_within",
-    "table_motion",
     "to_si",
 ]

@@ -59,6 +59,7 @@ __all__ = [
     "isolated_bridge_data",
     "isolated_bridge_measurements",
     "isolated_bridge_prior",
+    "table_motion",
 ]
 
 BRIDGE_COLUMN_MEANS = MappingProxyType({"Ec": 0.59, "Es": 0.96, "a0": 0.27, "a1": 4.78, "ft": 2.43})
@@ -168,14 +169,14 @@ def _make_noise(noise: Any, channels: Sequence[Channel]) -> Any:
     """Return the noise with a name, or the noise that was given; raise ValueError for an unknown name."""
     if not isinstance(noise, str):
         return noise
-    if noise == "per channel":
+    if noise == "channel":
         return GaussianNoise(channels)
-    if noise == "shared":
+    if noise == "all":
         return GaussianNoise(channels, groups="all")
     if noise == "autoregressive":
         return AutoregressiveNoise(channels)
     raise ValueError(
-        'expected noise="per channel", "shared", "autoregressive" or "marginal", or a noise such as GaussianNoise; '
+        'expected noise="channel", "all", "autoregressive" or "marginal", or a noise such as GaussianNoise; '
         f"got {noise!r}"
     )
 
@@ -187,7 +188,7 @@ def bridge_column(
     measurements: Measurements | None = None,
     every: int = 1,
     duration: float | None = None,
-    noise: Any = "per channel",
+    noise: Any = "channel",
     seed: int = 1,
     cache: SimulationCache | str | os.PathLike | None = None,
     **changes,
@@ -211,10 +212,10 @@ def bridge_column(
         cost of a simulation.
     duration : float, optional
         Use the first `duration` seconds only.
-    noise : {"per channel", "shared", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
-        "per channel" is white noise with one sigma per channel, as in the paper. "shared" has one sigma for all
+    noise : {"channel", "all", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
+        "channel" is white noise with one sigma per channel, as in the paper. "all" has one sigma for all
         channels, in root mean squares of the measured channels. "autoregressive" has a correlation ``rho_...`` per
-        channel in addition. "marginal" is "per channel" with the sigmas integrated out (`Posterior.marginal`), which
+        channel in addition. "marginal" is "channel" with the sigmas integrated out (`Posterior.marginal`), which
         leaves five parameters. The priors are in `bridge_column_prior`; those of other sensors (`outputs`) have 0.3
         times the measured root mean square as their scale.
     seed : int
@@ -260,7 +261,7 @@ def bridge_column(
         measurements = measurements.decimate(every)
         record = record.resample(record.dt * every)
     model = RCColumn.lhpost(record, **changes)
-    law = _make_noise("per channel" if noise == "marginal" else noise, model.channels)
+    law = _make_noise("channel" if noise == "marginal" else noise, model.channels)
     likelihood = FELikelihood(model, measurements, law, cache=cache)
     sensors = [channel.name for channel in model.channels if channel.name not in BRIDGE_COLUMN_NOISE]
     rms = measurements.select(sensors).root_mean_squares if sensors else ()
@@ -299,6 +300,30 @@ ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
 
 ISOLATED_BRIDGE_NOISE = MappingProxyType({"twin": 0.05, "means": 0.10})
 """Standard deviation of the noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
+
+
+def table_motion(seed: int = 1994) -> Record:
+    """Synthetic acceleration of the table: 15 s at 200 Hz, 0.8 g, at the time scale of a quarter-scale model.
+
+    The motion is stochastic (Rezaeian & Der Kiureghian 2008, 2010). Its parameters are **assumed** and give bearing
+    displacements of about 35 mm.
+    """
+    from .data.ground_motion import stochastic_motion
+
+    motion = stochastic_motion(
+        seed,
+        dt=0.005,
+        duration=15.005,
+        peak=8.0,
+        peak_time=4.0,
+        shape=3.0,
+        frequencies=(6.0, 3.0),
+        drift_time=12.0,
+        filter_damping=0.30,
+        high_pass=0.30,
+    )
+    source = "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters, quarter-scale time"
+    return Record("synthetic table motion", 0.005, motion, source)
 
 
 def isolated_bridge_data(data: str = "twin") -> Dataset:
@@ -380,7 +405,7 @@ def isolated_bridge(
     *,
     data: str = "twin",
     channels: tuple[str, ...] | int | None = None,
-    noise: Any = "shared",
+    noise: Any = "all",
     record: Record | None = None,
     measurements: Measurements | None = None,
     seed: int = 1,
@@ -397,10 +422,10 @@ def isolated_bridge(
         (`IsolatedBridge.exchange_piers`).
     channels : tuple of str, 5, 6 or 10, optional
         Measured channels to use. Default: six of "twin", all of any other data.
-    noise : {"shared", "per channel", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
-        "shared" is white noise with one sigma for all channels, in root mean squares of the measured channels. "per
-        channel" has one sigma per channel [SI]. "autoregressive" has a correlation ``rho_...`` per channel in addition
-        (uniform between -1 and 1). "marginal" is "shared" with sigma integrated out (`Posterior.marginal`), which
+    noise : {"all", "channel", "autoregressive", "marginal"}, or a noise such as `GaussianNoise`
+        "all" is white noise with one sigma for all channels, in root mean squares of the measured channels. "channel"
+        has one sigma per channel [SI]. "autoregressive" has a correlation ``rho_...`` per channel in addition
+        (uniform between -1 and 1). "marginal" is "all" with sigma integrated out (`Posterior.marginal`), which
         leaves ten parameters.
     record : Record, optional
         Table motion of your own. Default: that of `data`.
@@ -443,7 +468,7 @@ def isolated_bridge(
     model = IsolatedBridge(
         record, outputs=tuple(c.name for c in measurements.channels), **({"every": max(1, every)} | changes)
     )
-    law = _make_noise("shared" if noise == "marginal" else noise, model.channels)
+    law = _make_noise("all" if noise == "marginal" else noise, model.channels)
     rms = measurements.root_mean_squares
     scales = {"sigma": 1.0} | {f"sigma_{c.name}": scale for c, scale in zip(measurements.channels, rms, strict=True)}
     sigmas = {name: scales[name] for name in law.parameter_names if name in scales}

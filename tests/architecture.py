@@ -131,15 +131,14 @@ def imports(path: Path, root: Path = ROOT) -> list[Import]:
 @functools.cache
 def _imports_of(source: str, package: tuple[str, ...]) -> tuple[Import, ...]:
     tree = _parse(source)
-    late = {
-        node
-        for block in ast.walk(tree)
-        if isinstance(block, ast.FunctionDef | ast.AsyncFunctionDef)
-        or (isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING")
-        for node in ast.walk(block)
-    }
+    guards = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    for_types = {node for block in guards for node in ast.walk(block)}
+    late = for_types | {node for block in functions for node in ast.walk(block)}
     found = []
     for node in ast.walk(tree):
+        if package[-1:] == ("plots",) and node in for_types:
+            continue  # figures may import the types that they draw
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -240,9 +240,9 @@ def test_measurements_must_fit(data, strong):
     record, measurements = data.record.trim(0.0, 2.0), data.measurements.trim(0.0, 2.0)
     with pytest.raises(ValueError, match="need the record .* give record="):
         bridge_column(measurements=measurements)
-    with pytest.raises(ValueError, match="samples.*make them equal"):
+    with pytest.raises(ValueError, match="samples.*use the same part"):
         bridge_column(record=record, measurements=data.measurements.trim(0.0, 1.5))
-    with pytest.raises(ValueError, match="step.*make them equal"):
+    with pytest.raises(ValueError, match="step.*use the same part"):
         bridge_column(record=record, measurements=replace(measurements, dt=2.0 * measurements.dt))
     force = Measurements((Channel("force", "force", "kip"),), record.dt, np.zeros((1, record.n_steps)))
     with pytest.raises(ValueError, match="channels are acceleration, displacement, the measurements' are force"):
@@ -354,7 +354,7 @@ def test_the_likelihood_of_the_bridge_has_one_sigma_for_normalised_channels():
 
 def test_channels_and_noise_of_the_bridge_can_be_chosen():
     assert problems.isolated_bridge(channels=5).likelihood.measurements.n_channels == 5
-    each = problems.isolated_bridge(channels=10, noise="per channel")
+    each = problems.isolated_bridge(channels=10, noise="channel")
     assert each.ndim == 20
     rms = np.sqrt(np.mean(each.likelihood.measurements.values**2, axis=1))
     shared = problems.isolated_bridge(channels=10)
@@ -391,7 +391,7 @@ def test_another_table_motion(rng):
     ("arguments", "message"),
     [
         ({"data": "tests"}, "twin"),
-        ({"noise": "white"}, "per channel"),
+        ({"noise": "white"}, 'noise="channel", "all"'),
         ({"channels": 7}, "sets"),
         ({"channels": ("Ub_9",)}, "Ub_9"),
         ({"data": "means", "channels": 5}, "Ub_1"),
@@ -433,7 +433,7 @@ def test_bridge_column_with_other_sensors():
         bridge_column_measurements(record, outputs=outputs)
     levels = {"displacement": 0.001, "strain@0.1:0.4": 1e-5, "base_moment": 1e4}
     data = bridge_column_measurements(record, outputs=outputs, levels=levels, n_strips=20, substeps=1)
-    for noise in ("per channel", "autoregressive"):
+    for noise in ("channel", "autoregressive"):
         posterior = bridge_column(record=record, measurements=data, outputs=outputs, noise=noise)
         for name in outputs[1:]:
             rms = np.sqrt(np.mean(data.channel(name) ** 2))

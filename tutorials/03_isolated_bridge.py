@@ -46,9 +46,9 @@ from fe_likelihoods import (
     plot_fragility,
     problems,
     propagate,
-    table_motion,
 )
 from fe_likelihoods.models.isolated_bridge_parts import Bearing
+from fe_likelihoods.problems import table_motion
 from samplers import (
     SamplingWarning,
     SMCSampler,
@@ -79,7 +79,7 @@ parser.add_argument(
     "--data", choices=("twin", "means"), default="twin", help="posterior with one mode (twin) or two (means)"
 )
 parser.add_argument("--channels", type=int, choices=(5, 6, 10), help="measured channels of the twin (default: 6)")
-parser.add_argument("--noise", choices=("shared", "per channel"), default="shared")
+parser.add_argument("--noise", choices=("all", "channel"), default="all")
 parser.add_argument("--walkers", type=int, help="samples per stage (default: from the preset)")
 parser.add_argument("--step", type=float, help="time step of the model [s] (default: from the preset)")
 parser.add_argument("--seed", type=int, default=1, help="seed of sampler, propagation and motions")

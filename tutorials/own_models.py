@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from own_program import solve
 
-from fe_likelihoods import Channel, table_motion
+from fe_likelihoods import Channel
+from fe_likelihoods.problems import table_motion
 
 NAMES = ("stiffness", "strength")
 CHANNELS = (

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel, Measurements, plot_response
 from ..signals.records import DisplacementHistory, Record
@@ -72,7 +73,7 @@ class StructuralModel:
     path_dependent: bool = True
     _time_label = "time [s]"
 
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
+    def simulate(self, theta: ArrayLike) -> np.ndarray:
         """Simulate the structure for one set of parameters.
 
         Parameters

@@ -176,6 +176,8 @@ class ExecutableModel(UserModel):
         self.version = version
         written = {Path(file).resolve() for file in written}
         named = _named_files(self.command) if hash_executable else []
+        given = {*self.templates, *self.files, self.record_file}
+        self._elsewhere = [part for part in self.command[1:] if os.path.isfile(part) and part not in given]
         self._named = tuple(file for file in named if file.resolve() not in written)
         self._prepare()
 
@@ -283,10 +285,21 @@ class ExecutableModel(UserModel):
         if exit_code:
             with open(outputs[1], "rb") as stderr:
                 reason = ": ".join(filter(None, [describe_exit(exit_code, "the program"), last_lines(stderr, 3)]))
+            reason += self._missing(place / "run")
             killed = exit_code < 0 or exit_code in _EXIT_CODES_OF_SHELLS
             raise RunFailed(TransientReason(reason) if killed else reason, seconds)
         if _size(place) > self.max_output:
             raise RunFailed(TransientReason(f"the program wrote more than {self.max_output} bytes"), seconds)
+
+    def _missing(self, folder: Path) -> str:
+        """What a failed program may have looked for in the folder of the run, where it is not."""
+        lost = [part for part in self._elsewhere if not (folder / part).exists()]
+        if not lost:
+            return ""
+        return (
+            f"; the program ran in {folder}, where there is no {', '.join(lost)}: give the absolute path in the "
+            'command, or copy the file into this folder with files={"name": Path(...)}'
+        )
 
     def _read(self, folder: Path) -> Any:
         """Read the response from the folder of the run."""

@@ -89,7 +89,7 @@ class FunctionModel(UserModel):
 
     def __init__(
         self,
-        function: Callable[[np.ndarray], Any],
+        function: Callable[..., Any],
         parameter_names: Sequence[str],
         channels: Sequence[Channel],
         dt: float | None = None,

@@ -275,10 +275,10 @@ class RCColumn(ThreadedModel):
             found |= dict(zip(_OF_BUCKLING, (slenderness,), strict=True))
         return found
 
-    @cached_property
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels of the response, in order."""
-        return display_channels(self._parsed_outputs, dict(self.units))
+        return self._channels
 
     @property
     def dt(self) -> float:
@@ -437,6 +437,10 @@ class RCColumn(ThreadedModel):
     @property
     def _sections(self) -> Sections:
         return Sections(self.height, 0.5 * self.diameter, self.n_elements, gauss_lobatto(self.n_points)[0])
+
+    @cached_property
+    def _channels(self) -> tuple[Channel, ...]:
+        return display_channels(self._parsed_outputs, dict(self.units))
 
     @cached_property
     def _parsed_outputs(self) -> tuple[Output, ...]:

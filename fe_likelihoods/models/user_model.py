@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel
 from ..signals.records import Record
@@ -101,7 +102,7 @@ class ExternalModel(StructuralModel):
                     "sends simulations: it was changed meanwhile, or is another one on that machine"
                 )
 
-    def simulate(self, theta: np.ndarray) -> np.ndarray:
+    def simulate(self, theta: ArrayLike) -> np.ndarray:
         """Simulate the structure for one set of parameters.
 
         Parameters

@@ -157,7 +157,7 @@ def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: 
             "time_shifts= is for white noise in SI units, GaussianNoise(channels) or GaussianNoise(channels, "
             f'groups="all"); got {noise_title(noise)}. For other noises, and for standard deviations that are '
             "integrated out, estimate the shift with align(response, measurements), correct it with "
-            "Measurements.shift(-lag), and leave time_shifts= out"
+            "Measurements.shift(-lag, [channel]), and leave time_shifts= out"
         )
     names = [channel.name for channel in noise.channels]
     if not isinstance(time_shifts, Mapping) or not time_shifts or set(time_shifts) - set(names):

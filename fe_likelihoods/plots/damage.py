@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .protocols import DamageLike
 from .style import select_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from ..column_damage.damage import Damage
 
 __all__ = ["plot_damage"]
 
@@ -30,7 +31,7 @@ _EXTENT = (
 """Measures that are written beside the columns: name, label, factor, unit."""
 
 
-def plot_damage(damage: DamageLike, events: Sequence[str] | None = None) -> Figure:
+def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     """Draw the column after each event with the probabilities of its limit states.
 
     Each row is an event and each column a limit state of strains. The two sides of every section are coloured by the
@@ -40,7 +41,7 @@ def plot_damage(damage: DamageLike, events: Sequence[str] | None = None) -> Figu
 
     Parameters
     ----------
-    damage : DamageLike
+    damage : Damage
         The result of `fe_likelihoods.damage` for a column.
     events : sequence of str, optional
         Names of the events to draw. Default: all.
@@ -87,7 +88,7 @@ def plot_damage(damage: DamageLike, events: Sequence[str] | None = None) -> Figu
     return figure
 
 
-def _draw_column(axes: Axes, damage: DamageLike, state: str, event: int, colours) -> None:
+def _draw_column(axes: Axes, damage: Damage, state: str, event: int, colours) -> None:
     """Draw one column with the probabilities of one limit state after one event."""
     from matplotlib.patches import Rectangle
 
@@ -134,7 +135,7 @@ def _number(value: float) -> str:
     return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
 
 
-def _write_extent(axes: Axes, damage: DamageLike, event: int, states: Sequence[str]) -> None:
+def _write_extent(axes: Axes, damage: Damage, event: int, states: Sequence[str]) -> None:
     """Write the probabilities of limit states without a place, and the quantiles of the measures."""
     axes.set_axis_off()
     lines = []

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..units import from_si
-from .protocols import ChannelHistories
 from .style import BLUE, ORANGE, channel_label, marker_of, select_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from ..signals.channels import Measurements
 
 __all__ = ["draw_fit"]
 
@@ -24,8 +25,8 @@ _MEASURED = "0.45"
 
 
 def draw_fit(
-    measurements: ChannelHistories,
-    responses: Mapping[str, ChannelHistories],
+    measurements: Measurements,
+    responses: Mapping[str, Measurements],
     errors: Mapping[str, Mapping[str, float]],
     windows: Mapping[str, tuple[float, float]],
     channels: Sequence[str] | None = None,
@@ -38,9 +39,9 @@ def draw_fit(
 
     Parameters
     ----------
-    measurements : ChannelHistories
+    measurements : Measurements
         The measured histories.
-    responses : mapping of str to ChannelHistories
+    responses : mapping of str to Measurements
         Responses by their titles, in the order in which they are drawn.
     errors : mapping of str to mapping of str to float
         Relative root mean square error [-], by title and channel; missing where it is not known.

@@ -1,7 +1,7 @@
 """Figures of records, response spectra, channel histories, loops and residuals, in display units.
 
-The functions draw what they are given. None of them runs a simulation or computes a statistic. The objects that they
-accept are described in `fe_likelihoods.plots.protocols`.
+The functions draw what they are given. None of them runs a simulation or computes a statistic. Other objects with
+the attributes of the named types can be drawn as well.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..units import find_unit, from_si
-from .protocols import ChannelHistories, ChannelLike, RecordLike, ResidualChecksLike, SpectrumLike
 from .style import (
     BLUE,
     GREY,
@@ -31,18 +30,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..noise.residuals import ResidualChecks
+    from ..signals.channels import Channel, Measurements
+    from ..signals.records import Record
+    from ..signals.response_spectrum import ResponseSpectrum
+
 __all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residual_checks", "plot_spectra"]
 
 _SHADES = (BLUE, ORANGE, "#5b8c5a", "#b03a48", GREY)
 _SPECTRUM_UNITS = {"pseudo_acceleration": "g", "pseudo_velocity": "cm/s", "displacement": "cm"}
 
 
-def plot_record(record: RecordLike, axes: Axes | None = None, unit: str = "g") -> Axes:
+def plot_record(record: Record, axes: Axes | None = None, unit: str = "g") -> Axes:
     """Plot ground acceleration against time, with a mark at the peak.
 
     Parameters
     ----------
-    record : RecordLike
+    record : Record
         The ground motion, such as `fe_likelihoods.Record`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
@@ -76,7 +80,7 @@ def plot_record(record: RecordLike, axes: Axes | None = None, unit: str = "g") -
 
 
 def plot_spectra(
-    spectra: Sequence[SpectrumLike],
+    spectra: Sequence[ResponseSpectrum],
     axes: Axes | None = None,
     quantity: str = "pseudo_acceleration",
     unit: str | None = None,
@@ -86,7 +90,7 @@ def plot_spectra(
 
     Parameters
     ----------
-    spectra : sequence of SpectrumLike
+    spectra : sequence of ResponseSpectrum
         Spectra such as `ResponseSpectrum`, for instance of one record with several damping ratios.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
@@ -135,8 +139,8 @@ def plot_spectra(
 
 
 def plot_histories(
-    measurements: ChannelHistories | None = None,
-    response: ChannelHistories | None = None,
+    measurements: Measurements | None = None,
+    response: Measurements | None = None,
     channels: Sequence[str] | None = None,
     label: str = "model",
     time_label: str = "time [s]",
@@ -148,9 +152,9 @@ def plot_histories(
 
     Parameters
     ----------
-    measurements : ChannelHistories, optional
+    measurements : Measurements, optional
         The measured histories, such as `fe_likelihoods.Measurements`.
-    response : ChannelHistories, optional
+    response : Measurements, optional
         The simulated histories. A channel that only one of the two has is drawn alone.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all measured channels, or all channels of the response if there are no
@@ -237,9 +241,9 @@ def plot_loop(
 
 def plot_residual_checks(
     residuals: np.ndarray,
-    channels: Sequence[ChannelLike],
+    channels: Sequence[Channel],
     dt: float,
-    checks: ResidualChecksLike,
+    checks: ResidualChecks,
     correlation: np.ndarray,
 ) -> Figure:
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
@@ -251,11 +255,11 @@ def plot_residual_checks(
     ----------
     residuals : ndarray, shape (n_channels, n_steps)
         Measured minus simulated response [SI]; NaN where a sample is missing.
-    channels : sequence of ChannelLike
+    channels : sequence of Channel
         The channels, one per row of `residuals`.
     dt : float
         Time step [s].
-    checks : ResidualChecksLike
+    checks : ResidualChecks
         Lag-one correlation, effective number of samples and verdict in words, per channel.
     correlation : ndarray, shape (n_channels, n_steps)
         Autocorrelation at lags 0, 1, ... samples [-].
@@ -312,7 +316,7 @@ def plot_residual_checks(
     return figure
 
 
-def _find(source: ChannelHistories | None, name: str) -> ChannelLike | None:
+def _find(source: Measurements | None, name: str) -> Channel | None:
     if source is None:
         return None
     return next((channel for channel in source.channels if channel.name == name), None)

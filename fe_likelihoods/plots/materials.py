@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from ..units import find_unit, from_si
-from .protocols import MaterialCurveLike, MomentCurvatureLike
 from .style import BLUE, GREY, ORANGE, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ..models.rc_column_curves import MaterialCurve, MomentCurvature
 
 __all__ = ["plot_material", "plot_moment_curvature"]
 
@@ -18,7 +19,7 @@ _COLOURS = (BLUE, ORANGE, GREY, "#4c8c4a", "#8c4a6e")
 
 
 def plot_material(
-    *curves: MaterialCurveLike,
+    *curves: MaterialCurve,
     axes: Axes | None = None,
     strain_unit: str = "%",
     stress_unit: str = "MPa",
@@ -27,7 +28,7 @@ def plot_material(
 
     Parameters
     ----------
-    *curves : MaterialCurveLike
+    *curves : MaterialCurve
         The curves, such as the results of `fe_likelihoods.material_curves`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
@@ -57,7 +58,7 @@ def plot_material(
 
 
 def plot_moment_curvature(
-    curves: MomentCurvatureLike | Mapping[str, MomentCurvatureLike],
+    curves: MomentCurvature | Mapping[str, MomentCurvature],
     axes: Axes | None = None,
     *,
     curvature_unit: str = "1/m",
@@ -67,7 +68,7 @@ def plot_moment_curvature(
 
     Parameters
     ----------
-    curves : MomentCurvatureLike, or a mapping from labels to them
+    curves : MomentCurvature, or a mapping from labels to them
         The curves, such as the result of `fe_likelihoods.moment_curvature`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.

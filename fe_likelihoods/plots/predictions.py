@@ -8,18 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..units import from_si
-from .protocols import ChannelHistories, FragilityLike, PredictionLike
 from .style import BLUE, GREY, ORANGE, add_legend_row, channel_label, marker_of, select_names, set_time_axis, stack_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..prediction.fragility import Fragility
+    from ..prediction.prediction import Prediction
+    from ..signals.channels import Measurements
+
 __all__ = ["plot_bands", "plot_fragility"]
 
 
 def plot_bands(
-    prediction: PredictionLike,
-    measurements: ChannelHistories | None = None,
+    prediction: Prediction,
+    measurements: Measurements | None = None,
     channels: Sequence[str] | None = None,
     time_shifts: Mapping[str, float] | None = None,
 ) -> Figure:
@@ -27,9 +30,9 @@ def plot_bands(
 
     Parameters
     ----------
-    prediction : PredictionLike
+    prediction : Prediction
         Prediction of histories, such as the result of `fe_likelihoods.propagate`.
-    measurements : ChannelHistories, optional
+    measurements : Measurements, optional
         Measurements, drawn at their own times. Channels that were not measured are drawn without measurements.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all channels of the prediction.
@@ -78,13 +81,13 @@ def plot_bands(
 
 
 def plot_fragility(
-    fragility: FragilityLike, label: str = "peak ground acceleration", unit: str | None = "g", si_unit: str = "m/s2"
+    fragility: Fragility, label: str = "peak ground acceleration", unit: str | None = "g", si_unit: str = "m/s2"
 ) -> Figure:
     """Plot the probability of exceedance against intensity: one point with its interval per record, and the curve.
 
     Parameters
     ----------
-    fragility : FragilityLike
+    fragility : Fragility
         Result of `fe_likelihoods.fragility`.
     label : str
         Name of the intensity measure.

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..units import from_si
-from .protocols import HistoryScoresLike, QuantityScoresLike
 from .style import BLUE, GREY, ORANGE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from ..prediction.score_tables import HistoryScores, QuantityScores
 
 __all__ = ["plot_scores"]
 
@@ -33,13 +34,13 @@ _FEWEST = 3  # events whose scatter is drawn as standard errors
 
 
 def plot_scores(
-    scores: HistoryScoresLike | QuantityScoresLike | Mapping[str, HistoryScoresLike] | Mapping[str, QuantityScoresLike],
+    scores: HistoryScores | QuantityScores | Mapping[str, HistoryScores] | Mapping[str, QuantityScores],
 ) -> Figure:
     """Plot scores of predicted histories, or of predicted numbers such as peaks, of one event or of several.
 
     Parameters
     ----------
-    scores : HistoryScoresLike, QuantityScoresLike, or mapping from names of events to them
+    scores : HistoryScores, QuantityScores, or mapping from names of events to them
         Results of `Prediction.score`, all of histories or all of numbers, with one level.
 
     Returns
@@ -84,7 +85,7 @@ def plot_scores(
     return figure
 
 
-def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScoresLike]) -> None:
+def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None:
     level = next(iter(events.values())).level
     shares = np.concatenate([each.pit for each in events.values()])
     worth = sum(float(each.effective_samples.sum()) for each in events.values())
@@ -167,7 +168,7 @@ def _spread(heights: np.ndarray, gap: float) -> np.ndarray:
     return np.repeat([mean for _, mean in groups], [int(n) for n, _ in groups]) + gap * np.arange(len(heights))
 
 
-def _coverage_of(name: str, events: Sequence[HistoryScoresLike]) -> tuple[np.ndarray, np.ndarray]:
+def _coverage_of(name: str, events: Sequence[HistoryScores]) -> tuple[np.ndarray, np.ndarray]:
     """Mean coverage (3,) of a channel by level, and its standard errors."""
     found, errors = [], []
     for each in events:
@@ -183,7 +184,7 @@ def _coverage_of(name: str, events: Sequence[HistoryScoresLike]) -> tuple[np.nda
     return mean, np.where(count >= _FEWEST, between, within)
 
 
-def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScoresLike]) -> None:
+def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScores]) -> None:
     level = next(iter(events.values())).level
     joined = {
         what: np.concatenate([np.asarray(getattr(each, what)) for each in events.values()])
@@ -233,7 +234,7 @@ def _number_axes(axes: np.ndarray, events: Mapping[str, QuantityScoresLike]) -> 
         each.grid(alpha=0.25)
 
 
-def _label(event: str, scores: QuantityScoresLike, k: int) -> str:
+def _label(event: str, scores: QuantityScores, k: int) -> str:
     """Event, quantity and measured value."""
     name = ", ".join(each for each in (event, scores.names[k]) if each)
     unit = scores.units[k]

@@ -13,26 +13,29 @@ import numpy as np
 
 from ..units import from_si
 from .histories import plot_loop
-from .protocols import ColumnLike, HistoryLike, PatchesLike
 from .style import BLUE, GREY, ORANGE, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..models.base import History
+    from ..models.rc_column import RCColumn
+    from ..models.rc_column_parts import Patches
+
 __all__ = ["plot_bearing_loops", "plot_column_loops", "plot_section", "plot_sensors"]
 
 _CORE = "#b9cfe4"
 
 
-def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
+def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     """Plot a circular section to scale: cover, core inside the hoops, mesh of the concrete, and bars.
 
     The horizontal axis points in the direction of positive displacements, against the coordinate `y` of the fibers.
 
     Parameters
     ----------
-    column : ColumnLike
+    column : RCColumn
         The column, such as `fe_likelihoods.RCColumn`.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
@@ -77,12 +80,12 @@ def plot_section(column: ColumnLike, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def plot_sensors(column: ColumnLike, axes: Axes | None = None) -> Axes:
+def plot_sensors(column: RCColumn, axes: Axes | None = None) -> Axes:
     """Plot where the sensors of a column are: its elevation with every channel at its place.
 
     Parameters
     ----------
-    column : ColumnLike
+    column : RCColumn
         The column, such as `fe_likelihoods.RCColumn`; its channels have the names of its outputs.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
@@ -148,14 +151,14 @@ def _rank(place: tuple[float, float, str]) -> tuple[float, float]:
     return z, x
 
 
-def plot_column_loops(column: ColumnLike, history: HistoryLike) -> Figure:
+def plot_column_loops(column: RCColumn, history: History) -> Figure:
     """Plot base moment against curvature, and restoring force against displacement of the top.
 
     Parameters
     ----------
-    column : ColumnLike
+    column : RCColumn
         The column, for its display units and the name of its loading.
-    history : HistoryLike
+    history : History
         Histories by name [SI], the result of ``column.history(theta)``: "base curvature", "base moment", "force", and
         "displacement" (imposed) or "relative displacement" (base acceleration).
 
@@ -191,12 +194,12 @@ def plot_column_loops(column: ColumnLike, history: HistoryLike) -> Figure:
     return figure
 
 
-def plot_bearing_loops(history: HistoryLike) -> Figure:
+def plot_bearing_loops(history: History) -> Figure:
     """Plot the isolator force (friction, rubber and dampers) against the bearing displacement of both piers.
 
     Parameters
     ----------
-    history : HistoryLike
+    history : History
         Histories by name [SI], the result of ``bridge.history(theta)``: "Ub_1", "Ub_2" and "Fb_1", "Fb_2".
 
     Returns
@@ -219,11 +222,11 @@ def plot_bearing_loops(history: HistoryLike) -> Figure:
     return figure
 
 
-def _length_unit(column: ColumnLike) -> str:
+def _length_unit(column: RCColumn) -> str:
     return dict(column.units).get("displacement", "m")
 
 
-def _mesh_lines(mesh: int | PatchesLike, radius: float, core_radius: float) -> list[np.ndarray]:
+def _mesh_lines(mesh: int | Patches, radius: float, core_radius: float) -> list[np.ndarray]:
     """Return the lines between fibers, each (n, 2): chords for strips, circles and radii for rings and wedges."""
     if isinstance(mesh, Integral):
         edges = np.linspace(-radius, radius, mesh + 1)[1:-1]

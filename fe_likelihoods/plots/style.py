@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .protocols import ChannelLike
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from ..signals.channels import Channel
 
 __all__ = [
     "BLUE",
@@ -67,7 +67,7 @@ def marker_of(values: np.ndarray) -> str:
     return "." if (there[1:-1] & ~there[:-2] & ~there[2:]).any() else ""
 
 
-def channel_label(channel: ChannelLike) -> str:
+def channel_label(channel: Channel) -> str:
     """Return the name of a channel with its display unit."""
     return f"{channel.name} [{channel.unit}]"
 

@@ -165,7 +165,13 @@ def split_samples(
     if noise and noise_model is None:
         raise ValueError("noise=True needs a posterior, whose samples have the parameters of the noise; got a model")
     width = len(samples) if isinstance(samples, Mapping) else np.shape(samples)[-1:]
-    structural_only = not noise and width in (len(structural), (len(structural),))
+    structural_only = width in (len(structural), (len(structural),))
+    if noise and structural_only and len(structural) < len(names):
+        raise ValueError(
+            f"noise={noise!r} needs {', '.join(names[len(structural) :])} of each sample; got only the "
+            f"{len(structural)} structural parameters. Give all columns of the chain, or posterior.draw_noise(samples) "
+            "where the noise was integrated out"
+        )
     try:
         points = as_points(samples, structural if structural_only else names)
     except TypeError as error:

@@ -25,7 +25,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
-from typing import Any
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 from tqdm import tqdm
@@ -70,6 +70,40 @@ logger = logging.getLogger(__name__)
 _BATCH_VALUES = 2**22  # response values in one batch: 32 MiB
 _LARGEST_BATCH = 256
 _LARGEST_SERIAL_BATCH = 16  # small, so that the progress bar moves often when simulations run one by one
+
+
+class _Options(TypedDict, total=False):
+    """Keywords of `propagate` besides `quantity`, for type checkers."""
+
+    part: str | None
+    model: Model | None
+    record: Record | None
+    from_state: str | None
+    rest: float
+    noise: bool | str
+    quantiles: Sequence[float]
+    effective_sample_size: float | None
+    batch: int | None
+    memory_bytes: int | None
+    state_bytes: int | None
+    pool: Any
+    cache: SimulationCache | str | os.PathLike | None
+    calibrated: Sequence[Measurements] | None
+    check: bool
+    seed: int | None
+    progress: bool
+
+
+@overload
+def propagate(
+    posterior_or_model: Any, samples: Any, *, quantity: Mapping[str, Quantity], **options: Unpack[_Options]
+) -> dict[str, Prediction]: ...
+
+
+@overload
+def propagate(
+    posterior_or_model: Any, samples: Any, *, quantity: Quantity = ..., **options: Unpack[_Options]
+) -> Prediction: ...
 
 
 def propagate(

@@ -86,7 +86,10 @@ def _of_the_verdict(run: FinishedRun) -> list[Advice]:
     if more is None:
         action = "How many more simulations are needed is not known. " + action
     elif more > 0.0:
-        action = f"About {more:.0f} more simulations are needed: raise max_simulations and call run_mcmc again."
+        action = (
+            f"At least about {more:.0f} more simulations are needed, possibly several times as many: raise "
+            "max_simulations and run again."
+        )
     reasons = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
     return [Advice(SEVERE if severe else CAUTION, title, reasons, action)]
 

@@ -235,7 +235,7 @@ def _errors(
     spread = samples.std(axis=0)
     if tempered:
         error = sampler.mean_error(discard=discard, thin=thin)
-        size = float(np.min((spread / error)[error > 0.0] ** 2, initial=len(samples)))
+        size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
         return error, size
     iterations = sampler.iteration - discard
     size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN

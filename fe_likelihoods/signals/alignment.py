@@ -27,6 +27,7 @@ _CANDIDATES = 8  # number of the highest peaks on the grid of lags that are refi
 _WINDOW = 5.0  # length of the sums over lags of autocorrelations, in correlation times
 _DRIFT = 4.0  # a drift beyond this many standard errors is stated
 _LARGEST_DRIFT = 0.01
+_CONTRADICTION = 8.0  # advantage of a channel's own lag over the common lag that is stated: 4 standard errors
 _GOOD = 0.7  # correlation below which the reference does not explain the channel
 
 
@@ -36,7 +37,8 @@ class Alignment(NamedTuple):
     Attributes
     ----------
     lag : float
-        Time by which the measurements are later than the reference [s]. ``measurements.shift(-lag)`` corrects them.
+        Time by which the measurements are later than the reference [s]. ``measurements.shift(-lag)`` corrects them; if
+        channels have `own_lags`, ``measurements.shift(-lag, [name])`` corrects one channel.
     standard_error : float
         Standard error of the lag [s], if the highest peak is the right one.
     correlation : dict of str to float
@@ -50,6 +52,8 @@ class Alignment(NamedTuple):
         clock of the measurements gains 2 ms per second.
     drift_error : float
         Standard error of the drift [-]; inf if the halves are too short.
+    own_lags : dict of str to float
+        Lags of the channels, each by itself [s], if a channel contradicts the common lag; empty if none does.
     """
 
     lag: float
@@ -59,6 +63,7 @@ class Alignment(NamedTuple):
     second_lag: float | None
     drift: float = 0.0
     drift_error: float = math.inf
+    own_lags: dict[str, float] = {}
 
     @property
     def statement(self) -> str:
@@ -66,6 +71,12 @@ class Alignment(NamedTuple):
         text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, correlation " + ", ".join(
             f"{name} {value:.3f}" for name, value in self.correlation.items()
         )
+        if self.own_lags:
+            lags = ", ".join(f"{name} {lag:.5g} s" for name, lag in self.own_lags.items())
+            text += (
+                f"; NOT SURE: the channels have different lags, each by itself {lags}, so no common lag fits them; "
+                "correct each channel with measurements.shift(-lag, [name])"
+            )
         low = [name for name, value in self.correlation.items() if abs(value) < _GOOD]
         if low:
             text += f"; NOT SURE: {', '.join(low)} is not a shifted copy of the reference"
@@ -200,7 +211,19 @@ def align(
     found = {p.name: _correlation(p, lag) for p in pairs}
     information = sum(_information(p, lag) for p in pairs)
     error = 1.0 / math.sqrt(information) if information > 0.0 else math.inf
-    return Alignment(lag, error, found, probability, second, *_drift(pairs, effective, lag, step))
+    own = {p.name: _own_lag(p, n, lags, c, lag, step) for p, n, c in zip(pairs, effective, correlations, strict=True)}
+    contradicted = len(pairs) > 1 and any(each != lag for each in own.values())
+    drift = _drift(pairs, effective, lag, step)
+    return Alignment(lag, error, found, probability, second, *drift, own if contradicted else {})
+
+
+def _own_lag(
+    pair: _Pair, n: float, lags: NDArray[np.float64], correlation: NDArray[np.float64], lag: float, step: float
+) -> float:
+    """Lag of one channel by itself, or the common lag if the channel does not contradict it."""
+    own = _refine([pair], np.array([n]), float(lags[int(np.argmax(np.abs(correlation)))]), step)
+    clear = abs(own - lag) > step and _advantage([pair], np.array([n]), own, lag) > _CONTRADICTION
+    return own if clear else lag
 
 
 def _pairs(reference: Record | Measurements, measurements: Measurements, channels: Sequence[str] | None) -> list[_Pair]:

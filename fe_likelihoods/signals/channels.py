@@ -271,10 +271,15 @@ class Measurements:
             starts.append(0.0 if abs(first) <= 1e-9 * dt else first)
         return self._with_rows(range(self.n_channels), rows, starts, self.steps)
 
-    def shift(self, seconds: float) -> "Measurements":
-        """Return the measurements with all times later by `seconds` [s], to correct the clock of a logger."""
-        shift = _check_start(seconds)
-        return replace(self, start=tuple(start + shift for start in self.starts))
+    def shift(self, seconds: float, channels: Sequence[str] | None = None) -> "Measurements":
+        """Return the measurements with the times of `channels` (default: all) later by `seconds` [s].
+
+        This corrects the clock of a logger. ValueError for an unknown channel, or a time that is not finite.
+        """
+        shift, names = _check_start(seconds), [channel.name for channel in self.channels]
+        chosen = names if channels is None else [channel.name for channel in self.select(channels).channels]
+        starts = zip(names, self.starts, strict=True)
+        return replace(self, start=tuple(start + shift * (name in chosen) for name, start in starts))
 
     def decimate(self, factor: int) -> "Measurements":
         """Return every `factor`-th sample, starting with the first one, without a filter.

@@ -110,7 +110,8 @@ class Verdict(_Stored):
     simulations : float
         Simulations made (`samplers.budget`).
     more_simulations : float, optional
-        About how many more simulations a converged result takes; 0 if the result is converged, None if unknown.
+        How many more simulations a converged result takes at least, about; it may take several times as many. 0 if the
+        result is converged, None if unknown.
     effective_sample_size : float
         Effective sample size of the points that `sample` names, when beta = 1 was reached.
     sample : str
@@ -221,7 +222,8 @@ class Verdict(_Stored):
         if self.more_simulations is None:
             more = ["How many more simulations are needed is not known."]
         elif self.more_simulations > 0.0:
-            more = [f"About {self.more_simulations:.0f} more simulations are needed."]
+            needed = f"{self.more_simulations:.0f} more simulations are needed, possibly several times as many"
+            more = [f"At least about {needed}."]
         return " ".join([first, *(f"{reason[0].upper()}{reason[1:]}." for reason in self.reasons), *more])
 
 

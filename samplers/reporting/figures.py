@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BLUE", "GREY", "ORANGE", "plot_corner", "plot_marginals"]
 
-Values = Sequence[float] | Mapping[str, float]  # one per parameter (NaN: none), or by the names of some parameters
+Values = Sequence[float] | np.ndarray | Mapping[str, float]  # one per parameter (NaN: none), or by name
 
 BLUE = "#1f5a8c"
 ORANGE = "#d9822b"

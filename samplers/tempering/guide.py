@@ -96,13 +96,13 @@ class Guide(Protocol):
         Identity of the guide: a run is resumed only with the same fingerprint.
     """
 
-    def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
+    def draw(self, n: int, random: np.random.RandomState, /) -> np.ndarray:
         """Independent draws (n, ndim), all inside the support of the prior."""
 
-    def log_density(self, coords: np.ndarray) -> np.ndarray:
+    def log_density(self, coords: np.ndarray, /) -> np.ndarray:
         """Logarithm (n,) of the normalised density of `draw` at points (n, ndim); -inf is allowed."""
 
-    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession) -> Iterator[None] | None:
+    def refine(self, coords: np.ndarray, log_prob: np.ndarray, session: GuideSession, /) -> Iterator[None] | None:
         """Learn from the latest draws (n, ndim) and their log-probabilities (n,), -inf where an evaluation failed.
 
         May be a generator; each item advances the progress bar. In an asynchronous run, the draws may be from an

@@ -52,7 +52,8 @@ draws = 10
 
 def write_oscillator(folder: Path) -> None:
     """Record, measurements and settings of the test of an oscillator."""
-    from fe_likelihoods import LinearOscillator, table_motion
+    from fe_likelihoods import LinearOscillator
+    from fe_likelihoods.problems import table_motion
 
     record = table_motion().trim(0.0, 6.0).resample(0.02)
     response = LinearOscillator(record, 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
@@ -255,7 +256,8 @@ def test_caches(folder):
 
 
 def test_a_damaged_cache_is_told_and_not_changed(folder):
-    from fe_likelihoods import LinearOscillator, table_motion
+    from fe_likelihoods import LinearOscillator
+    from fe_likelihoods.problems import table_motion
 
     model = LinearOscillator(table_motion().trim(0.0, 2.0).resample(0.02), 0.8)
     cache, n = SimulationCache("cache.sqlite"), 200
@@ -357,7 +359,7 @@ def test_files_and_folders_that_cannot_be_used_are_told(folder):
     (folder / "top.csv").write_text("\n".join([lines[0], *(",".join(3 * ["0,1"]) for _ in lines)]))
     assert "decimal commas need another separator" in call("check", "oscillator.toml", code=1)
     (folder / "top.csv").write_text("\n".join([lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])]))
-    assert "leave these channels out of `channels` in [measurements]" in call("check", "oscillator.toml", code=1)
+    assert "(Measurements.select, or channels in a TOML file)" in call("check", "oscillator.toml", code=1)
 
 
 def test_check_warns_of_what_is_likely_wrong(folder):

@@ -1,6 +1,7 @@
 """Data of an oscillator for runs of the console command."""
 
-from fe_likelihoods import LinearOscillator, table_motion
+from fe_likelihoods import LinearOscillator
+from fe_likelihoods.problems import table_motion
 
 
 def write_data(folder):

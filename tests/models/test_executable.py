@@ -4,6 +4,7 @@ import functools
 import multiprocessing
 import os
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -299,3 +300,13 @@ def test_program_found_by_a_relative_path_is_started_in_another_folder(tmp_path,
     model = model_of(command=["./solver", "in.txt"])
     os.chdir("/")
     np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+
+
+def test_a_script_that_is_not_in_the_folder_of_the_run_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "script.py").write_text(PROGRAM.read_text())
+    reason, _ = failure(model_of(command=[sys.executable, "script.py", "in.txt"]))
+    assert re.search(r"the program ran in /.*/run, where there is no script\.py: give the absolute path", reason)
+    assert "in.txt" not in reason.partition("the program ran in")[2]
+    copied = model_of(command=[sys.executable, "script.py", "in.txt"], files={"script.py": PROGRAM})
+    np.testing.assert_array_equal(copied.simulate(THETA), line(THETA))

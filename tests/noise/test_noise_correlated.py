@@ -366,7 +366,7 @@ def test_problems_take_another_noise():
     given = isolated_bridge(channels=("acc_p1", "Ub_2"), noise=noise, step=1e-3)
     assert given.likelihood.noise == noise.with_measurements(measurements) and given.ndim == 11
     assert given.fingerprint != isolated_bridge(channels=("acc_p1", "Ub_2"), step=1e-3).fingerprint
-    with pytest.raises(ValueError, match='"per channel", "shared", "autoregressive" or "marginal"'):
+    with pytest.raises(ValueError, match='"channel", "all", "autoregressive" or "marginal"'):
         isolated_bridge(noise="pink")
     column = bridge_column(noise="autoregressive", duration=1.0, mesh=20)
     assert column.fast_parameters == (5, 6, 7, 8)

@@ -23,7 +23,7 @@ def measured(rng):
 
 
 class Motion:
-    """A motion that is not a `Record`, with the attributes of `fe_likelihoods.plots.protocols.RecordLike`."""
+    """A motion that is not a `Record`, with the attributes that are drawn."""
 
     name, acceleration, time, duration = "another", np.array([0.0, 2.0, -1.0]), np.array([0.0, 0.1, 0.2]), 0.2
 

@@ -379,7 +379,7 @@ def test_average_of_two_models_is_their_mixture(rng):
         (np.ones(4), {}, r"shape \(n, 4\)"),
         (np.ones((0, 4)), {}, r"got \(0, 4\)"),
         (np.array([[1.0, 1.0], [1.0, np.nan]]), {}, "first is sample 1"),
-        (np.ones((5, 2)), {"noise": True}, "sigma_a, sigma_b"),
+        (np.ones((5, 2)), {"noise": True}, r"sigma_a, sigma_b of each sample.*posterior\.draw_noise\(samples\)"),
         (np.array([[1.0, 1.0, 1.0, 0.0]]), {"noise": True}, "positive standard deviation"),
         (np.ones((5, 4)), {"record": Record("r", 0.1, [0.0, 1.0])}, "Line has one excitation only.*with_record"),
         (np.ones((5, 4)), {"quantity": "c"}, "no channel 'c'; the channels of the model are a, b"),

@@ -4,7 +4,6 @@ import warnings
 
 import numpy as np
 import pytest
-from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import integrate, stats
 
 from fe_likelihoods import GaussianNoise
@@ -25,6 +24,7 @@ from fe_likelihoods.prediction.scores import (
     share_within,
 )
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
+from fe_likelihoods.problems import table_motion
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.interpolation import interpolate, make_interpolation
 

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import warnings
 from types import MappingProxyType
 
 import emcee
@@ -36,7 +37,7 @@ from fe_likelihoods.reporting.contents import evidence, residual_sentences
 from fe_likelihoods.reporting.failures import Failures
 from fe_likelihoods.reporting.fits import fit_data_sets
 from fe_likelihoods.reporting.report import _like
-from fe_likelihoods.reporting.run import read_run
+from fe_likelihoods.reporting.run import _errors, read_run
 from fe_likelihoods.reporting.table import parameter_rows
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from tests.contract.targets import Gaussian
@@ -302,3 +303,17 @@ def test_control_the_browser_tells_of_errors(tmp_path):
     bad = tmp_path / "bad.html"
     bad.write_text("<!DOCTYPE html><script>undefined_function()</script>")
     assert "CONSOLE" in browse(bad.as_uri(), tmp_path, "--dump-dom").stderr
+
+
+def test_identical_samples_have_an_effective_sample_size_without_a_warning():
+    """A chain that never moved has neither spread nor error in a parameter."""
+
+    class Stuck:
+        def mean_error(self, discard, thin):
+            return np.array([0.0, 0.5])
+
+    samples = np.column_stack([np.ones(100), np.arange(100.0)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, size = _errors(Stuck(), samples, True, np.nan, 0, 1)
+    assert size == pytest.approx((samples[:, 1].std() / 0.5) ** 2) or size == 100.0

@@ -60,6 +60,29 @@ def test_lag_without_noise(rng, lag):
     assert align(RECORD, corrected).lag == pytest.approx(0.0, abs=1e-5)
 
 
+def test_channels_with_different_clocks_are_named_and_corrected_one_by_one(rng):
+    """Each channel alone is right; together they are not sure, and a shift corrects one of them."""
+    channels, noise = (Channel("a", "acceleration", "g"), Channel("b", "acceleration", "g")), 0.05 * motion(TIME).std()
+    reference = Measurements(channels, DT, np.stack([motion(TIME), motion(TIME)]))
+
+    def measured(*lags):
+        rows = [motion(TIME - lag) + noise * rng.normal(size=TIME.size) for lag in lags]
+        return Measurements(channels, DT, rows)
+
+    apart = measured(0.1, 0.13)
+    found = align(reference, apart)
+    assert found.own_lags == pytest.approx({"a": 0.1, "b": 0.13}, abs=0.002)
+    assert "NOT SURE: the channels have different lags, each by itself a 0." in found.statement
+    corrected = apart
+    for name, lag in found.own_lags.items():
+        corrected = corrected.shift(-lag, [name])
+    assert corrected.starts == pytest.approx((-0.1, -0.13), abs=0.002)
+    for together in (align(reference, corrected), align(reference, measured(0.2, 0.2))):
+        assert together.own_lags == {} and "NOT SURE" not in together.statement
+    with pytest.raises(ValueError, match="channel 'c'"):
+        apart.shift(0.1, ["c"])
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_standard_error_is_that_of_repetitions(rng, correlation):
     found = [align(RECORD, late(0.1, rng, 0.7, correlation, missing=0.1), max_lag=1.0) for _ in range(120)]

@@ -164,7 +164,7 @@ def test_measurements_outside_the_response_are_refused(model):
         Measurements(CHANNELS, 0.01, np.ones((2, 401)), start=0.37),  # after the end
         sampled((0.01, 0.02)).trim(0.0, 3.9),
     ):
-        with pytest.raises(ValueError, match="make them equal with Record.trim"):
+        with pytest.raises(ValueError, match="use the same part of record and measurements"):
             FELikelihood(model, wrong)
     ended = Measurements(CHANNELS, 0.02, np.where(np.arange(201) < 150, 1.0, np.nan) * np.ones((2, 1)))
     assert FELikelihood(model, ended).n_samples.samples.tolist() == [150, 150]

@@ -14,7 +14,6 @@ import arviz
 import emcee
 import numpy as np
 import pytest
-from fe_likelihoods.data.make_isolated_bridge import table_motion
 from scipy import stats
 
 from fe_likelihoods import problems
@@ -22,6 +21,7 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.noise.gaussian import GaussianNoise
+from fe_likelihoods.problems import table_motion
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.presets import CHING_CHEN_2007
 
