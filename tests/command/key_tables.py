@@ -20,8 +20,8 @@ def _kind(key: Key) -> str:
 
 
 def _literal(meaning: str) -> str:
-    """Texts in quotes as they are typed, not as typographic quotes."""
-    return re.sub(r'("[^"]+")', r"``\1``", meaning)
+    """Names in backticks, and texts in quotes as they are typed, not as typographic quotes, as literals."""
+    return re.sub(r'``[^`]+``|`[^`]+`|"[^"]+"', lambda found: f"``{found[0].strip('`')}``", meaning)
 
 
 def _cell(text: str) -> str:
