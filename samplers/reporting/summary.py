@@ -202,6 +202,12 @@ def ladder_table(sampler: Any) -> str:
             f"of {check.evaluations} independent draws {check.log_evidence:.3f} +- {check.error:.3f} "
             f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
         )
+    if (sample := sampler.signed_sample) is not None:
+        error = np.max(sample.expectation().error / sample.standard_deviation().value)
+        rows.append(
+            f"largest error of a mean by sampler.signed_sample: {error:.2g} posterior standard deviations, from "
+            f"{np.count_nonzero(sample.rounds)} weighted draws and {sampler.simulations:.0f} simulations"
+        )
     if text := verdict_summary_of(sampler):
         rows.append(text)
     return "\n".join(rows)
