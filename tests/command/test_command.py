@@ -1,6 +1,7 @@
 """The commands as a user calls them: their files, their messages, their exit codes."""
 
 import dataclasses
+import itertools
 import re
 import shutil
 import subprocess
@@ -17,11 +18,12 @@ from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.main import _plain_warnings, main
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.command.priors import parse_prior
-from fe_likelihoods.command.schema import model_keys, part_keys, read_quantity
+from fe_likelihoods.command.schema import _KINDS, MODEL_KINDS, model_keys, part_keys, read_quantity
 from fe_likelihoods.command.starting import TEMPLATES
 from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from fe_likelihoods.units import DIMENSIONS
 from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables
 from tests.opensees_column import require_opensees
@@ -106,6 +108,14 @@ def test_keys_are_those_of_the_models():
     for name, cls in classes.items():
         keys = (part_keys("column") | part_keys("bridge"))[name]
         assert {key.name for key in keys} == {field.name for field in dataclasses.fields(cls)}, name
+    keys = {kind: [*model_keys(kind), *itertools.chain(*part_keys(kind).values())] for kind in MODEL_KINDS}
+    known = {*_KINDS, *DIMENSIONS}
+    assert not [(kind, key.name) for kind, each in keys.items() for key in each if key.kind not in known]
+    kinds = {key.name: (key.kind, key.meaning) for key in keys["column"]}
+    assert kinds["axial_load"] == (
+        "force",
+        "Gravity load at the top, positive downwards; default: the weight of `mass`",
+    )
 
 
 def test_sections_switch_fatigue_and_buckling_on():

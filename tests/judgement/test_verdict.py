@@ -7,6 +7,7 @@ import pytest
 from samplers import SMCSampler, compare_models, ladder_table
 from samplers.estimates.genealogy import worst_effective_sample_size
 from samplers.judgement.modes import find_modes
+from samplers.judgement.verdict import Verdict
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -24,6 +25,12 @@ def two_modes():
 @pytest.fixture(scope="module")
 def sampler(two_modes):
     return run(two_modes, 400)
+
+
+def test_further_simulations_are_a_lower_bound():
+    """A run that was told of 76, 51 and 54 more needed 184."""
+    told = str(Verdict("not usable", ("the walkers are few",), 100.0, 76.0, 10.0, "the walkers"))
+    assert "At least about 76 more simulations are needed, possibly several times as many." in told
 
 
 def test_modes_have_their_shares_and_places(two_modes, sampler):
