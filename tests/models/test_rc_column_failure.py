@@ -74,17 +74,6 @@ def test_outer_bars_fracture_first(column):
     assert column.history([1.0]).bar_damage is None
 
 
-def test_base_force_is_that_of_the_bars_that_remain(column):
-    """After fracture of all bars, a column without axial load has almost no strength."""
-    brittle = replace(column, axial_load=0.0, fatigue=LowCycleFatigue(cf=0.03, cd=10.0))
-    try:
-        late = peaks(brittle)
-    except SimulationFailed as failure:
-        assert "did not converge" in str(failure)
-    else:
-        assert late[-1] < 0.3 * late[0]
-
-
 @pytest.mark.parametrize("cf", [0.036, 0.039])
 def test_the_column_goes_on_after_it_has_lost_bars(column, cf):
     """Steps in which bars fractured had no equilibrium nearby, and both simulations failed."""
