@@ -45,13 +45,17 @@ def events():
     posterior = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(0.03, 0.5), HalfNormal(0.3))})
     grid = [each.ravel() for each in np.meshgrid(np.geomspace(0.02, 0.08, 60), np.linspace(0.02, 1.5, 60))]
     points = np.stack(grid, axis=1)
-    log_density = posterior.log_prob(points) + np.log(points[:, 0])  # the grid is even in the logarithm of the median
-    density = np.exp(log_density - log_density.max())
-    rows = rng.choice(len(points), 1000, p=density / density.sum())
+
+    def drawn(posterior):
+        log_density = posterior.log_prob(points) + np.log(points[:, 0])  # the grid is even in the log of the median
+        density = np.exp(log_density - log_density.max())
+        rows = rng.choice(len(points), 1000, p=density / density.sum())
+        return points[rows] * np.exp(0.01 * rng.standard_normal((1000, 2)))
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        hierarchy = Hierarchy(posterior, points[rows] * np.exp(0.01 * rng.standard_normal((1000, 2))))
-        return hierarchy, posteriors, leave_one_out(hierarchy)
+        hierarchy = Hierarchy(posterior, drawn(posterior))
+        return hierarchy, posteriors, leave_one_out(hierarchy, sample=drawn)
 
 
 def test_each_event_is_scored_by_the_others(events):
