@@ -18,6 +18,7 @@ from .rows import Row
 __all__ = ["cache"]
 
 LIMIT_MEMORY, LIMIT_DISK = 10.0, 60.0
+LIMIT_POSTERIOR_MEMORY, LIMIT_POSTERIOR_DISK = 50.0, 300.0
 
 
 def _seconds(function: Callable, *arguments) -> float:
@@ -79,6 +80,14 @@ def cache(repeats: int, stored: int = 100_000) -> list[Row]:
                 ),
                 Row("cache, wall time per row", f"stored, {case}", 1e6 * median(added), "us"),
             ]
+        posterior = bridge_column(cache=SimulationCache(path, verify=False))
+        points = np.hstack([thetas[:200], np.full((200, 2), 0.1)])
+        posterior(points[0])  # opens the file
+        for place, limit in (("disk", LIMIT_POSTERIOR_DISK), ("memory", LIMIT_POSTERIOR_MEMORY)):
+            one = 1e6 * median(_seconds(posterior, point) for point in points[1:])
+            rows.append(Row("posterior, wall time of one point", f"from {place}", one, "us", f"at most {limit:g}"))
+        if posterior.report()["disk_hits"] != 200:
+            raise RuntimeError(f"expected 200 rows from disk, got {posterior.report()['disk_hits']}")
         likelihood.simulator.cache.close()
         size = path.stat().st_size
         opened = median(_seconds(SimulationCache, path) for _ in range(repeats))

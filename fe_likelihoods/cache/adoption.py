@@ -1,27 +1,17 @@
 """Which stored simulations may be used: the model's generation, or a generation that new simulations agree with.
 
 If a model's label is unknown in a file, some stored rows are simulated again, chosen to cover the parameter space. If
-all agree, the label is *adopted*: it is added to the rows' generation. If one differs, a new generation begins. Rows of
-earlier releases, which have no label, are moved to the model's generation if they agree.
+all agree, the label is *adopted*: it is added to the rows' generation. If one differs, a new generation begins.
 """
 
 import logging
-import sqlite3
 import time
 
 import numpy as np
 
 from .comparison import Repetition, VerifyingRun, difference_of, is_transient, row_of_response
-from .file import CacheFile
 from .labels import OWN, Trust, labels_of
-from .rows import (
-    COLUMNS,
-    OF_EARLIER_RELEASES,
-    StoredSimulation,
-    is_undamaged,
-    regenerated,
-    transaction,
-)
+from .rows import StoredSimulation
 from .simulation_cache import MAX_CANDIDATES, SimulationCache, rows_to_compare
 
 __all__ = ["LATEST", "MAX_ATTEMPTS", "Adoption", "choose_rows"]
@@ -32,21 +22,11 @@ FIRST_COMPARED = 3  # rows in the first batch; each further batch has four times
 LATEST = 100  # rows among which the latest success is looked for
 MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 PAUSE_SECONDS = 60.0  # before another attempt, if no simulation could be compared
-MAX_SOURCES = 8  # sources of earlier releases that are compared with a model
 LARGEST = 3  # rows with the largest misfits, and failed rows nearest to successful rows
 
 
 class Adoption:
-    """Finds the generation of a model in a file.
-
-    Parameters
-    ----------
-    cache : SimulationCache
-    trust : Trust
-        Locked during a search.
-    again : Repetition
-        Runs the simulations that are compared.
-    """
+    """Finds the generation of a model in a file; `trust` is locked during a search."""
 
     def __init__(self, cache: SimulationCache, trust: Trust, again: Repetition) -> None:
         self.cache, self.trust, self.again = cache, trust, again
@@ -54,11 +34,7 @@ class Adoption:
     def generation(self, fingerprint: str, run: VerifyingRun) -> int | None:
         """Generation whose rows are used; None if no rows of this identity can be used yet.
 
-        Parameters
-        ----------
-        fingerprint : str
-            Fingerprint for statistics, as in `SimulationCache.look_up`, or the model's fingerprint for responses.
-        run : VerifyingRun
+        The fingerprint is that for statistics, as in `SimulationCache.look_up`, or the model's for responses.
         """
         found = self.trust.generations.get(fingerprint)
         if found is None:
@@ -88,51 +64,36 @@ class Adoption:
         trust, cache, n = self.trust, self.cache, rows_to_compare(self.cache.verify)
         of_responses = fingerprint == run.model.fingerprint
         present = cache.generations_of(fingerprint, "responses" if of_responses else "simulations")
-        present = [
-            each for each in present if each != OF_EARLIER_RELEASES and self._rows(fingerprint, run, each, LATEST)
-        ]
-        earlier = [] if of_responses else _earlier_sources(cache.file, run)
-        is_empty = not present and not earlier
-        if not is_empty and time.monotonic() < trust.pause_ends:
+        present = [each for each in present if self._rows(fingerprint, run, each, LATEST)]
+        if present and time.monotonic() < trust.pause_ends:
             return None
         stored = trust.find(cache.file, run.model)
-        if stored is None and not is_empty:
-            if n:
-                return self._search(fingerprint, run, present, earlier, n)
-            if present:
-                trust.adopt(cache.file, run.model, present[0], 0)
-            else:
-                trust.begin(cache.file, run.model, set())
-            stored = trust.find(cache.file, run.model)
-        elif n and not is_empty:
-            return self._complete(fingerprint, run, present, earlier, n)
+        if present and n:
+            return self._search(fingerprint, run, present, n) if stored is None else self._complete(fingerprint, run, n)
+        if present and stored is None:
+            trust.adopt(cache.file, run.model, present[0], 0)
+            stored = trust.stored
         return None if stored is None else stored.generation
 
-    def _complete(
-        self, fingerprint: str, run: VerifyingRun, present: list[int], earlier: list[int], n: int
-    ) -> int | None:
+    def _complete(self, fingerprint: str, run: VerifyingRun, n: int) -> int | None:
         """The generation of a known label; compares further rows if only a few were compared before."""
         trust, stored, before = self.trust, self.trust.find(self.cache.file, run.model), self.trust.stored
-        if stored.generation in present and stored.compared < n:
+        if stored.compared < n:
             same = {each.id for each in labels_of(self.cache.file, stored.source) if each.label == stored.label}
             rows = self._rows(fingerprint, run, stored.generation, n + MAX_ATTEMPTS)
             left = min(n, sum(row.label not in same for row in rows)) - stored.compared
             if left > 0 and not self._adopts(fingerprint, run, stored.generation, left):
                 return trust.stored.generation if trust.stored is not before else None
-        if stored.generation not in present and earlier:
-            self._adopt_earlier(fingerprint, run, earlier, n)
         return stored.generation
 
-    def _search(
-        self, fingerprint: str, run: VerifyingRun, present: list[int], earlier: list[int], n: int
-    ) -> int | None:
+    def _search(self, fingerprint: str, run: VerifyingRun, present: list[int], n: int) -> int | None:
         """The generation that an unknown label belongs to, according to new simulations; None if they cannot tell."""
         logger.warning(
             "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up to %d "
             "of them are simulated again, to see whether they can be used",
             self.cache.path,
             type(run.model).__name__,
-            min(n, len(self._rows(fingerprint, run, present[0]))) if present else n,
+            min(n, len(self._rows(fingerprint, run, present[0]))),
         )
         for generation in present:
             adopts = self._adopts(fingerprint, run, generation, n)
@@ -140,8 +101,7 @@ class Adoption:
                 return None
             if adopts:
                 return self.trust.stored.generation
-        if not self._adopt_earlier(fingerprint, run, earlier, n):
-            self.begin(fingerprint, run)
+        self.begin(fingerprint, run)
         return self.trust.stored.generation
 
     def _rows(
@@ -195,79 +155,17 @@ class Adoption:
         self.cache.verified += compared
         return True, compared
 
-    def _adopt_earlier(self, fingerprint: str, run: VerifyingRun, earlier: list[int], n: int) -> bool:
-        """Compare rows of earlier releases; if they agree, move their source to the model's generation."""
-        cache, trust = self.cache, self.trust
-        for source in earlier:
-            rows = cache.stored_rows(source, OF_EARLIER_RELEASES, run.n_numbers, run.n_steps)
-            same, compared = self._compare(fingerprint, run, choose_rows(rows, n, np.random.default_rng()))
-            if same and compared >= min(n, len(rows)) / 2:
-                if trust.stored is None:
-                    trust.begin(cache.file, run.model, set())
-                _take_over(cache.file, source, fingerprint, trust.stored.generation, trust.stored.id)
-                text = "%s: %d simulations of an earlier release agree with new ones and are used"
-                logger.warning(text, cache.path, compared)
-                return True
-        return False
-
-
-# rows of earlier releases ---------------------------------------------------------------------------------------------
-
-
-def _earlier_sources(file: CacheFile, run: VerifyingRun) -> list[int]:
-    """Sources of earlier releases whose simulations have the model's shapes, the latest first."""
-    if file.has_earlier_rows is None:
-        query = "SELECT 1 FROM simulations INDEXED BY simulation_generations WHERE generation = ? LIMIT 1"
-        file.has_earlier_rows = bool(file.select(query, (OF_EARLIER_RELEASES,)))
-    if not file.has_earlier_rows:
-        return []
-    query = (
-        "SELECT source FROM simulations WHERE generation = ? AND length(theta) = ? AND length(misfit) = ? "
-        "AND n_steps = ? GROUP BY source ORDER BY max(id) DESC LIMIT ?"
-    )
-    shape = 8 * len(run.model.parameter_names), 8 * run.n_numbers, run.n_steps
-    return [source for (source,) in file.select(query, (OF_EARLIER_RELEASES, *shape, MAX_SOURCES))]
-
-
-def _take_over(file: CacheFile, source: int, fingerprint: str, generation: int, label: int) -> None:
-    """Move the simulations of an earlier release to an identity and generation."""
-    query = f"SELECT {COLUMNS} FROM simulations WHERE source = ? AND generation = ?"
-    update = "UPDATE OR REPLACE simulations SET key = ?, source = ?, crc = ?, generation = ?, label = ? WHERE key = ?"
-
-    def take_over(connection: sqlite3.Connection) -> None:
-        with transaction(connection):
-            rows = connection.execute(query, (source, OF_EARLIER_RELEASES)).fetchall()
-            good = [regenerated(fingerprint, generation, label, row) for row in rows if is_undamaged(*row)]
-            connection.executemany(update, good)
-
-    with file.lock:
-        if file.writable:
-            file.attempt("written", take_over, None)
-
 
 # coverage of the space ------------------------------------------------------------------------------------------------
 
 
 def choose_rows(rows: list[StoredSimulation], n: int, rng: np.random.Generator) -> list[StoredSimulation]:
-    """Choose rows that would show a change of the model in a part of the parameter space.
+    """Choose n rows, of which the latest is the first, that would show a change of the model in a part of the space.
 
     The space is divided into n cells with about equal numbers of rows. One row per cell is chosen: a special row if
     there is one, otherwise a random row. A change that concerns a share p of the rows is then missed with a probability
-    of at most (1 - p)^n, as with n random rows, and less if the changed part is connected.
-
-    Parameters
-    ----------
-    rows : list of StoredSimulation
-        The latest first.
-    n : int
-        Number of rows to choose.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    list of StoredSimulation
-        The special rows first: the latest row, failed rows nearest to successful ones, largest misfits, extremes of
-        each parameter; then the others in random order.
+    of at most (1 - p)^n, as with n random rows, and less if the changed part is connected. Special rows come first: the
+    latest row, failed rows nearest to successful ones, largest misfits, extremes of each parameter.
     """
     if len(rows) <= n:
         return list(rows)

@@ -49,9 +49,8 @@ class VerifyingRun(NamedTuple):
 
     Attributes
     ----------
-    model : Model
-    pool : executor or None
-        Where the simulations of the likelihood run.
+    model, pool : Model, executor or None
+        The model, and where the simulations of the likelihood run.
     measured : (n_channels, n_steps) float, or Comparison
         Measured response [SI].
     statistic : Statistic or None
@@ -129,15 +128,11 @@ def simulate_again(
 class Repetition:
     """Runs stored simulations again, for one likelihood.
 
-    Parameters
-    ----------
-    file : CacheFile
-    trust : Trust
-
     Attributes
     ----------
     compared, unverified, seconds
-        As for `VerifiedCache`.
+        Numbers of rows that were compared with a new simulation, and that could not be, because it was stopped (not by
+        the model); wall time [s].
     found : dict
         New simulations in the present search or verification.
     """
@@ -205,7 +200,7 @@ def response_tolerance(model: Model) -> float:
 
 
 def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, tolerance: float) -> tuple[int, float] | None:
-    """Index and size of the largest difference beyond a tolerance, from `largest_difference`; None without any."""
+    """Index and size of the largest difference beyond a tolerance, see `largest_difference`; None without any."""
     return largest_difference(stored, new.misfit, new.norm, tolerance, needs_response(run.statistic))
 
 

@@ -2,11 +2,8 @@
 
 The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a transaction whose process is
 killed has no effect. SQLite's application id identifies the file as a cache, the user version is the layout version. A
-file with another id or version is never written to.
-
-SQLite connections must not be used after a fork. Therefore every process has its own connection, opened when it is
-first needed and closed before the process forks. WAL mode needs memory shared by all users of a file, so the file must
-be on a local disk, not on a network file system.
+file with another id or version is never written to. Every process has its own connection, opened when it is first
+needed and closed before the process forks, since SQLite connections must not be used after a fork.
 
 A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value with which the run continues.
 """
@@ -30,7 +27,7 @@ except ImportError:  # without file locks, two programs must not move the same d
     lock_file = None
 
 from .rows import transaction
-from .salvage import number_or_unknown, read_options, salvage
+from .salvage import read_options, salvage
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
 
@@ -38,18 +35,15 @@ logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
 SCHEMA_VERSION = 4
-EARLIER = (2, 3)  # layouts of earlier releases, without remarks or labels; such files are completed
-GENERATION = "generation INTEGER NOT NULL DEFAULT 0"
-LABEL = "label INTEGER NOT NULL DEFAULT 0"
-ADDED = (GENERATION, LABEL)
+LABELLED = "generation INTEGER NOT NULL DEFAULT 0, label INTEGER NOT NULL DEFAULT 0"
 LAYOUT = (
     # the id orders rows by age
     "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
-    f"crc INTEGER NOT NULL, {GENERATION}, {LABEL})",
+    f"crc INTEGER NOT NULL, {LABELLED})",
     "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
     "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
-    f"response BLOB NOT NULL, {GENERATION}, {LABEL})",
+    f"response BLOB NOT NULL, {LABELLED})",
     # to find the last simulation of a model, or all of them
     "CREATE INDEX simulation_generations ON simulations (source, generation)",
     "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
@@ -64,17 +58,7 @@ LAYOUT = (
     "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
     "UNIQUE (source, label, cpu))",
 )
-# statements that complete an earlier layout; the tables then have exactly the SQL in `LAYOUT`
-COMPLETION = (
-    LAYOUT[-2].replace("TABLE", "TABLE IF NOT EXISTS"),
-    *(f"ALTER TABLE {table} ADD COLUMN {column}" for table in ("simulations", "responses") for column in ADDED),
-    "DROP INDEX simulation_sources",
-    LAYOUT[2],
-    LAYOUT[-1],
-    "DELETE FROM failures",  # their keys contain a digest of an earlier release, and they have no parameters
-)
 CHECK_SECONDS = 2.0  # limit for the integrity check on opening; each row has a checksum
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
@@ -121,14 +105,6 @@ def _is_damage(error: Exception) -> bool:
     return _code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
-def _is_earlier(layout: dict[str, str]) -> bool:
-    """Whether tables and indices (their SQL, by name) have the layout of an earlier release."""
-    expected = {"simulations": LAYOUT[0], "responses": LAYOUT[1], "response_sizes": LAYOUT[3], "failures": LAYOUT[4]}
-    expected = {name: sql.replace(f", {GENERATION}, {LABEL}", "") for name, sql in expected.items()}
-    expected["simulation_sources"] = "CREATE INDEX simulation_sources ON simulations (source)"
-    return layout in (expected, expected | {"remarks": LAYOUT[5]})
-
-
 class _Damaged(sqlite3.DatabaseError):
     """Damage that SQLite does not detect."""
 
@@ -138,12 +114,7 @@ class _Damaged(sqlite3.DatabaseError):
 class CacheFile:
     """A file and this process's connection to it. Hold `lock` while using the connection.
 
-    Parameters
-    ----------
-    path : path
-        The file; created if it does not exist.
-    timeout : float
-        How long to wait for another writer [s].
+    `timeout` [s] is how long to wait for another writer.
 
     Attributes
     ----------
@@ -155,8 +126,6 @@ class CacheFile:
         False for a read-only file.
     retry_times : dict of str to float
         Actions that failed, with the monotonic time [s] before which they are not tried again.
-    has_earlier_rows : bool or None
-        Whether there are rows of earlier releases; None until this was queried.
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
@@ -165,7 +134,6 @@ class CacheFile:
         self.lock = threading.RLock()
         self.writable = True
         self.retry_times: dict[str, float] = {}
-        self.has_earlier_rows: bool | None = None
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
         self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
@@ -178,15 +146,9 @@ class CacheFile:
             self._connection.close()
 
     def check(self) -> None:
-        """Open the file and check its integrity, before any costly work.
+        """Open the file and check its integrity, before any costly work; see `SimulationCache` for the errors.
 
         A damaged cache is moved aside with a warning, and a new one is created.
-
-        Raises
-        ------
-        ValueError
-            If the path is a folder or in no existing folder, or if the file cannot be read or created, is not a cache,
-            belongs to another program, or has the layout of another release. Such a file is not changed.
         """
         folder = self.path.parent
         if self.path.is_dir():
@@ -215,10 +177,7 @@ class CacheFile:
     def damage(self) -> str:
         """Describe the damage of an existing file, which is not changed; empty for an undamaged cache.
 
-        Raises
-        ------
-        ValueError
-            If the file is not a cache, has another layout, or cannot be opened.
+        ValueError if the file is not a cache, has another layout, or cannot be opened.
         """
         connection = None
         try:
@@ -309,12 +268,7 @@ class CacheFile:
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.
 
-        Raises
-        ------
-        ValueError
-            If the file belongs to another program or has another layout.
-        sqlite3.Error
-            If the file cannot be opened.
+        ValueError if the file belongs to another program or has another layout, sqlite3.Error if it cannot be opened.
         """
         if self._connection is None:
             with self._exclusive():
@@ -327,11 +281,8 @@ class CacheFile:
             if self._aside is not None and self.writable:
                 aside, self._aside = self._aside, None
                 found = salvage(aside, self._connection)
-                text = "%s: %d simulations were salvaged, %s were lost"
-                logger.warning(text, aside.name, found.rows, number_or_unknown(found.lost))
-                if found.responses or found.lost_responses != 0:
-                    text = "%s: %d responses were salvaged, %s were lost"
-                    logger.warning(text, aside.name, found.responses, number_or_unknown(found.lost_responses))
+                text = "%s: %d simulations and %d responses were salvaged; the others are lost"
+                logger.warning(text, aside.name, *found)
         return self._connection
 
     def close(self) -> None:
@@ -344,12 +295,7 @@ class CacheFile:
     def set_aside(self, why: str) -> None:
         """Rename a damaged file to ``<name>.damaged-<n>`` with a warning, unless another process has already done so.
 
-        Raises
-        ------
-        ValueError
-            If the file is not known to be a cache; it is not changed.
-        OSError
-            If the file cannot be renamed.
+        ValueError if the file is not known to be a cache (it is not changed), OSError if it cannot be renamed.
         """
         with self.lock, self._exclusive():
             self.close()
@@ -411,7 +357,6 @@ class CacheFile:
             if self._is_empty(connection):
                 self._create(connection)
             self._identify(connection)
-            self._complete(connection)
             self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
@@ -459,22 +404,6 @@ class CacheFile:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
 
-    def _complete(self, connection: sqlite3.Connection) -> None:
-        """Complete the layout of an earlier release, in one transaction."""
-        version = "PRAGMA user_version"
-        if connection.execute(version).fetchone() == (SCHEMA_VERSION,):
-            return
-        self._execute_with_retry(connection, "BEGIN IMMEDIATE")
-        if connection.execute(version).fetchone() != (SCHEMA_VERSION,):  # another process may have done it
-            for statement in COMPLETION:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            logger.warning(
-                "%s is of an earlier release: its simulations are kept, and those that agree with new ones are used",
-                self.path,
-            )
-        connection.execute("COMMIT")
-
     def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
         """Execute a statement, waiting while another process holds a lock, where SQLite itself does not wait."""
         give_up = time.monotonic() + self.timeout
@@ -497,13 +426,12 @@ class CacheFile:
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
                 f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}); give another path"
             )
-        if version not in (SCHEMA_VERSION, *EARLIER) or (version != SCHEMA_VERSION and not self.writable):
+        if version != SCHEMA_VERSION:
             raise ValueError(
-                f"{self.path} is a cache of layout {version}, this release reads and writes {SCHEMA_VERSION}, and "
-                "completes writable files of earlier ones; give another path, or remove the file"
+                f"{self.path} is a cache of another release (layout {version}); this release reads and writes layout "
+                f"{SCHEMA_VERSION}: give another path, or remove the file"
             )
-        # the version was read first, so another process may have completed the file since
-        if sorted(layout.values()) != sorted(LAYOUT) and (version == SCHEMA_VERSION or not _is_earlier(layout)):
+        if sorted(layout.values()) != sorted(LAYOUT):
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
@@ -536,8 +464,6 @@ class CacheFile:
             return
         if size % PAGE_SIZE == 0 and not any(page):
             return
-        if page.startswith(HDF5_SIGNATURE):
-            raise ValueError(f"{self.path} is an HDF5 file, not a cache; give another path") from None
         raise ValueError(
             f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
             "'cache.sqlite'. If it is a cache with a damaged header, remove it"

@@ -79,19 +79,13 @@ def _enter(file: CacheFile, label: StoredLabel, move: bool) -> StoredLabel:
 class Trust:
     """Label and generation of a model in a file, and which rows are trusted in this process.
 
-    Likelihoods with the same file, model and pool share it (`shared_trust`), as do derived likelihoods and copies.
-
-    Parameters
-    ----------
-    label : ModelLabel
-        Label of the model, completed by simulations.
-    is_local : bool
-        Whether simulations run on this machine, so that the processor is known.
-    token : str
-        Identifies the object in other processes, where it starts without trusted rows.
+    Likelihoods with the same file, model and pool share it (`shared_trust`), as do derived likelihoods and copies. In
+    other processes, where `token` identifies it, it starts without trusted rows.
 
     Attributes
     ----------
+    label, is_local
+        Label of the model, completed by simulations; whether these run on this machine, whose processor is known.
     stored : StoredLabel or None
         The label in the file; None until it is known.
     generations : dict of str to int
@@ -111,8 +105,7 @@ class Trust:
         self.generations: dict[str, int] = {}
         self.served: Counter[tuple[str, str]] = Counter()
         self.own: set[bytes] = set()
-        self.failed_attempts = 0
-        self.pause_ends, self.rows_in_pause = -np.inf, 0
+        self.pause_ends = -np.inf  # of the time in which nothing is verified, since no new simulation ended [s]
         self.stale: tuple[str, Any] | None = None
         self._lock, self._owner = threading.RLock(), os.getpid()
 
@@ -135,7 +128,7 @@ class Trust:
     def find(self, file: CacheFile, model: Model) -> StoredLabel | None:
         """The label in the file; None if it is unknown there.
 
-        The label includes the present contents of files that earlier simulations have opened.
+        It includes the present contents of files that earlier simulations have opened.
         """
         source = source_number(model.fingerprint)
         if self.stored is not None and source != self.stored.source:  # another length of the record, for example
@@ -227,18 +220,9 @@ def _remember(token: str, trust: Trust) -> Trust:
 def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats_bits: bool) -> Trust:
     """The `Trust` of this process for a file, a model in its present state, and a pool.
 
-    Compiled models of this library with equal values share it. A model that runs user code may have a state that
-    neither its fingerprint nor its label contains, so only the same model object with the same pool shares it.
-
-    Parameters
-    ----------
-    cache : SimulationCache
-    model : Model
-    pool : executor or None
-    label : ModelLabel
-        Label of the model.
-    repeats_bits : bool
-        Whether the same parameters give the same bits on the same processor.
+    Compiled models of this library with equal values share it (`repeats_bits`: the same parameters give the same bits
+    on the same processor). A model that runs user code may have a state that neither its fingerprint nor its label
+    contains, so only the same model object with the same pool shares it.
     """
     is_local = pool is None or isinstance(pool, LocalPool)
     values, objects = "", [each for each in (model, pool) if each is not None]

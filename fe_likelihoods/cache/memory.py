@@ -1,4 +1,4 @@
-"""Simulations in memory: caches of recent statistics and responses, and rows that wait to be written.
+"""Caches of recent statistics and responses in memory.
 
 Residual statistics do not depend on the noise parameters. They are reused when only noise parameters change, when a
 sampler returns to a point, and when a chain is evaluated again. Responses depend neither on the noise nor on the
@@ -7,19 +7,16 @@ measurements. They are reused when a mode search is repeated, and by other likel
 
 import logging
 import threading
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
-__all__ = ["FinishedRows", "MemoryCache", "ResponseMemory", "RowBuffer", "distinct_keys"]
+__all__ = ["MemoryCache", "ResponseMemory", "distinct_keys", "thetas_of"]
 
 logger = logging.getLogger(__name__)
 
-SECONDS_BETWEEN_WRITES = 1.0
-MOST_BYTES = 2**26  # of responses that wait to be written
 _NAN = np.array([np.nan]).tobytes()
 _ENTRY_BYTES = 250  # memory of one stored response, besides its numbers
 
@@ -29,6 +26,11 @@ def distinct_keys(rows: np.ndarray) -> tuple[list[bytes], list[int]]:
     first: dict[bytes, int] = {}
     which = [first.setdefault(row.tobytes(), len(first)) for row in rows + 0.0]  # adding zero makes 0.0 of -0.0
     return list(first), which
+
+
+def thetas_of(keys: Sequence[bytes], n_structural: int) -> np.ndarray:
+    """Structural parameters (n, n_structural) of keys."""
+    return np.frombuffer(b"".join(keys), dtype=float).reshape(len(keys), n_structural).copy()
 
 
 def _as_limit(name: str, what: str, value: Any) -> int:
@@ -92,7 +94,7 @@ class MemoryCache:
         """Structural parameters (n, n_structural) of cached simulations that did not fail."""
         with self._lock:
             keys = [key for key, misfit in self._misfits.items() if not np.isnan(np.frombuffer(misfit)).any()]
-        return np.frombuffer(b"".join(keys), dtype=float).reshape(-1, n_structural)
+        return thetas_of(keys, n_structural)
 
     def clear(self) -> None:
         """Drop all rows."""
@@ -185,85 +187,3 @@ class ResponseMemory:
 def _size(outcome: np.ndarray | str) -> int:
     """Bytes of an outcome in the response memory."""
     return _ENTRY_BYTES + (len(outcome) if isinstance(outcome, str) else outcome.nbytes)
-
-
-# rows that wait -------------------------------------------------------------------------------------------------------
-
-
-class FinishedRows(NamedTuple):
-    """Simulations to be written.
-
-    Attributes
-    ----------
-    thetas : (n, n_structural) float
-        Structural parameters.
-    misfit : (n, n_numbers) float
-        Statistics.
-    reasons : list of n str
-        Reasons of failures.
-    response : (n, n_channels, n_steps) float, or None
-        Responses, if they are stored.
-    seconds : float
-        Wall time [s].
-    """
-
-    thetas: np.ndarray
-    misfit: np.ndarray
-    reasons: list[str]
-    response: np.ndarray | None
-    seconds: float
-
-
-class RowBuffer:
-    """Rows that wait to be written.
-
-    The first rows are written at once, later rows together, one second after the last write: by the thread that adds
-    rows, or by a timer if no more rows are added.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
-        self._rows: list[FinishedRows] = []
-        self._write: Callable[[FinishedRows], None] | None = None
-        self._timer: threading.Timer | None = None
-        self._bytes, self._last = 0, -np.inf
-
-    def add(self, rows: FinishedRows, write: Callable[[FinishedRows], None]) -> None:
-        """Add rows, which the function `write` writes."""
-        with self._lock:
-            self._rows.append(rows)
-            self._write = write
-            self._bytes += 0 if rows.response is None else rows.response.nbytes
-            wait = self._last + SECONDS_BETWEEN_WRITES - time.monotonic()
-            if wait <= 0.0 or self._bytes > MOST_BYTES:
-                self.flush()
-            elif self._timer is None:
-                self._timer = threading.Timer(wait, self.flush)  # no daemon: rows are written before the process ends
-                self._timer.start()
-
-    def flush(self) -> None:
-        """Write the rows that wait."""
-        with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
-            if not self._rows:
-                return
-            rows, self._rows, self._bytes = self._rows, [], 0
-            self._last = time.monotonic()
-            write, self._write = self._write, None  # it refers to the likelihood
-            # separately with and without responses, since `write` takes either responses for all rows or none
-            for some in ([r for r in rows if r.response is None], [r for r in rows if r.response is not None]):
-                if some:
-                    write(_joined(some))
-
-
-def _joined(rows: list[FinishedRows]) -> FinishedRows:
-    response = None if rows[0].response is None else np.concatenate([row.response for row in rows])
-    return FinishedRows(
-        np.concatenate([row.thetas for row in rows]),
-        np.concatenate([row.misfit for row in rows]),
-        [reason for row in rows for reason in row.reasons],
-        response,
-        sum(row.seconds for row in rows),
-    )

@@ -17,7 +17,6 @@ __all__ = [
     "COLUMNS",
     "LABEL_COLUMNS",
     "MIN_STOPS",
-    "OF_EARLIER_RELEASES",
     "RESPONSE_COLUMNS",
     "STORE",
     "STORE_FAILURE",
@@ -35,7 +34,6 @@ __all__ = [
     "pack_label",
     "pack_response",
     "pack_row",
-    "regenerated",
     "select_rows",
     "simulation_keys",
     "source_number",
@@ -48,12 +46,11 @@ __all__ = [
 COLUMNS = "key, source, theta, misfit, n_steps, reason, seconds, crc, generation, label"
 RESPONSE_COLUMNS = "key, source, theta, n_channels, size, crc, response, generation, label"
 LABEL_COLUMNS = "id, source, label, cpu, generation, compared, files, crc"
-OF_EARLIER_RELEASES = 0  # generation of rows from earlier releases, whose keys cannot be computed any more
 KEY_BYTES = 16
 KEYS_PER_QUERY = 500  # keys in one SELECT
 MAX_REASON_LENGTH = 2000
 NUMBERS = struct.Struct("<qqd")
-LABEL_NUMBERS = struct.Struct("<qq")
+ALL_NUMBERS = struct.Struct("<qqdqq")
 
 STORE = (
     f"INSERT INTO simulations ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) "
@@ -61,7 +58,6 @@ STORE = (
     "seconds = excluded.seconds, crc = excluded.crc, label = excluded.label "
     "WHERE length(reason) > 0"  # a success is never overwritten
 )
-# replaces a response that an earlier version stored in single precision
 STORE_RESPONSE = f"INSERT OR REPLACE INTO responses ({RESPONSE_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 STORE_LABEL = f"INSERT OR REPLACE INTO labels ({LABEL_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
 # counts how often a simulation was stopped at the same time limit
@@ -118,14 +114,10 @@ class StoredLabel(NamedTuple):
 
     Attributes
     ----------
-    id : int
-        Number by which rows refer to the label.
-    source : int
-        Source number of the model.
-    label : str
-        See `fe_likelihoods.simulation.label.ModelLabel`.
-    cpu : str
-        Name of the processor.
+    id, source : int
+        Number by which rows refer to the label; source number of the model.
+    label, cpu : str
+        See `fe_likelihoods.simulation.label.ModelLabel`; name of the processor.
     generation : int
         Generation that the label belongs to.
     compared : int
@@ -149,14 +141,8 @@ class StoredLabel(NamedTuple):
 def simulation_keys(fingerprint: str, thetas: np.ndarray, generation: int = 1) -> list[bytes]:
     """Keys of simulations, digests of 128 bits.
 
-    Parameters
-    ----------
-    fingerprint : str
-        Declared identity: everything that a simulation depends on, except the parameters.
-    thetas : (n, n_structural) float
-        Structural parameters; -0.0 and 0.0 have the same key.
-    generation : int
-        See `StoredLabel`.
+    `fingerprint` is the declared identity: everything that a simulation depends on, except the structural parameters
+    (n, n_structural), where -0.0 and 0.0 have the same key, and the generation.
     """
     start = hashlib.blake2b(f"{fingerprint}\0{generation}\0".encode(), digest_size=KEY_BYTES)
     keys = []
@@ -175,8 +161,7 @@ def source_number(fingerprint: str) -> int:
 def checksum(*values: Any) -> int:
     """CRC-32 of the values in `COLUMNS` except the checksum; the key is included, so swapped rows count as damaged."""
     key, source, theta, misfit, n_steps, reason, seconds, generation, label = values
-    # earlier releases stored no generation and no label
-    numbers = NUMBERS.pack(source, n_steps, seconds) + (LABEL_NUMBERS.pack(generation, label) if generation else b"")
+    numbers = ALL_NUMBERS.pack(source, n_steps, seconds, generation, label)
     return zlib.crc32(b"".join((key, numbers, theta, misfit, reason)))
 
 
@@ -272,16 +257,6 @@ def unpack_label(*row: Any) -> StoredLabel:
     return StoredLabel(*row[:2], row[2].decode(), row[3].decode(), *row[4:6], tuple(json.loads(row[6])))
 
 
-def regenerated(fingerprint: str, generation: int, label: int, row: tuple) -> tuple:
-    """A stored simulation, given by the values of `COLUMNS`, moved to another identity and generation.
-
-    Returns key, source, checksum, generation, label, and the former key.
-    """
-    (key,) = simulation_keys(fingerprint, np.frombuffer(row[2], dtype="<f8")[None], generation)
-    source = source_number(fingerprint)
-    return key, source, checksum(key, source, *row[2:7], generation, label), generation, label, row[0]
-
-
 def _packed(values: np.ndarray) -> bytes:
     return np.asarray(values, dtype="<f8").tobytes()
 
@@ -321,22 +296,10 @@ def select_rows(
 def insert_rows(
     connection: sqlite3.Connection, statement: str, rows: list[tuple], max_rows: int, max_response_bytes: int
 ) -> tuple[int, int]:
-    """Store rows and evict the oldest, in one transaction.
+    """Store the values of a statement and evict the oldest rows beyond the limits of a `SimulationCache`, in one
+    transaction.
 
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-    statement : str
-        `STORE`, `STORE_RESPONSE` or `STORE_FAILURE`.
-    rows : list of tuple
-        Values of the statement.
-    max_rows, max_response_bytes : int
-        As for `SimulationCache`.
-
-    Returns
-    -------
-    simulations, responses : int
-        Numbers of evicted rows.
+    Returns the numbers of evicted simulations and responses.
     """
     with transaction(connection):
         connection.executemany(statement, rows)

@@ -27,7 +27,7 @@ from .rows import (
     transaction,
 )
 
-__all__ = ["Salvaged", "number_or_unknown", "read_options", "salvage"]
+__all__ = ["Salvaged", "read_options", "salvage"]
 
 logger = logging.getLogger(__name__)
 
@@ -35,31 +35,11 @@ SECONDS = 60.0
 FEWEST_BYTES = 100  # per row; bounds the row numbers if they cannot be queried
 
 
-class _Table(NamedTuple):
-    """A table to copy: its columns, the statement and check for a row, and the number of rows per query."""
-
-    name: str
-    columns: str
-    store: str
-    check: Callable[..., bool]
-    rows_per_query: int
-
-
-_SIMULATIONS = _Table("simulations", COLUMNS, STORE, is_undamaged, 1000)
-_RESPONSES = _Table("responses", RESPONSE_COLUMNS, STORE_RESPONSE, is_undamaged_response, 20)
-_ADDED = "generation, label"  # columns that files of earlier releases do not have
-
-
 class Salvaged(NamedTuple):
-    """Numbers of simulations and responses that were copied, and that are lost (unreadable or a wrong checksum).
+    """Numbers of simulations and responses that were copied."""
 
-    The numbers of lost rows are upper bounds, since they may count deleted rows; None if they are unknown.
-    """
-
-    rows: int
-    lost: int | None
+    simulations: int
     responses: int
-    lost_responses: int | None
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
@@ -75,7 +55,10 @@ def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
     with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError), _opened(damaged) as source:
         rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
         connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])
-    return Salvaged(*_copy(damaged, connection, _SIMULATIONS), *_copy(damaged, connection, _RESPONSES))
+    return Salvaged(
+        _copy(damaged, connection, "simulations", COLUMNS, STORE, is_undamaged, 1000),
+        _copy(damaged, connection, "responses", RESPONSE_COLUMNS, STORE_RESPONSE, is_undamaged_response, 20),
+    )
 
 
 @contextlib.contextmanager
@@ -91,78 +74,63 @@ def read_options(path: Path) -> str:
     return "mode=ro" if path.with_name(f"{path.name}-wal").exists() else "mode=ro&immutable=1"
 
 
-def number_or_unknown(n: int | None) -> str:
-    """A number of rows as text."""
-    return "an unknown number" if n is None else str(n)
-
-
-def _copy(damaged: Path, connection: sqlite3.Connection, table: _Table) -> tuple[int, int | None]:
-    """Copy the readable rows of a table; return how many were copied, and how many were lost (None if unknown)."""
-    kept, lost, known = 0, 0, True
+def _copy(
+    damaged: Path,
+    connection: sqlite3.Connection,
+    table: str,
+    columns: str,
+    store: str,
+    check: Callable[..., bool],
+    rows_per_query: int,
+) -> int:
+    """Copy the readable rows of a table; return how many were copied."""
+    kept = 0
     try:
         with _opened(damaged) as source:
-            table = _as_stored(source, table)
-            if (largest := _largest_id(source, table.name)) is None:
-                known, largest = False, damaged.stat().st_size // FEWEST_BYTES
-            for rows, missing in _ranges(source, damaged, table, largest):
-                good = [row for row in rows if table.check(*row)]
-                known = known and missing is not None
-                lost += (missing or 0) + len(rows) - len(good)
-                if good:
+            query = f"SELECT {columns} FROM {table} WHERE id BETWEEN ? AND ?"
+            for rows in _ranges(source, query, _largest_id(source, table, damaged), rows_per_query):
+                if good := [row for row in rows if check(*row)]:
                     with transaction(connection):
-                        connection.executemany(table.store, good)
+                        connection.executemany(store, good)
                     kept += len(good)
-    except (sqlite3.Error, OSError, ValueError, MemoryError) as error:
-        logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table.name, error)
-        known = False
-    return kept, lost if known else None
+    except (sqlite3.Error, OSError, ValueError, MemoryError, TimeoutError) as error:
+        logger.warning("%s: no more %s can be salvaged (%s)", damaged.name, table, error)
+    return kept
 
 
-def _as_stored(source: sqlite3.Connection, table: _Table) -> _Table:
-    """The table with zeros in place of columns that a file of an earlier release does not have."""
-    with contextlib.suppress(sqlite3.DatabaseError):
-        known = [name for _, name, *_ in source.execute(f"PRAGMA table_info({table.name})")]
-        if known and b"label" not in known:
-            return table._replace(columns=table.columns.replace(_ADDED, "0, 0"))
-    return table
-
-
-def _ranges(
-    source: sqlite3.Connection, path: Path, table: _Table, largest: int
-) -> Iterator[tuple[list[tuple], int | None]]:
-    """Rows in consecutive ranges of row numbers, and how many rows per range are unreadable (None if unknown)."""
-    query = f"SELECT {table.columns} FROM {table.name} WHERE id BETWEEN ? AND ?"
+def _ranges(source: sqlite3.Connection, query: str, largest: int, rows_per_query: int) -> Iterator[list[tuple]]:
+    """Rows in consecutive ranges of row numbers; TimeoutError if it takes too long."""
     stop = time.monotonic() + SECONDS
     waiting = [(1, largest)]
     while waiting:
         first, last = waiting.pop()
-        if last - first >= table.rows_per_query:
-            middle = first + table.rows_per_query
+        if last - first >= rows_per_query:
+            middle = first + rows_per_query
             waiting += [(middle, last), (first, middle - 1)]
             continue
         if time.monotonic() > stop:
-            text = "%s: salvage of %s ended after %g s, at row %d of %d"
-            logger.warning(text, path.name, table.name, SECONDS, first, last)
-            yield [], None
-            return
+            raise TimeoutError(f"stopped after {SECONDS:g} s, at row {first} of {largest}")
         try:
-            yield source.execute(query, (first, last)).fetchall(), 0
+            yield source.execute(query, (first, last)).fetchall()
         except (sqlite3.DatabaseError, MemoryError) as error:
-            if isinstance(error, sqlite3.OperationalError) and "no such" in str(error):
+            if _is_absent(error):
                 raise
-            if first == last:
-                yield [], 1
-            elif last >= first:
+            if first < last:
                 middle = (first + last) // 2
                 waiting += [(middle + 1, last), (first, middle)]
 
 
-def _largest_id(source: sqlite3.Connection, table: str) -> int | None:
-    """The largest row number, None if it cannot be read."""
+def _largest_id(source: sqlite3.Connection, table: str, damaged: Path) -> int:
+    """The largest row number, or an upper bound if it cannot be read."""
     try:
         (largest,) = source.execute(f"SELECT max(id) FROM {table}").fetchone()
+        return largest or 0
     except (sqlite3.DatabaseError, MemoryError) as error:
-        if isinstance(error, sqlite3.OperationalError) and "no such" in str(error):
+        if _is_absent(error):
             raise
-        return None
-    return largest or 0
+        return damaged.stat().st_size // FEWEST_BYTES
+
+
+def _is_absent(error: Exception) -> bool:
+    """Whether a table is absent from the file."""
+    return isinstance(error, sqlite3.OperationalError) and "no such" in str(error)

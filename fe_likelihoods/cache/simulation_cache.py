@@ -4,17 +4,14 @@ For each simulation, the sum of squared residuals is stored, one number per chan
 on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
 simulation is a digest of the declared identity (fingerprints of model and measurements), the generation, and the
 structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
-model's code (`fe_likelihoods.cache.adoption`); rows of other generations stay in the file and are not used. When the
-cache is full, the oldest rows are evicted.
+model's code (`fe_likelihoods.cache.adoption`); rows of other generations stay in the file and are not used.
 
-Responses are stored if they are requested, for example by a guide, or for every simulation. They depend on the model
-alone. They are stored in double precision: in single precision, a response with an offset of a million times its noise
-would lose its digits. Lossless compression would save only 10 to 25 %, and is not used.
-
-Failures of the model are stored under a key of the model, so that they are valid for any measurements. Faults of the
-infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run simulates the point again. A simulation
-that was stopped at a time limit is stored together with this limit. A later run with a longer limit repeats it; a run
-with the same or a shorter limit repeats it once, because a busy machine may have been the cause.
+Responses, which depend on the model alone, are stored in double precision if they are requested, for example by a
+guide, or for every simulation. Failures of the model are stored under a key of the model, so that they are valid for
+any measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run
+simulates the point again. A simulation that was stopped at a time limit is stored together with this limit. A later run
+with a longer limit repeats it; a run with the same or a shorter limit repeats it once, because a busy machine may have
+been the cause.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
@@ -28,7 +25,7 @@ import sqlite3
 import zlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,7 +64,6 @@ MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 CONFIDENCE = 0.95
 STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
 TABLES = ("simulations", "responses", "failures", "remarks")
-SETTINGS = ("path", "max_rows", "retry_failures", "responses", "max_response_bytes", "timeout", "verify", "tolerance")
 
 _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
 
@@ -86,8 +82,7 @@ class CacheInfo(NamedTuple):
     seconds : float
         Wall time of the stored simulations [s].
     hits, misses, evictions, damaged, verified : int
-        Rows that this object has found, not found, evicted, found damaged, and simulated again without a difference, in
-        this process.
+        As for `SimulationCache`.
     """
 
     path: Path
@@ -153,7 +148,7 @@ class SimulationCache:
         How long to wait for another writer [s].
     verify : bool, int or str
         How many stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`). If
-        the model's label is known: two rows per process, and one of every 1000. If it is unknown, because code, a file
+        the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a file
         or a package has changed: enough rows to detect a change in 5 % of the parameter space with a probability of
         95 % (59 rows, or all rows). Give another share, such as "2 %", or a number of rows; False for no rows.
     tolerance : float, optional
@@ -163,14 +158,9 @@ class SimulationCache:
 
     Attributes
     ----------
-    hits, misses : int
-        Rows found and not found by this object in this process.
-    evictions : int
-        Rows evicted by this object.
-    damaged : int
-        Rows that were damaged and deleted.
-    verified : int
-        Rows that were simulated again by likelihoods in this process and did not differ.
+    hits, misses, evictions, damaged, verified : int
+        Rows that this object has found, not found, evicted, found damaged and deleted, and simulated again without a
+        difference, in this process.
     file : CacheFile
         The SQLite file and its connection.
 
@@ -178,8 +168,8 @@ class SimulationCache:
     ------
     ValueError
         If a bound is not positive, if the tolerance is negative, if the path is a folder or in no existing folder, or
-        if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of a later
-        release. Such a file is not changed. A file of an earlier release is completed; its rows are kept.
+        if the file cannot be read or created, is not a cache, belongs to another program, or has the layout of another
+        release. Such a file is not changed.
 
     Notes
     -----
@@ -213,26 +203,29 @@ class SimulationCache:
         if tolerance is not None and not 0.0 <= tolerance < np.inf:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
         rows_to_compare(verify)  # refuses an impossible value
-        bounds = int(max_rows), bool(retry_failures), bool(responses), int(max_response_bytes)
-        self._set_up(path, *bounds, timeout, verify, tolerance)
+        self.max_rows, self.max_response_bytes = int(max_rows), int(max_response_bytes)
+        self.retry_failures, self.responses = bool(retry_failures), bool(responses)
+        self.verify, self.tolerance = verify, tolerance
+        self._begin(CacheFile(path, timeout))
         self.file.check()
         if not self.file.writable:
             self._warn_read_only()
 
-    def _set_up(self, path: Any, max_rows: int, retry_failures: bool, responses: bool, *others: Any) -> None:
-        """Set all attributes without opening the file."""
-        self.max_rows, self.retry_failures, self.responses = max_rows, retry_failures, responses
-        self.max_response_bytes, self.timeout, self.verify, self.tolerance = others
-        self.file = CacheFile(path, self.timeout)
+    def _begin(self, file: CacheFile) -> None:
+        self.file = file
         self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
         self._waiting: list[tuple] = []
+        self._remark = ""  # that was stored last
         self._warned_read_only = self._said_evicted = False
 
     def __getstate__(self) -> tuple:
-        return tuple(getattr(self, name) for name in SETTINGS)
+        settings = ("max_rows", "max_response_bytes", "retry_failures", "responses", "verify", "tolerance")
+        return self.path, self.file.timeout, {name: getattr(self, name) for name in settings}
 
     def __setstate__(self, state: tuple) -> None:
-        self._set_up(*state)  # the file is opened when it is needed; if that fails, a run continues without it
+        path, timeout, settings = state
+        vars(self).update(settings)
+        self._begin(CacheFile(path, timeout))  # opened when it is needed; if that fails, a run continues without it
 
     def __repr__(self) -> str:
         return f"SimulationCache({str(self.path)!r})"
@@ -320,19 +313,16 @@ class SimulationCache:
     def look_up_responses(
         self, model: Model, thetas: np.ndarray, generation: int | None = None
     ) -> list[np.ndarray | None]:
-        """Responses (n_channels, n_steps) [SI] of a model.
-
-        None for a response that is not stored, or was stored by an earlier version in single precision.
-        """
+        """Responses (n_channels, n_steps) [SI] of a model; None for a response that is not stored."""
         shape = len(model.channels), model.n_steps
         size = 8 * shape[0] * shape[1]
         keys = self._keys(model.fingerprint, thetas, generation)
         found, bad = {}, []
         with self.file.lock:
             for key, crc, data in self._rows(keys, "key, crc, response FROM responses"):
-                if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) not in (size, size // 2):
+                if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) != size:
                     bad.append(key)
-                elif len(data) == size:
+                else:
                     found[key] = np.frombuffer(data, dtype="<f8").reshape(shape)
             self._drop("responses", bad)
         return [found.get(key) for key in keys]
@@ -386,10 +376,12 @@ class SimulationCache:
 
     def store_remark(self, model: Model) -> None:
         """Store a model's `range_remark` (a law was used beyond its range), unless it is empty or one is stored."""
-        if text := getattr(model, "range_remark", ""):
+        text = getattr(model, "range_remark", "")
+        if text and text != self._remark:
             source = source_number(model.fingerprint)
             key = source.to_bytes(8, "little", signed=True)
-            self.file.write(STORE_REMARK, [(key, source, text.encode("utf-8", "backslashreplace"))])
+            if self.file.write(STORE_REMARK, [(key, source, text.encode("utf-8", "backslashreplace"))]):
+                self._remark = text
 
     def look_up_remark(self, model: Model) -> str:
         """Remark of a model; empty if there is none."""
@@ -418,21 +410,13 @@ class SimulationCache:
         return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
 
     def stored_rows(
-        self, fingerprint: str | int, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
+        self, fingerprint: str, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
     ) -> list[StoredSimulation]:
         """Undamaged simulations of one identity and generation, the latest first, evenly chosen if there are many.
 
-        Parameters
-        ----------
-        fingerprint : str or int
-            Fingerprint, or a source number from an earlier release.
-        generation : int
-        n_channels, n_steps : int
-            Shape of the measurements.
-        most : int
-            Approximate largest number of rows.
+        `n_channels` and `n_steps` are the shape of the measurements, `most` is about the largest number of rows.
         """
-        values = fingerprint if isinstance(fingerprint, int) else source_number(fingerprint), generation
+        values = source_number(fingerprint), generation
         where = "FROM simulations WHERE source = ? AND generation = ?"
         latest = f"SELECT {COLUMNS} {where} ORDER BY id DESC LIMIT ?"
         ((n,),) = self.file.select(f"SELECT count(*) {where}", values) or [(0,)]
@@ -459,19 +443,10 @@ class SimulationCache:
     # the file ---------------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
-        """Copy the cache with all rows to a new file, for an archive or another machine.
+        """Copy the cache with all rows to a new file, for an archive or another machine; returns the number of
+        simulations.
 
-        Returns
-        -------
-        int
-            Number of simulations.
-
-        Raises
-        ------
-        ValueError
-            If the file exists, or its folder does not.
-        OSError
-            If either file cannot be used.
+        ValueError if the file exists, or its folder does not; OSError if either file cannot be used.
         """
         target = Path(path).resolve()
         if target.exists() or not target.parent.is_dir():
@@ -480,24 +455,10 @@ class SimulationCache:
         return self.info().simulations
 
     def add(self, path: str | os.PathLike) -> int:
-        """Add the rows of another cache; rows that are stored already are not changed.
+        """Add the rows of another cache, which no other process uses; rows that are stored already are not changed.
 
-        Parameters
-        ----------
-        path : path
-            The other file, which no other process uses. A file of an earlier release is completed.
-
-        Returns
-        -------
-        int
-            Number of simulations added.
-
-        Raises
-        ------
-        ValueError
-            If the other file is not a cache.
-        OSError
-            If either file cannot be used.
+        Returns the number of simulations added. ValueError if the other file is not a cache, OSError if either file
+        cannot be used.
         """
         other = SimulationCache(path)
         if other.path == self.path:
@@ -535,17 +496,9 @@ class SimulationCache:
             return CacheInfo(self.path, *counted, size, *counts)
 
     def check_rows(self) -> tuple[int, int]:
-        """Compare all simulations with their checksums; no row is changed.
+        """Compare all simulations with their checksums; no row is changed. OSError if the file cannot be read.
 
-        Returns
-        -------
-        rows, damaged : int
-            Number of simulations, and how many do not match their checksums.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be read.
+        Returns the number of simulations, and how many do not match their checksums.
         """
         rows = good = last = 0
         query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
@@ -560,28 +513,20 @@ class SimulationCache:
         with self.file.lock:
             self.file.insist(lambda connection: _delete_rows(connection, "?", [(True,)]))
             self._waiting.clear()
+            self._remark = ""
             # returns the space to the disk; may fail while others read
             self.file.attempt("vacuumed", lambda connection: connection.execute("VACUUM"), None)
 
     def forget(self, *fingerprints: str) -> int:
-        """Delete all rows with these fingerprints, in all generations, for all users of the file.
+        """Delete all rows with these fingerprints, in all generations, for all users of the file; returns their number.
 
         ``cache.forget(*likelihood.simulator.cache_keys)`` deletes the rows that a likelihood uses. Likelihoods keep
-        their caches in memory: make a new likelihood.
-
-        Returns
-        -------
-        int
-            Number of rows deleted.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
+        their caches in memory: make a new likelihood. OSError if the file cannot be written.
         """
         sources = {source_number(fingerprint) for fingerprint in fingerprints}
         with self.file.lock:
             self._waiting = [row for row in self._waiting if row[1] not in sources]
+            self._remark = ""
             rows = [(source,) for source in sources]
             return self.file.insist(lambda connection: _delete_rows(connection, "source = ?", rows))
 

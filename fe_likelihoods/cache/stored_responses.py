@@ -12,8 +12,7 @@ import numpy as np
 
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, simulate_batch
-from ..simulation.opened import observing
-from .comparison import VerifyingRun
+from .comparison import VerifyingRun, observed
 from .simulation_cache import SimulationCache
 from .verification import VerifiedCache
 
@@ -23,14 +22,9 @@ _SECONDS = 0.1  # of simulations between two writes, if one simulation is shorte
 
 
 class StoredResponses:
-    """Simulations of a model; each is run only once for all processes that use the cache.
+    """Simulations of a model in a pool or here; each is run only once for all processes that use the cache.
 
-    Parameters
-    ----------
-    model : Model
-    pool : executor or None
-    cache : SimulationCache
-        Cache of the responses. One or two stored responses per process are simulated again and compared.
+    One or two stored responses per process are simulated again and compared.
     """
 
     def __init__(self, model: Model, pool: Any, cache: SimulationCache) -> None:
@@ -47,9 +41,9 @@ class StoredResponses:
         self._size = self._least
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses (n, n_channels, n_steps) [SI], stored or new, and the reasons of failures.
+        """Responses of distinct parameter sets (n, n_parameters), stored or new, and the reasons of failures.
 
-        The parameter sets (n, n_parameters) must be distinct. `StaleCache` if a stored and a new simulation differ.
+        `StaleCache` if a stored and a new simulation differ.
         """
         responses = np.full((len(thetas), len(self.model.channels), self.model.n_steps), np.nan)
         left = []
@@ -68,7 +62,9 @@ class StoredResponses:
             start = time.perf_counter()
             batch = self._new(thetas[rows])
             seconds = time.perf_counter() - start
-            self._store(thetas[rows], batch)
+            self.simulations += len(rows)
+            place = self.model.fingerprint, thetas[rows]
+            self._verified.store(*place, None, batch.reasons, batch.response, 0.0, self._run)
             responses[rows] = batch.response
             for row, reason in zip(rows, batch.reasons, strict=True):
                 reasons[row] = reason
@@ -76,21 +72,11 @@ class StoredResponses:
             self._size = max(self._least, min(4 * self._size, wanted))
         return SimulationBatch(responses, reasons)
 
-    def _store(self, thetas: np.ndarray, batch: SimulationBatch) -> None:
-        self.simulations += len(thetas)
-        run = self._run
-        self._verified.store(self.model.fingerprint, thetas, None, batch.reasons, batch.response, 0.0, run)
-
     def _new(self, thetas: np.ndarray) -> SimulationBatch:
         """New simulations, which complete the label."""
         label = self._verified.label
-        if self.pool is not None:
-            return simulate_batch(self.model, thetas, self.pool)
-        try:
-            with observing() as observer:
-                batch = simulate_batch(self.model, thetas)
-        finally:
+        with observed(label, self.pool, self._verified.complete):
+            batch = simulate_batch(self.model, thetas, self.pool)
+        if self.pool is None:
             label.has_changed_itself(label.changed(self.model))
-        if label.observes:
-            self._verified.complete(observer.result(label.known))
         return batch

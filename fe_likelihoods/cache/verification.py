@@ -5,14 +5,14 @@ identity still computes the same results. Therefore stored rows are compared wit
 (`fe_likelihoods.simulation.label`) decides how many:
 
 * The label is known in the file: two rows before the first row is used in a process (the row stored last, and a random
-  one of the requested rows), and one more for every 1000 rows used. A difference is an error, `StaleCache`: something
-  that the label does not contain has changed.
+  one of the requested rows), and a random one of every 100 rows used. A difference is an error, `StaleCache`: something
+  that the label does not contain has changed. A change in a share p of the parameter space is noticed with a
+  probability of 1 - (1 - p)^n after n rows, in one process or in several.
 * The label is unknown: enough rows, chosen to cover the parameter space, to detect a change in 5 % of the space with a
   probability of 95 % (59 rows, or all rows). If all agree, the label is added to the rows' generation (adoption). If
   one differs, a new generation begins: the earlier rows stay in the file and are not used. Both are logged.
 
-Simulations complete the label with the files that they open. Files of earlier releases have rows without a label; rows
-with the model's numbers of parameters, channels and samples are compared in the same way.
+Simulations complete the label with the files that they open.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
 Likelihoods of one model and file share their verified and stored rows (`fe_likelihoods.cache.labels.shared_trust`).
@@ -49,16 +49,19 @@ __all__ = ["StaleCache", "VerifiedCache"]
 logger = logging.getLogger(__name__)
 
 FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
-ROWS_PER_VERIFICATION = 1000
+ROWS_PER_VERIFICATION = 100
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
     "likelihood.simulator.cache.forget(*likelihood.simulator.cache_keys), or give the model a new version= "
     "(or depends_on=)"
 )
-MAX_FAILED_ATTEMPTS = 3  # to verify a row, before rows are used for a while without verification
-PAUSE_SECONDS = 60.0  # shortest pause of verification after failed attempts
-PAUSE_RATIO = 20.0  # shortest pause, relative to the duration of the last attempt
+_NOT_REPEATABLE = (
+    "The model is not repeatable: one more simulation at this point differs from the new one ({}). Make it depend on "
+    "its parameters alone, for example with a fixed seed"
+)
+PAUSE_SECONDS = 60.0  # in which rows are used without verification if no new simulation ends
+PAUSE_RATIO = 20.0  # shortest pause, relative to the duration of these simulations
 
 
 class StaleCache(ValueError):
@@ -81,17 +84,9 @@ class StaleCache(ValueError):
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
-    Another process verifies rows again, once for all copies of this object there.
-
-    Parameters
-    ----------
-    cache : SimulationCache
-        Its settings `verify` and `tolerance` apply.
-    model : Model
-        The model in its state when the likelihood is made.
-    pool : executor or None
-    label : ModelLabel
-        Label of the model.
+    Its settings `verify` and `tolerance` apply. `model` and `label` are those in whose state the likelihood was made;
+    simulations run in `pool`. `again` counts the simulations for verification. Another process verifies rows again,
+    once for all copies of this object there.
     """
 
     def __init__(self, cache: SimulationCache, model: Model, pool: Any, label: ModelLabel) -> None:
@@ -99,8 +94,8 @@ class VerifiedCache:
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust
-        self._again = Repetition(cache.file, trust)
-        self._adoption = Adoption(cache, trust, self._again)
+        self.again = Repetition(cache.file, trust)
+        self._adoption = Adoption(cache, trust, self.again)
         self._model: Any = None  # model of the last look-up in this process
         self._random = random.Random()  # separate, so that the user's random number streams do not change
 
@@ -109,21 +104,6 @@ class VerifiedCache:
 
     def __setstate__(self, state: tuple) -> None:
         self._set_up(*state)
-
-    @property
-    def compared(self) -> int:
-        """Number of rows that were compared with a new simulation."""
-        return self._again.compared
-
-    @property
-    def unverified(self) -> int:
-        """Number of rows that could not be compared, since the new simulation was stopped (not by the model)."""
-        return self._again.unverified
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of simulations for verification [s]."""
-        return self._again.seconds
 
     @property
     def label(self) -> ModelLabel:
@@ -193,12 +173,9 @@ class VerifiedCache:
     # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
-        """Rows from `SimulationCache.look_up`; some of them are verified.
+        """Rows from `SimulationCache.look_up`, some of them verified.
 
-        Raises
-        ------
-        StaleCache
-            If a stored row and a new simulation differ, although the label of the model is known.
+        `StaleCache` if a stored row and a new simulation differ, although the label of the model is known.
         """
         self._notice_other_model(run)
         while True:
@@ -306,14 +283,13 @@ class VerifiedCache:
                 if self.cache.are_stored([differing], error.theta[None], generation)[0]:
                     raise StaleCache(str(error), error.theta)
                 trust.stale = None
-            if trust.rows_in_pause < ROWS_PER_VERIFICATION and time.monotonic() < trust.pause_ends:
-                trust.rows_in_pause += n
+            if time.monotonic() < trust.pause_ends:
                 return True
             before = trust.served[table, fingerprint]
-            first = before == 0
-            # one row suffices for responses and shorter records if other rows of the same code were verified
-            first_rows = 1 if trust.served else FIRST_ROWS
-            due = first_rows if first else (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            due = (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
+            if not before:
+                # one row suffices for responses and shorter records if other rows of the same code were verified
+                due += 1 if trust.served else FIRST_ROWS
             start = time.monotonic()
             try:
                 compared = not due or self._verify(candidates(), due, fingerprint, run)
@@ -321,26 +297,21 @@ class VerifiedCache:
                 trust.stale = fingerprint, error
                 raise
             finally:
-                self._again.found.clear()
+                self.again.found.clear()
             if compared is None:
                 return False
-            if not compared:
-                trust.failed_attempts += 1
-                if trust.failed_attempts >= MAX_FAILED_ATTEMPTS:
-                    now = time.monotonic()
-                    trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
-                    trust.rows_in_pause = 0
-                return True  # verified with the next rows, or after a pause
-            if due:
-                trust.failed_attempts = 0
-            trust.served[table, fingerprint] = before + n
+            if compared:
+                trust.served[table, fingerprint] = before + n
+            else:
+                now = time.monotonic()
+                trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
             return True
 
     def _verify(self, rows: Iterable[StoredSimulation], due: int, fingerprint: str, run: VerifyingRun) -> bool | None:
         """Simulate the first `due` rows again; for each new simulation that is stopped, a further row instead.
 
-        Returns whether rows were compared; failures alone do not count if another simulation was stopped. None if a row
-        of another label differs, and a new generation has begun.
+        Whether rows were compared; failures alone do not count if another simulation was stopped. None if a row of
+        another label differs, and a new generation has begun.
         """
         rows, done, succeeded, reasons = iter(rows), 0, 0, []
         attempts = max(due, MAX_ATTEMPTS)
@@ -349,7 +320,7 @@ class VerifiedCache:
             if not chosen:
                 break
             attempts -= len(chosen)
-            for row, new in zip(chosen, self._again.simulate(fingerprint, chosen, run), strict=True):
+            for row, new in zip(chosen, self.again.simulate(fingerprint, chosen, run), strict=True):
                 if is_transient(new.reason):
                     reasons.append(new.reason)
                 elif self._differs(row, new, fingerprint, run):
@@ -365,82 +336,49 @@ class VerifiedCache:
                 len(reasons),
                 len(reasons) + done,
                 reasons[0],
-                "" if done else ". Rows are used without verification; the next ones are verified instead",
+                "" if done else ". Rows are used without verification for a while",
             )
         return bool(succeeded or (done and not reasons))
 
     def _differs(self, row: StoredSimulation, new: Simulated, fingerprint: str, run: VerifyingRun) -> bool:
         """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
-        if row.reason and new.reason:
+        label, tolerances = row.label, self.again.tolerances(run)
+        if label == -1:  # not read yet
+            generation = self._trust.generations.get(fingerprint)
+            label = 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
+        difference, change = _difference(row, new, run, tolerances[label])
+        if not difference:
             return False
-        label = self._label_of(row, fingerprint, run)
-        names = [channel.name for channel in run.model.channels]
-        if row.reason or new.reason:
-            was, now = (f"failed ({text})" if text else "succeeded" for text in (row.reason, new.reason))
-            difference, advice = f"the stored simulation {was}; simulated again, it {now}", ""
-            if row.reason:
-                advice = ". If failures depend on anything but the parameters, set retry_failures=True"
-        else:
-            found = difference_of(row.misfit, new, run, self._again.tolerances(run)[label])
-            if found is None:
-                return False
-            index, change = found
-            what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
-            difference = (
-                f"channel {names[index % len(names)]!r}, {what}: stored {row.misfit[index]:.17g}, simulated again "
-                f"{new.misfit[index]:.17g}"
-            )
-            advice = ""
-            if change < LARGEST_ROUNDING:
-                advice = (
-                    ". If the model is not exactly repeatable, for example on another machine, accept differences of "
-                    f"this size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
-                )
-        scatter = self._scatter(row.theta, new, run)
+        start = time.perf_counter()
+        (once_more,) = simulate_again(run, row.theta[None])
+        self.again.seconds += time.perf_counter() - start
+        scatter, spread = "", 0.0
+        if not is_transient(once_more.reason):
+            first = StoredSimulation(row.theta, new.misfit, new.reason)
+            scatter, spread = _difference(first, once_more, run, tolerances[0], "first")
         served = self._trust.served.total()
         self._trust.start_again()
         stored, labels = self._trust.stored, labels_of(self.cache.file, source_number(run.model.fingerprint))
-        of_others = {each.id for each in labels if stored and each.label != stored.label}
-        if label in of_others and not scatter:
+        if not scatter and label in {each.id for each in labels if stored and each.label != stored.label}:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
             self._adoption.begin(fingerprint, run)
             if not served:
                 return True
         point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
-        rest = f", and discard this run, which has used {served} rows" if served else ""
-        raise StaleCache(
-            f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
-            f"{difference}. {scatter or CHANGED}{rest}{'' if scatter else advice}",
-            row.theta,
-        )
-
-    def _label_of(self, row: StoredSimulation, fingerprint: str, run: VerifyingRun) -> int:
-        """Id of the label under which a row was stored; 0 if unknown."""
-        if row.label != -1:
-            return row.label
-        generation = self._trust.generations.get(fingerprint)
-        return 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
-
-    def _scatter(self, theta: np.ndarray, earlier: Simulated, run: VerifyingRun) -> str:
-        """Advice if one more simulation differs from the new simulation (no repeatable model); empty if they agree."""
-        start = time.perf_counter()
-        (new,) = simulate_again(run, theta[None])
-        self._again.seconds += time.perf_counter() - start
-        if is_transient(new.reason) or (earlier.reason and new.reason):
-            return ""
-        text = "The model is not repeatable: one more simulation at this point "
-        if earlier.reason or new.reason:
-            outcome = f"failed ({new.reason})" if new.reason else "succeeded"
-            return f"{text}{outcome}. Make it depend on its parameters alone, for example with a fixed seed"
-        found = difference_of(earlier.misfit, new, run, self._again.tolerances(run)[0])
-        if found is None:
-            return ""
-        index, change = found
-        return (
-            f"{text}gave {new.misfit[index]:.17g} instead of {earlier.misfit[index]:.17g}, a change of {change:.1e} of "
-            "the response. Make it depend on its parameters alone, for example with a fixed seed, or accept such "
-            f"differences with SimulationCache(path, tolerance={10.0 * change:.1e})"
-        )
+        text = f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
+        text += f"{difference}. {_NOT_REPEATABLE.format(scatter) if scatter else CHANGED}"
+        if served:
+            text += f", and discard this run, which has used {served} rows"
+        if spread:
+            text += f", or accept such differences with SimulationCache(path, tolerance={10.0 * spread:.1e})"
+        elif row.reason and not scatter:
+            text += ". If failures depend on anything but the parameters, set retry_failures=True"
+        elif 0.0 < change < LARGEST_ROUNDING and not scatter:
+            text += (
+                ". If the model is not exactly repeatable, for example on another machine, accept differences of this "
+                f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
+            )
+        raise StaleCache(text, row.theta)
 
     def _notice_other_model(self, run: VerifyingRun) -> None:
         """Verify all rows again if another model object was set."""
@@ -449,11 +387,30 @@ class VerifiedCache:
                 with self._trust.lock:
                     self._trust.start_again()
                     self._trust.stale = None
-                    self._again.found.clear()
+                    self.again.found.clear()
             self._model = run.model
 
     def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:
         """Indices in random order, but rows that have just been simulated again come first."""
-        again = {key[-1] for key in self._again.found}
+        again = {key[-1] for key in self.again.found}
         shuffled = self._random.sample(rows, len(rows))
         return sorted(shuffled, key=lambda row: thetas[row].tobytes() not in again) if again else shuffled
+
+
+def _difference(
+    earlier: StoredSimulation, new: Simulated, run: VerifyingRun, tolerance: float, origin: str = "stored"
+) -> tuple[str, float]:
+    """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
+    if earlier.reason or new.reason:
+        if earlier.reason and new.reason:
+            return "", 0.0
+        was, now = (f"failed ({text})" if text else "succeeded" for text in (earlier.reason, new.reason))
+        return f"it {was}; simulated again, it {now}", 0.0
+    found = difference_of(earlier.misfit, new, run, tolerance)
+    if found is None:
+        return "", 0.0
+    index, change = found
+    names = [channel.name for channel in run.model.channels]
+    what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
+    values = f"{origin} {earlier.misfit[index]:.17g}, simulated again {new.misfit[index]:.17g}"
+    return f"channel {names[index % len(names)]!r}, {what}: {values}", change

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..cache.file import CacheFile
-from ..cache.salvage import number_or_unknown, salvage
+from ..cache.salvage import salvage
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.likelihood import FELikelihood
 
@@ -115,10 +115,7 @@ def salvage_cache(file: Path, out: Path) -> str:
     cache = SimulationCache(out)
     found = salvage(file.resolve(), cache.file.connection())
     cache.close()
-    return (
-        f"{found.rows} simulations copied to {out}, {number_or_unknown(found.lost)} could not be read; "
-        f"{found.responses} responses copied, {number_or_unknown(found.lost_responses)} could not be read"
-    )
+    return f"{found.simulations} simulations and {found.responses} responses copied to {out}; others could not be read"
 
 
 def latest_stored(likelihood: FELikelihood) -> np.ndarray | None:

@@ -1,20 +1,36 @@
-"""The model of a simulator: whether it is still the same, and which stored simulations are its own."""
+"""The model of a simulator: whether it is still the same, and which stored simulations are its own.
 
+Results from two states of a model must not be mixed, neither in memory nor on disk, as when a value is set between two
+batches or a file is edited. So the model's label (`fe_likelihoods.simulation.label`) and fingerprint are compared
+before and after simulations, in about 1 % of the time. User code may change values itself, such as a counter or a table
+of earlier results. Therefore a difference alone is no error: the first and the latest simulation are repeated, and the
+model counts as unchanged if the results are the same.
+"""
+
+import copy
+import os
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun
-from ..cache.guard import EarlierPoint, ModelGuard
+from ..cache.comparison import VerifyingRun, difference_of, is_transient, response_tolerance, simulate_again
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
+from ..simulation.by_value import is_arriving
+from ..simulation.faults import ChangedModel
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model
 from ..simulation.opened import Opened
 
 __all__ = ["CheckedModel"]
+
+_SHARE_OF_TIME = 0.01  # for comparisons
+_NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
+_OF_A_PROCESS = ("environment ", "library", "package ", "python")  # label items that may differ between processes
+_ROWS_PER_REPETITION = 100  # simulations between two repetitions if only `_changing` items have changed
 
 
 class CheckedModel:
@@ -35,20 +51,40 @@ class CheckedModel:
         Rows of the model in the cache on disk, which are verified before they are used.
     has_results : bool
         Whether results of the model are known in this process.
+    unchecked : list of (n, n_structural) ndarray
+        Parameters simulated since the last comparison of the model.
     """
 
     def __init__(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
-        self.has_results = False
-        self._begin(model, statistic, cache, pool)
+        self._set_up(model, statistic, cache, pool)
 
-    def _begin(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
+    def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
         label = ModelLabel(model, statistic)
         self.rows = None if cache is None else VerifiedCache(cache, model, pool, label)
-        self._label = label if self.rows is None else self.rows.label  # an equal one, which likelihoods share
-        self._guard = ModelGuard(model, self._label)
+        self._label = label
+        self._fingerprint = model.fingerprint
+        self._known = copy.copy(self.label)  # a copy, because the label of stored rows never changes
+        self._changing = self._known.changing  # label items that change without an effect on results
+        self._repeated = 0
+        self._begin()
 
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"has_results": False}
+    def _begin(self) -> None:
+        self.has_results = False
+        self.unchecked: list[np.ndarray] = []
+        self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
+        self._rows_since = 0  # since the last repetition
+        self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
+        self._was_sent = False  # from another process, by a pool whose workers import the code
+
+    def __getstate__(self) -> tuple:
+        state = self.rows, self._label, self._fingerprint, self._known, self._changing, self._repeated
+        return *state, os.getpid()
+
+    def __setstate__(self, state: tuple) -> None:
+        *state, pid = state
+        self.rows, self._label, self._fingerprint, self._known, self._changing, self._repeated = state
+        self._begin()
+        self._was_sent = pid != os.getpid() and not is_arriving()  # by value
 
     @property
     def label(self) -> ModelLabel:
@@ -58,12 +94,7 @@ class CheckedModel:
     @property
     def compared(self) -> int:
         """Number of earlier simulations that were compared with a new one."""
-        return self._guard.compared + (0 if self.rows is None else self.rows.compared)
-
-    @property
-    def unchecked(self) -> list[np.ndarray]:
-        """Parameters (n, n_structural) of the simulations since the last comparison of the model."""
-        return self._guard.unchecked
+        return self._repeated + (0 if self.rows is None else self.rows.again.compared)
 
     def complete(self, opened: Opened | None) -> None:
         """Add the files that simulations opened to the model's label."""
@@ -77,14 +108,15 @@ class CheckedModel:
         if self.rows is not None and other.rows is not None:
             self.rows.share_trust(other.rows)
 
-    def before(self, run: VerifyingRun, earlier: Callable[[], list[EarlierPoint]]) -> None:
-        """Compare the model before simulations, if that is due.
+    def before(self, run: VerifyingRun, earlier: Callable[[], list]) -> None:
+        """Compare the model before simulations, unless the last comparison was too recent.
 
         Parameters
         ----------
         run : VerifyingRun
         earlier : callable
-            Returns a known simulation that can be run again, if the model has run none in this process.
+            Returns a known simulation, parameters and statistics, that can be repeated; called if the model has run
+            none in this process, and only rows of the disk are known.
 
         Raises
         ------
@@ -92,29 +124,110 @@ class CheckedModel:
             If the model has changed; the simulations at `unchecked` may be from before or after the change.
         """
         self._know_more()
-        if not self._guard.points:
-            if self.has_results:  # only rows of the disk are known
-                self._guard.points += earlier()
-            else:
-                self._label_again(run)
-        self._guard.before(run)
+        if not self._points:
+            if self.has_results:
+                self._points += earlier()
+            elif self._known.changed(run.model) <= self._changing:
+                self._known.renew(run.model)
+            else:  # nothing was used yet: the model is labelled as it is now
+                self._require_what_was_sent(run.model)
+                self._set_up(run.model, run.statistic, None if self.rows is None else self.rows.cache, run.pool)
+        self._is_due = time.monotonic() >= self._not_before
+        if self._is_due:
+            self._require_same(run)
+            pause = max(0.0, 2.0 * self._last_seconds - _NO_TIME) / _SHARE_OF_TIME
+            self._not_before = time.monotonic() + pause
 
     def after(
         self, run: VerifyingRun, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float, last: bool
     ) -> bool:
-        """Compare the model after simulations, if that is due; see `ModelGuard.after`."""
+        """Compare the model after simulations, if `before` did and, with a pool, they took long; whether it compared.
+
+        Parameters
+        ----------
+        run : VerifyingRun
+        thetas, misfit, reasons
+            Parameters (n, n_structural), statistics (n, n_numbers) and reasons of failures.
+        seconds : float
+            Wall time [s]; with a pool that runs without interruption, the time since the last comparison.
+        last : bool
+            Whether no other simulations run. If others run, the model is not compared now.
+
+        Raises
+        ------
+        ChangedModel
+            As for `before`.
+        """
         self._know_more()
-        return self._guard.after(run, thetas, misfit, reasons, seconds, last)
+        self.unchecked.append(thetas)
+        self._rows_since += len(thetas)
+        here = run.pool is None
+        due = self._is_due and last and (here or _SHARE_OF_TIME * seconds >= self._last_seconds)
+        if due:
+            self._require_same(run, simulated_here=here)
+        succeeded = [row for row, reason in enumerate(reasons) if not reason]
+        for row in succeeded[:1] + succeeded[-1:] if not self.unchecked or not self._points else []:
+            self._points[1:] = [(thetas[row].copy(), misfit[row].copy())]
+        return due
+
+    def _require_what_was_sent(self, model: Model) -> None:
+        """Raise `ChangedModel` if this object was pickled in another process, where the code has other values."""
+        changed = self._known.changed(model) - self._changing
+        found = sorted(name for name in changed if not name.startswith(_OF_A_PROCESS))
+        if self._was_sent and found:
+            raise ChangedModel(
+                f"the {type(model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
+                "differ): a module that is imported here has other contents or values than where the likelihood was "
+                "made. Give the pool to the likelihood, FELikelihood(..., pool=...), which sends code and values, or "
+                "make a new likelihood"
+            )
 
     def _know_more(self) -> None:
         """Include what later simulations have opened and changed in the comparison."""
-        self._guard.known.add(self.label.opened)
-        self._guard.changing |= self.label.changing
+        self._known.add(self.label.opened)
+        self._changing |= self.label.changing
 
-    def _label_again(self, run: VerifyingRun) -> None:
-        """Label the model as it is now, if it has changed since the likelihood was made and nothing was used yet."""
-        if self._guard.known.changed(run.model) <= self._guard.changing:
-            self._guard.known.renew(run.model)
-        else:
-            cache = None if self.rows is None else self.rows.cache
-            self._begin(run.model, run.statistic, cache, run.pool)
+    def _require_same(self, run: VerifyingRun, simulated_here: bool = False) -> None:
+        """Raise `ChangedModel` if the model has changed, except for values that it changes itself."""
+        start = time.monotonic()
+        same_fingerprint = run.model.fingerprint == self._fingerprint
+        changed = self._known.changed(run.model)
+        self._last_seconds = time.monotonic() - start
+        if same_fingerprint and not changed:
+            self.unchecked.clear()
+            return
+        why = "its fingerprint differs"
+        if same_fingerprint:
+            few = self._rows_since < _ROWS_PER_REPETITION or not self._points
+            if changed <= self._changing and few and not (simulated_here and not self._points):
+                return
+            # the first simulation here may have changed values that it uses
+            if self._repeat(run) if self._points else simulated_here:
+                self._changing |= changed
+                self._known.has_changed_itself(changed)
+                self._known.renew(run.model)
+                self._rows_since = 0
+                self.unchecked.clear()
+                return
+            why = f"different: {', '.join(sorted(changed)[:3])}"
+            why += ", and an earlier simulation gives another result" if self._points else ""
+        raise ChangedModel(
+            f"the {type(run.model).__name__} has changed since the likelihood was made ({why}): "
+            "a value or file that it uses was changed, or another model was set. Its simulations cannot be stored with "
+            "the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a parameter"
+        )
+
+    def _repeat(self, run: VerifyingRun) -> bool:
+        """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
+        thetas = np.array([theta for theta, _ in self._points])
+        tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
+
+        def same_as(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
+            new = simulate_again(run, thetas)
+            self._repeated += len(thetas)
+            pairs = zip(earlier, new, strict=True)
+            agree = (is_transient(n.reason) or not (n.reason or difference_of(e, n, run, tolerance)) for e, n in pairs)
+            return all(agree), [each.misfit for each in new]
+
+        same, repeated = same_as([misfit for _, misfit in self._points])
+        return same or not same_as(repeated)[0]

@@ -19,19 +19,9 @@ __all__ = ["combined_digest", "data_digests"]
 
 
 def data_digests(model: Model, measurements: Measurements) -> list[str]:
-    """Digests of independent parts of the measurements: one per measured event, or one for all measurements.
+    """Digests of independent parts of the measurements over the excitation of a model.
 
-    Parameters
-    ----------
-    model : Model
-        Model of the measurements.
-    measurements : Measurements
-        Measurements over its excitation.
-
-    Returns
-    -------
-    list of str
-        One per measured event if the excitation is `Events` and nothing was measured in the pauses; otherwise one.
+    One per measured event if the excitation is `Events` and nothing was measured in the pauses; otherwise one.
     """
     there = ~np.isnan(measurements.values)
     whole = [(-np.inf, np.inf)]

@@ -41,14 +41,7 @@ class _Point:
 
 
 class _Part:
-    """The points that wait for the simulations of one likelihood.
-
-    Parameters
-    ----------
-    likelihood : FELikelihood
-    columns : list of int
-        Indices of its parameters among the posterior's parameters.
-    """
+    """The points that wait for the simulations of one likelihood, whose parameters are `columns` of the points."""
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
         self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
@@ -107,13 +100,10 @@ class EvaluationQueue:
         return None if None in sizes else sum(sizes)
 
     def submit(self, coords: Any) -> list[int]:
-        """Submit points, without waiting for them.
+        """Submit points (n, ndim), without waiting for them.
 
-        Parameters
-        ----------
-        coords : (n, ndim) array_like
-            Points. Those outside the support of the prior, with impossible noise parameters, or whose simulations are
-            cached in memory, are finished at once.
+        Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached in
+        memory, are finished at once.
 
         Returns
         -------
@@ -167,20 +157,14 @@ class EvaluationQueue:
         self._require_open()
         if not self._pending:
             raise RuntimeError("no point is pending: submit points before collect()")
-        try:
-            self._receive(wait=False)
-            while not self._finished:
-                if self._error is not None:
-                    raise self._error
-                if not self._begin_unstarted():
-                    self._receive(wait=True)
-        except BaseException:
-            self._write()
-            raise
+        self._receive(wait=False)
+        while not self._finished:
+            if self._error is not None:
+                raise self._error
+            if not self._begin_unstarted():
+                self._receive(wait=True)
         self._collected, self._finished = self._finished, []
         self._pending -= len(self._collected)
-        if not self._pending:
-            self._write()
         return self._collected
 
     def ended(self) -> list[tuple[int, float]]:
@@ -211,10 +195,6 @@ class EvaluationQueue:
     def _require_open(self) -> None:
         if self._closed:
             raise RuntimeError("the queue is closed: make another one with posterior.evaluation_queue()")
-
-    def _write(self) -> None:
-        for part in self._parts:
-            part.simulator.flush()
 
     def _finish(self, point: _Point, log_likelihood: float) -> None:
         self._finished.append((point.ticket, point.log_prior + log_likelihood))
@@ -249,11 +229,9 @@ class EvaluationQueue:
         """Send the simulations of points to the pool."""
         if not points:
             return
-        thetas = part.thetas(points)
-        keys, distinct = distinct_keys(thetas)
-        first = [distinct.index(place) for place in range(len(keys))]
+        keys, distinct = distinct_keys(part.thetas(points))
         try:
-            started = part.simulator.start(keys, thetas[first], self._responses, self._arrived)
+            started = part.simulator.start(keys, self._responses, self._arrived)
         except Exception as error:  # raised by `collect`, as in a call of the posterior
             self._error = self._error or error
             part.unstarted.append(points)
@@ -328,5 +306,3 @@ def _cache_rest(simulator: Simulator, left: list[RunningSimulation]) -> None:
             simulator.receive([running[future]])
     except Exception as error:
         logger.warning("simulations of a closed queue are not stored: %s", error)
-    finally:
-        simulator.flush()

@@ -49,28 +49,20 @@ class FailureLog:
     parameter_names : sequence of str
         Names of the structural parameters.
     max_share : float
-        Largest share of failed simulations that `check` accepts, in [0, 1].
+        Largest share of failed simulations that `check` accepts, in [0, 1]; ValueError for other numbers.
 
     Attributes
     ----------
-    outcomes : int
-        Simulations with a known outcome: run here, read from the disk, or recalled.
-    count : int
-        Number of failures.
+    outcomes, count, transient : int
+        Simulations with a known outcome (run here, read from the disk, or recalled); failures; failures whose cause is
+        not the model.
     records : list of dict
         ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of the model and of the first 1000
         others, with ``"seconds"`` where the duration is known, and ``"transient": True`` where the cause is not the
         model, so that a later run simulates the point again (`fe_likelihoods.simulation.faults`).
-    transient : int
-        Number of failures whose cause is not the model.
     reasons : collections.Counter
         Number of failures per reason. After the first 100 reasons, further ones are counted by their text without
         numbers (`reason_without_numbers`), and after 100 of these in two groups: failures of the model and others.
-
-    Raises
-    ------
-    ValueError
-        If `max_share` is outside [0, 1].
     """
 
     def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.comparison import VerifyingRun
-from ..cache.guard import EarlierPoint
-from ..cache.memory import MemoryCache, ResponseMemory
+from ..cache.memory import MemoryCache, ResponseMemory, thetas_of
 from ..cache.verification import StaleCache
 from ..simulation.model import SimulationBatch, misfit_of_responses, most_responses
 from .checked_model import CheckedModel
@@ -60,26 +59,14 @@ class Requested(NamedTuple):
         response: np.ndarray | None = None,
     ) -> "Requested":
         """A request whose statistics are in memory where `known`."""
-        n = len(keys)
-        thetas = np.frombuffer(b"".join(keys), dtype=float).reshape(n, n_structural).copy()
+        n, thetas = len(keys), thetas_of(keys, n_structural)
         return cls(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
 
 
 class KnownSimulations:
-    """Results of one model in memory and on disk.
+    """Results of one model in memory and on disk, where the statistics are stored under the declared identity `key`.
 
-    Parameters
-    ----------
-    key : str
-        Declared identity of the statistics, under which they are stored on disk.
-    memory : MemoryCache
-        Statistics in memory.
-    responses : ResponseMemory
-        Responses in memory.
-    checked : CheckedModel
-        Gives access to the rows on disk.
-    failures : FailureLog
-        Where failures that are found are recorded.
+    `checked` gives access to the rows on disk; failures that are found are recorded in `failures`.
     """
 
     def __init__(
@@ -94,11 +81,11 @@ class KnownSimulations:
         self.memory.clear()
         self.responses.clear()
 
-    def earlier_points(self, run: VerifyingRun) -> list[EarlierPoint]:
-        """A successful simulation in memory, if there is one, to be run again."""
+    def earlier_points(self, run: VerifyingRun) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
         thetas = self.memory.successes(len(run.model.parameter_names))[:1]
         statistics, _ = self.memory.look_up([theta.tobytes() for theta in thetas], run.n_numbers)
-        return list(map(EarlierPoint, thetas, statistics))
+        return list(zip(thetas, statistics, strict=True))
 
     def fill(self, requested: Requested, run: VerifyingRun) -> None:
         """Fill in what is known; some rows of the disk may be simulated again for verification."""

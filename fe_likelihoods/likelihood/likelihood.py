@@ -69,8 +69,8 @@ class FELikelihood:
         pickled. The default holds 1300 responses of two channels of 12 800 samples, more than a run with a guide needs.
     cache : SimulationCache or path, optional
         Cache on disk, used after the one in memory: simulations of earlier runs and of other processes are not run
-        again, and a killed run loses only its last few seconds. With a pool, simulations are stored as they arrive,
-        about once per second. Without one, or with a pool that has ``map`` only, a batch is simulated in chunks of a
+        again. With a pool, simulations are stored as they arrive, so that a killed run loses only what runs. Without
+        one, or with a pool that has ``map`` only, a batch is simulated in chunks of a
         few seconds that are stored one by one. The responses of `simulate` are stored as well, up to the
         `max_response_bytes` of the cache.
     max_failure_share : float
@@ -334,26 +334,22 @@ class FELikelihood:
             -inf where a simulation fails, where the noise parameters are impossible (nothing is simulated there) and
             where x is not finite; never NaN.
         """
-        points = as_points(x, self.parameter_names)
-        if points.ndim == 1:
-            return self._of_point(points)
-        possible = self.possible(points)
-        result = np.full(len(points), -np.inf)
-        if possible.any():
-            misfit = self.simulator.statistics(points[possible, : self.simulator.n_structural])
-            result[possible] = self.of_statistics(points[possible], misfit)
-        return result
-
-    def _of_point(self, point: np.ndarray) -> float:
-        """Log-likelihood of one point (ndim,); `possible` is evaluated only if its simulation is not cached."""
-        n, row = self.simulator.n_structural, point[None]
-        misfit = self.simulator.in_memory(point[:n])
+        points, n = as_points(x, self.parameter_names), self.simulator.n_structural
+        if points.ndim == 2:
+            possible = self.possible(points)
+            result = np.full(len(points), -np.inf)
+            if possible.any():
+                misfit = self.simulator.statistics(points[possible, :n])
+                result[possible] = self.of_statistics(points[possible], misfit)
+            return result
+        # most calls of many samplers: whether one point is possible is asked only if its simulation is not cached
+        row, misfit = points[None], self.simulator.in_memory(points[:n])
         if misfit is None:
             misfit = self.simulator.statistics(row[:, :n], lambda: bool(self.possible(row)[0]))
         (value,) = self.noise.log_likelihood(misfit, self.n_samples, row[:, n:])
-        if abs(value) < np.inf:
-            return float(value)
-        return float(self.of_statistics(row, misfit)[0]) if self.possible(row)[0] else -np.inf
+        if not abs(value) < np.inf:
+            value = self.of_statistics(row, misfit)[0] if self.possible(row)[0] else -np.inf
+        return float(value)
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""

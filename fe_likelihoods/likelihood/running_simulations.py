@@ -29,10 +29,8 @@ class RunningSimulation:
 
     Attributes
     ----------
-    key : bytes
-        Key of the structural parameters, see `distinct_keys`.
-    theta : (n_structural,) float
-        Structural parameters.
+    key, theta : bytes, (n_structural,) float
+        Structural parameters, and their key as in `distinct_keys`.
     responses : bool
         Whether its response was requested.
     future : Future or None
@@ -71,12 +69,8 @@ def take_all(arrived: SimpleQueue, wait: bool) -> list:
 class RunningRequests:
     """Groups of simulations for responses; each group is waited for as a whole.
 
-    Without a pool that accepts single simulations, nothing is simulated here, and all requests count as ended.
-
-    Parameters
-    ----------
-    simulator : Simulator
-        It must cache the responses in memory until they are used.
+    Without a pool that accepts single simulations, nothing is simulated here, and all requests count as ended. The
+    simulator must cache the responses in memory until they are used.
     """
 
     def __init__(self, simulator: Any) -> None:
@@ -92,12 +86,10 @@ class RunningRequests:
         self._left[name] = set()
         if not self._simulator.streams:
             return
-        keys, distinct = distinct_keys(thetas)
-        first = [distinct.index(place) for place in range(len(keys))]
-        new = np.flatnonzero(~self._simulator.has_responses(keys))
-        if len(new):
-            wanted = [keys[place] for place in new], thetas[first][new]
-            self._left[name].update(self._simulator.start(*wanted, True, self._arrived))
+        keys, _ = distinct_keys(thetas)
+        new = [key for key, is_there in zip(keys, self._simulator.has_responses(keys), strict=True) if not is_there]
+        if new:
+            self._left[name].update(self._simulator.start(new, True, self._arrived))
 
     def wait(self) -> list[Hashable]:
         """Wait until a request has ended; returns the names of all that have, in the order in which they began.
@@ -119,4 +111,3 @@ class RunningRequests:
         self._left.clear()
         if left:
             self._simulator.leave(left, self._arrived, running=False)
-        self._simulator.flush()

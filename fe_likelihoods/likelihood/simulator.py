@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..cache.comparison import VerifyingRun, observed
-from ..cache.memory import FinishedRows, MemoryCache, ResponseMemory, RowBuffer, distinct_keys
+from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
 from ..cache.simulation_cache import SimulationCache
 from ..noise.statistics import Statistic, statistic_width
 from ..priors.points import as_rows
@@ -63,7 +63,7 @@ _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk
 
 
 def reported(likelihood: Any, name: str) -> Any:
-    """A report entry that is read as an attribute of a likelihood; AttributeError for any other name."""
+    """An entry of the report that is read as an attribute of a likelihood; AttributeError for any other name."""
     if name not in (*COUNTS, "failures", "failure_reasons"):
         moved = name[0] != "_" and hasattr(vars(likelihood).get("simulator"), name)
         hint = f": it belongs to the simulator, as likelihood.simulator.{name}" if moved else ""
@@ -78,7 +78,6 @@ class _Pool:
         self.owner, self.lock = os.getpid(), threading.RLock()
         self.running: dict[tuple[bytes, bool], RunningSimulation] = {}
         self.function: tuple[Any, bool, Callable] | None = None  # model, whether responses are returned, what is sent
-        self.unwritten = RowBuffer()
         self.counted_until = self.compared_at = 0.0  # of the wall time [s]
 
 
@@ -98,33 +97,22 @@ class Simulator:
     time_shifts : mapping of str to float, optional
         Largest unknown time shifts of channels [s].
     pool, cache, memory_rows, memory_bytes, max_failure_share
-        As for `FELikelihood`.
+        As for `FELikelihood`, which also has the errors that are raised.
 
     Attributes
     ----------
     measured : (n_channels, n_steps) float, or Comparison
         What responses are compared with: the measured values, or a `Comparison` where samples are missing.
-    simulations : int
-        Simulations run by this object in this process.
-    cache_hits : int
-        Rows whose statistics were cached, in memory or on disk.
-    disk_hits : int
-        Those cache hits that came from the cache on disk.
+    simulations, cache_hits, disk_hits : int
+        Simulations run by this object in this process; rows whose statistics were cached; those read from the disk.
     failures : FailureLog
         Failed simulations, including failures known from the cache on disk.
-    memory_cache : MemoryCache
-        The statistics that are cached in memory.
-    response_memory : ResponseMemory
-        The responses that are cached in memory.
+    memory_cache, response_memory : MemoryCache, ResponseMemory
+        The statistics and the responses that are cached in memory.
     chunk_size : int
         Number of simulations between two writes to the disk, for simulation in chunks; adapted to their duration.
     when_simulated : callable or None
         Called with the number of simulations that have ended, in this process only.
-
-    Raises
-    ------
-    ValueError
-        As for `FELikelihood`.
     """
 
     def __init__(
@@ -167,7 +155,7 @@ class Simulator:
     def seconds(self) -> float:
         """Wall time of the simulations [s], including verification."""
         rows = self._checked.rows
-        return self._seconds + (0.0 if rows is None else rows.seconds)
+        return self._seconds + (0.0 if rows is None else rows.again.seconds)
 
     @property
     def verifications(self) -> int:
@@ -177,7 +165,7 @@ class Simulator:
     @property
     def unverified(self) -> int:
         """Number of rows that could not be compared, because the new simulation was stopped (`TransientReason`)."""
-        return 0 if self._checked.rows is None else self._checked.rows.unverified
+        return 0 if self._checked.rows is None else self._checked.rows.again.unverified
 
     def report(self) -> dict:
         """Summary of the simulations that were requested in this process, see `Posterior.report`."""
@@ -224,17 +212,9 @@ class Simulator:
     # requests -----------------------------------------------------------------------------------------------------
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals, without unknown time shifts: the first columns of `statistics`.
+        """Sums of squared residuals (n, n_channels), without unknown time shifts: the first columns of `statistics`.
 
-        Parameters
-        ----------
-        thetas : (n, n_structural) float
-            Structural parameters only.
-
-        Returns
-        -------
-        (n, n_channels) float
-            [SI unit of the channel, squared]; NaN where there is no usable simulation.
+        In the squared SI unit of the channel; NaN where there is no usable simulation.
         """
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
@@ -267,48 +247,32 @@ class Simulator:
             if finite.any():
                 result[finite] = self.statistics(thetas[finite], is_possible)
             return result
-        # few calls of numpy, because a cached row has to cost less than 10 microseconds
         keys, distinct = distinct_keys(thetas)
-        misfit, known = self.memory_cache.look_up(keys, self.n_numbers)
-        if all(known):
-            self.cache_hits += len(thetas)
-        else:
-            new = ~np.array(known)
-            left = [key for key, is_new in zip(keys, new, strict=True) if is_new]
-            requested = Requested.of(left, self.n_structural, misfit[new], np.zeros(len(left), dtype=bool))
-            self._obtain(requested, is_possible)
-            misfit[new] = requested.misfit
-            counts = np.bincount(distinct)  # of the rows that were requested
-            self.disk_hits += int(counts[new][requested.on_disk].sum())
-            self.cache_hits += int(counts[~new].sum() + counts[new][requested.cached].sum())
+        misfit, cached = self.look_up(keys, distinct, on_disk=True)
+        left = np.flatnonzero(~cached)
+        if len(left) and (is_possible is None or is_possible()):
+            misfit[left] = [new.misfit for new in self._results([keys[row] for row in left], responses=False)]
         return misfit if len(keys) == len(thetas) else misfit[distinct]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses of the model; they and their statistics are cached.
+        """Responses of the model at structural parameters (n, n_structural); they and their statistics are cached.
 
         Duplicates are simulated once, and cached responses are reused. A point whose statistics are cached without its
-        response is simulated again, unless its simulation failed.
-
-        Parameters
-        ----------
-        thetas : (n, n_structural) float
-            Structural parameters only.
+        response is simulated again, unless its simulation failed. Raises the errors of `statistics`.
 
         Returns
         -------
         SimulationBatch
             Responses (n, n_channels, n_steps) [SI], NaN where there is no usable simulation, and the reasons.
-
-        Raises
-        ------
-        TooManyFailures, ChangedModel, StaleCache
-            As for `statistics`.
         """
         thetas = as_rows(thetas, self.model.parameter_names)
         finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
         keys, distinct = distinct_keys(thetas[finite])
         requested = self._requested_responses(keys)
-        self._obtain(requested)
+        self._known.fill(requested, self._run)
+        left = np.flatnonzero(~requested.cached)
+        for row, new in zip(left, self._results([keys[row] for row in left], responses=True), strict=True):
+            requested.reasons[row], requested.response[row] = new.reason, new.response
         counts = np.bincount(distinct, minlength=len(keys))
         self.disk_hits += int(counts[requested.on_disk].sum())
         self.cache_hits += int(counts[requested.cached].sum())
@@ -350,26 +314,23 @@ class Simulator:
         return misfit
 
     def look_up(self, keys: list[bytes], distinct: list[int], on_disk: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Cached statistics; missing ones are not simulated.
+        """Cached statistics (n, n_numbers) of distinct keys, and whether they are cached (n,); nothing is simulated.
 
         Parameters
         ----------
         keys : list of n bytes
-            Distinct, see `distinct_keys`.
+            See `distinct_keys`.
         distinct : list of int
             For every requested row, the index of its key, for the counts.
         on_disk : bool
             Whether to look in the cache on disk as well. Some of its rows may be simulated again for verification.
-
-        Returns
-        -------
-        misfit : (n, n_numbers) float
-            NaN where nothing is cached and where the simulation failed.
-        cached : (n,) bool
         """
         misfit, known = self.memory_cache.look_up(keys, self.n_numbers)
-        known, counts = np.array(known, dtype=bool), np.bincount(distinct, minlength=len(keys))
-        if on_disk and not known.all():
+        if all(known):
+            self.cache_hits += len(distinct)
+            return misfit, np.ones(len(keys), dtype=bool)
+        known, counts = np.array(known), np.bincount(distinct, minlength=len(keys))
+        if on_disk:
             left = [key for key, is_known in zip(keys, known, strict=True) if not is_known]
             requested = Requested.of(left, self.n_structural, misfit[~known], np.zeros(len(left), dtype=bool))
             self._known.fill(requested, self._run)
@@ -387,16 +348,10 @@ class Simulator:
         Parameters
         ----------
         thetas : (n, n_structural) float
-            Structural parameters only.
         statistics : (n, n_numbers) float
-            What `statistics` returned for them.
+            What `statistics` returned for them; ValueError for another shape.
         reasons : sequence of n str
             Reasons of failures; empty where the simulation succeeded.
-
-        Raises
-        ------
-        ValueError
-            If the numbers of rows differ, or the statistics are of another noise.
         """
         thetas, statistics = as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
         if statistics.shape != (len(thetas), self.n_numbers) or len(reasons) != len(thetas):
@@ -416,31 +371,23 @@ class Simulator:
         response = np.full((len(keys), len(self.model.channels), self.model.n_steps), np.nan)
         return Requested.of(keys, self.n_structural, misfit, np.array(known, dtype=bool), response)
 
-    def _obtain(self, requested: Requested, is_possible: Callable[[], bool] | None = None) -> None:
-        """Fill in what was requested, from the caches or by simulation."""
-        self._known.fill(requested, self._run)
-        left = np.flatnonzero(~requested.cached)
-        if not len(left) or (is_possible is not None and not is_possible()):
-            return
+    def _results(self, keys: list[bytes], responses: bool) -> list[Simulated]:
+        """Results of new simulations."""
         arrived: SimpleQueue = SimpleQueue()
-        keys, responses = [requested.keys[row] for row in left], requested.response is not None
-        started = self.start(keys, requested.thetas[left], responses, arrived)
-        waiting = dict(zip(started, left, strict=True))
+        started = self.start(keys, responses, arrived) if keys else []
+        waiting = dict.fromkeys(started)
         try:
             while waiting:
                 for running in self.wait(waiting, arrived):
                     if running.error is not None:
                         raise running.error
-                    row, result = waiting.pop(running), running.result
-                    requested.misfit[row], requested.reasons[row] = result.misfit, result.reason
-                    if responses:
-                        requested.response[row] = result.response
+                    del waiting[running]
                 if waiting:
                     self.check_failures()
         except BaseException:
             self.leave(list(waiting), arrived, running=True)
             raise
-        self.flush()
+        return [running.result for running in started]
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -457,9 +404,7 @@ class Simulator:
         """Requests for responses, several at once; `simulate` then finds the responses in the cache."""
         return RunningRequests(self)
 
-    def start(
-        self, keys: Sequence[bytes], thetas: np.ndarray, responses: bool, arrived: SimpleQueue
-    ) -> list[RunningSimulation]:
+    def start(self, keys: Sequence[bytes], responses: bool, arrived: SimpleQueue) -> list[RunningSimulation]:
         """Submit simulations to the pool, unless they run already; returns without waiting for them.
 
         Without a pool that takes single items, they are run by `wait`.
@@ -467,9 +412,7 @@ class Simulator:
         Parameters
         ----------
         keys : sequence of n bytes
-            Distinct, see `distinct_keys`.
-        thetas : (n, n_structural) float
-            Structural parameters.
+            Keys of structural parameters, distinct, see `distinct_keys`.
         responses : bool
             Whether the responses are requested.
         arrived : SimpleQueue
@@ -485,6 +428,7 @@ class Simulator:
         TooManyFailures, ChangedModel
             As for `statistics`.
         """
+        thetas = thetas_of(keys, self.n_structural)
         if not self.streams:
             return [RunningSimulation(key, theta, responses) for key, theta in zip(keys, thetas, strict=True)]
         self._check_before()
@@ -518,22 +462,8 @@ class Simulator:
     def wait(self, waiting: Collection[RunningSimulation], arrived: SimpleQueue) -> list[RunningSimulation]:
         """Wait until some simulations have ended, which are then counted and cached; see `receive`.
 
-        Parameters
-        ----------
-        waiting : collection of RunningSimulation
-            All simulations of one `start`; unless they run in a pool, a first part of them is run here.
-        arrived : SimpleQueue
-            As for `start`.
-
-        Returns
-        -------
-        list of RunningSimulation
-            The ended simulations, with `result` or `error` set.
-
-        Raises
-        ------
-        TooManyFailures, ChangedModel
-            As for `statistics`.
+        Unless they run in a pool, a first part of `waiting`, all simulations of one `start`, is run here. Returns the
+        simulations that have ended, with `result` or `error` set; raises the errors of `start`.
         """
         if self.streams:
             ended = take_all(arrived, wait=True)
@@ -550,7 +480,6 @@ class Simulator:
             else:
                 values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
         self._record(chosen, thetas, values, reasons, time.perf_counter() - start)
-        self.flush()
         # the size grows by steps: the first simulations may be failures that took no time
         seconds = time.perf_counter() - start
         self.chunk_size = min(4 * len(chosen), 1 + int(_SECONDS_PER_CHUNK * len(chosen) / seconds))
@@ -559,10 +488,7 @@ class Simulator:
     def receive(self, ended: Sequence[RunningSimulation]) -> None:
         """Count and cache simulations that have ended in the pool, and record failures; sets `result` or `error`.
 
-        Raises
-        ------
-        ChangedModel
-            If the model has changed; these simulations, and all since the last comparison, are not stored.
+        `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
         pool = self._submitted
         with pool.lock:
@@ -589,20 +515,9 @@ class Simulator:
     def leave(
         self, waiting: Sequence[RunningSimulation], arrived: SimpleQueue, running: bool
     ) -> list[RunningSimulation]:
-        """Stop waiting for simulations: ended ones are cached, others cancelled if nobody else waits for them.
+        """Stop waiting: ended simulations are cached, others are cancelled if nobody else waits for them.
 
-        Parameters
-        ----------
-        waiting : sequence of RunningSimulation
-        arrived : SimpleQueue
-            As for `start`.
-        running : bool
-            Whether started simulations are cancelled too.
-
-        Returns
-        -------
-        list of RunningSimulation
-            The simulations that go on.
+        With `running`, started simulations are cancelled too. Returns the simulations that go on.
         """
         pool = self._submitted
         with pool.lock:
@@ -618,15 +533,8 @@ class Simulator:
                 if each.future.cancelled():
                     each.received = True
                     pool.running.pop((each.key, each.responses), None)
-            try:
-                self.receive([each for each in left if each.future.done()])
-            finally:
-                pool.unwritten.flush()
+            self.receive([each for each in left if each.future.done()])
             return [each for each in left if not each.received]
-
-    def flush(self) -> None:
-        """Write rows that wait to the cache on disk."""
-        self._submitted.unwritten.flush()
 
     @property
     def _submitted(self) -> _Pool:
@@ -706,21 +614,14 @@ class Simulator:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
             self.response_memory.store(self.model.fingerprint, keys, outcomes)
         if self.cache is not None:
-            response = None if batch is None else batch.response.copy() if responses else batch.response
-            rows = FinishedRows(thetas, misfit, reasons, response, seconds)
-            self._submitted.unwritten.add(rows, self._write)
+            response = None if batch is None else batch.response
+            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, self._run)
+            self.cache.store_remark(self.model)
         for row, each in enumerate(ended):
             if responses and reasons[row]:
                 batch.response[row] = np.nan
             each.received = True
             each.result = Simulated(misfit[row], reasons[row], batch.response[row] if responses else None)
-
-    def _write(self, rows: FinishedRows) -> None:
-        """Write simulations to the cache on disk."""
-        self._checked.rows.store(
-            self._key, rows.thetas, rows.misfit, rows.reasons, rows.response, rows.seconds, self._run
-        )
-        self.cache.store_remark(self.model)
 
     # the model ----------------------------------------------------------------------------------------------------
 
@@ -752,7 +653,6 @@ class Simulator:
         except ChangedModel:
             self._known.clear()
             if self.cache is not None and self._checked.unchecked:
-                self.flush()
                 unchecked = np.concatenate(self._checked.unchecked)
                 self._checked.rows.discard(unchecked, self._key, self.model.fingerprint)
             raise

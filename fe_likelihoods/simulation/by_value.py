@@ -41,12 +41,7 @@ _PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleT
 _CACHED = type(functools.cache(len))
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
-_OF_A_CLASS = {"__dict__", "__weakref__", "_abc_impl", "__abstractmethods__"}
-_DESCRIPTORS = {property, staticmethod, classmethod, types.MemberDescriptorType, types.GetSetDescriptorType}
-# constant, or with contents that are compared separately
-_CONSTANT = {*_PLAIN, *_LOCKS, types.FunctionType, types.CodeType} | _DESCRIPTORS
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
-_ABSENT = type("Absent", (), {})  # in place of a value, for a name that is not defined
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
@@ -109,13 +104,10 @@ class Pickled(NamedTuple):
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
-        """Pickle a function with everything that it uses at present; ValueError if that is impossible.
-
-        The pickle of an earlier call is returned if nothing that the function depends on has changed.
-        """
+        """Pickle a function with everything that it uses at present; ValueError if that is impossible."""
         try:
-            with _lock:
-                return _pickled(function)
+            payload = sources_digest() + _this_process(os.getpid()) + dumps(function)
+            return cls(payload, _digest(payload))
         except Exception as error:
             name = getattr(function, "__qualname__", type(function).__qualname__)
             raise ValueError(
@@ -130,12 +122,9 @@ class Pickled(NamedTuple):
     def load(self) -> "Arrived":
         """The function, in a worker.
 
-        Raises
-        ------
-        ValueError
-            If the payload cannot be unpickled, or does not match its digest (then nothing is unpickled).
-        ChangedModel
-            If this process has imported another version of this library, or a file that the model depends on differs.
+        ValueError if the payload cannot be unpickled, or does not match its digest (then nothing is unpickled);
+        ChangedModel if this process has imported another version of this library, or a file that the model depends on
+        differs.
         """
         global _arriving
         if not self.is_whole():
@@ -187,10 +176,10 @@ class Arrived:
         return self._function(item)
 
 
-def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
-    """Pickle an object, with user code and its values by value; `uses` receives this code and these values."""
+def dumps(thing: Any) -> bytes:
+    """Pickle an object, with user code and its values by value."""
     with _lock:
-        pickler = _Pickler(file := io.BytesIO(), _Uses() if uses is None else uses)
+        pickler = _Pickler(file := io.BytesIO())
         try:
             pickler.dump(thing)
         finally:
@@ -199,115 +188,25 @@ def dumps(thing: Any, uses: "_Uses | None" = None) -> bytes:
         return file.getvalue()
 
 
-def _pickled(function: Any) -> Pickled:
-    """Pickle a function, or find an earlier pickle with the same code and values; the lock is held."""
-    seen, header = _snapshot(function), sources_digest() + _this_process(os.getpid())
-    known = [each for each in reversed(_sent.values()) if seen[0] is not None and each.seen[0] == seen[0]]
-    sent = next((each for each in known if each.pickled.payload.startswith(header) and each.is_unchanged()), None)
-    if sent is not None and sent.is_confirmed:
-        return _sent.use(sent.pickled.key).pickled
-    uses = _Uses()
-    payload = header + dumps(function, uses)
-    pickled = Pickled(payload, _digest(payload))
-    # another thread may have changed a value meanwhile, so a pickle is reused only after a second one was equal
-    _sent.keep(pickled.key, _Sent(pickled, seen, uses, sent is not None and sent.pickled == pickled), 3 * len(payload))
-    return pickled
-
-
-class _Sent:
-    """A pickled function and what it depends on."""
-
-    def __init__(self, pickled: Pickled, seen: tuple, uses: "_Uses", is_confirmed: bool) -> None:
-        self.pickled, self.seen, self.uses, self.is_confirmed = pickled, seen, uses, is_confirmed
-        self._objects = uses.objects()  # kept, so that no other object gets the same identity
-        self._identities = list(map(id, self._objects))
-        self._mutable = [x for x in self._objects if type(x) not in _CONSTANT and id(x) not in uses.unsent]
-        self._content = _snapshot(self._mutable)
-
-    def is_unchanged(self) -> bool:
-        """Whether the code and values that the function uses are unchanged since they were pickled."""
-        if self._content[0] is None or list(map(id, self.uses.objects())) != self._identities:
-            return False
-        return _snapshot(self._mutable)[0] == self._content[0]
-
-
-_sent: "Recent" = Recent()  # by key
-
-
-class _Uses:
-    """User code and values that a pickle contains, to notice when they have changed."""
-
-    def __init__(self) -> None:
-        self.modules: set[str] = set()  # names that were looked up
-        self.namespaces: dict[int, tuple[dict, set[str] | None]] = {}  # with the names in use; None for all names
-        self.functions: dict[int, types.FunctionType] = {}
-        self.classes: dict[int, type] = {}
-        self.unsent: dict[int, Any] = {}  # values that are not, or cannot be, sent
-
-    def add_names(self, namespace: dict, names: Any) -> None:
-        """Note that a function uses values of a namespace."""
-        known = self.namespaces.setdefault(id(namespace), (namespace, set()))[1]
-        if known is not None:
-            known.update(names)
-
-    def objects(self) -> list:
-        """The names, code and values in their present state."""
-        objects = [sys.modules.get(name) for name in self.modules]
-        for function in self.functions.values():
-            objects += function.__code__, function.__defaults__, function.__kwdefaults__, vars(function)
-            objects += function.__closure__ or ()
-        for namespace, names in self.namespaces.values():
-            if names is None:
-                objects += (*namespace, *namespace.values())
-            else:
-                objects += [namespace.get(name, _ABSENT) for name in names]
-        for cls in self.classes.values():
-            objects += cls.__bases__
-            for name, value in vars(cls).copy().items():  # other threads may change it
-                if name not in _OF_A_CLASS:
-                    objects += name, value
-        return objects
-
-
-def _snapshot(thing: Any) -> tuple[bytes | None, list]:
-    """Bytes that differ when an object has changed; functions, classes and modules are compared by identity.
-
-    Much faster than a pickle by value. The objects compared by identity are returned as well: as long as they are kept,
-    no other object can have the same identity. The bytes are None for an object that cannot be pickled.
-    """
-    pickler = _Snapshot(file := io.BytesIO())
-    try:
-        pickler.dump(thing)
-    except Exception:
-        return None, []
-    return file.getvalue(), pickler.kept
-
-
-class _Snapshot(cloudpickle.Pickler):
-    """Pickler that replaces functions, classes and modules by their identity; fails for objects that cannot be sent."""
-
-    def __init__(self, file: io.BytesIO) -> None:
-        super().__init__(file, protocol=5)
-        self.kept: list[Any] = []
+class _Trial(cloudpickle.Pickler):
+    """Pickler that leaves out functions, classes and modules; fails for objects that cannot be sent."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, _CACHED | functools.cached_property):
             return abs, (), getattr(obj, "__wrapped__", None) or obj.func
         if not isinstance(obj, types.FunctionType | type | types.ModuleType | types.CodeType):
             return NotImplemented
-        self.kept.append(obj)
         if not isinstance(obj, types.FunctionType) or not (obj.__module__ is None or is_of_user(obj.__module__)):
-            return abs, (id(obj),)
+            return abs, (0,)
         values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
-        return abs, (id(obj),), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
+        return abs, (0,), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
 
 
 class _Pickler(cloudpickle.Pickler):
     """Pickler whose functions keep their module: all functions of a module share one namespace with its values."""
 
-    def __init__(self, file: io.BytesIO, uses: _Uses) -> None:
+    def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        self.uses = uses
         self.registered: list[types.ModuleType] = []
         self._namespaces: dict[str, _Namespace] = {}
         self._of_user: dict[Any, types.ModuleType | None] = {}
@@ -321,7 +220,6 @@ class _Pickler(cloudpickle.Pickler):
                 module if is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED) else None
             )
             if self._of_user[name] is not None:
-                self.uses.modules.add(name)
                 if name not in cloudpickle.list_registry_pickle_by_value():
                     cloudpickle.register_pickle_by_value(module)
                     self.registered.append(module)
@@ -343,7 +241,6 @@ class _Pickler(cloudpickle.Pickler):
         if reduced is NotImplemented or len(reduced) != 6:
             return reduced
         # a new class for each function, since the methods of an earlier class may refer to earlier values
-        self.uses.classes[id(obj)] = obj
         make, (*arguments, _, extra), (state, slots), *tail = reduced
         members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
         state = {name: self._sendable(name, each) for name, each in state.items() if not isinstance(each, members)}
@@ -355,8 +252,6 @@ class _Pickler(cloudpickle.Pickler):
         if name in SCRIPTS:
             present = {key: present[key] for key in ("__file__", "__package__") if key in present}
         else:
-            self.uses.namespaces[id(values)] = values, None
-            self.uses.unsent |= {id(present[key]): present[key] for key in _OF_THE_IMPORT & present.keys()}
             # modules of a package are sent where a function names them
             present = {key: value for key, value in present.items() if self._module(f"{name}.{key}") is None}
         parent = self._module(name.rpartition(".")[0])
@@ -368,19 +263,12 @@ class _Pickler(cloudpickle.Pickler):
         module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
         if module is None or vars(module) is not function.__globals__:
             self._module(function.__module__)
-            reduced = super().reducer_override(function)
-            if reduced is not NotImplemented:
-                self.uses.functions[id(function)] = function
-                self.uses.add_names(function.__globals__, names.all)
-            return reduced
-        self.uses.functions[id(function)] = function
+            return super().reducer_override(function)
         namespace = self._namespaces.setdefault(module.__name__, _Namespace(module))
         used = {}
         if module.__name__ in SCRIPTS:
-            self.uses.add_names(vars(module), names.all)
             used = {name: _new_lock(value) for name, value in vars(module).copy().items() if name in names.all}
         imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
-        self.uses.modules |= imported
         state = (
             used,
             [*filter(None, map(self._module, imported)), *_named_modules(vars(module), names.all)],
@@ -400,10 +288,9 @@ class _Pickler(cloudpickle.Pickler):
         if plain or isinstance(value, _LOCKS):
             return _new_lock(value)
         try:
-            _Snapshot(io.BytesIO()).dump(value)
+            _Trial(io.BytesIO(), protocol=5).dump(value)
             _refuse_a_name(value)
         except Exception as error:
-            self.uses.unsent[id(value)] = value
             return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
         return value
 
@@ -453,7 +340,8 @@ def _named_modules(values: Mapping[str, Any], names: frozenset[str]) -> list[typ
 
 def _new_function(code: types.CodeType, namespace: dict[str, Any], n_cells: int) -> types.FunctionType:
     namespace.setdefault("__builtins__", builtins)
-    return types.FunctionType(code, namespace, None, None, tuple(types.CellType() for _ in range(n_cells)))
+    cells = tuple(types.CellType() for _ in range(n_cells)) or None  # as a function that was not sent
+    return types.FunctionType(code, namespace, None, None, cells)
 
 
 def _fill_function(function: types.FunctionType, state: tuple) -> None:

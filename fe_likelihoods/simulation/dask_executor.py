@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 MAX_ATTEMPTS = 3  # submissions of an item to dask, each of which may cost several workers
 SECONDS_FOR_MESSAGES = 0.2  # until dask has reported all tasks that it has given up with a worker
 SECONDS_BETWEEN_CHECKS = 5.0  # of the workers
-SECONDS_TO_START = 60.0  # until a worker that was requested from a cluster runs
 SECONDS_TO_RETURN = 15.0  # until a nanny has restarted a worker process
 LONGEST_WITHOUT_WORKER = 3600.0  # [s] that simulations wait while a cluster has no worker
 _NO_WORKERS = (
@@ -144,7 +143,7 @@ class DaskExecutor(PoolExecutor):
         options = {"resources": self.resources} if self.resources else {}
         starts = not self._sent
         if starts:
-            self._workers.note(getattr(self.pool, "cluster", None))
+            self._start_lost_workers()
         inner = self.pool.map(function, [[each.item for each in items] for items in groups], pure=False, **options)
         self._sent |= {each: (items, self._losses) for each, items in zip(inner, groups, strict=True)}
         if starts:
@@ -155,6 +154,10 @@ class DaskExecutor(PoolExecutor):
         for each in inner:
             each.add_done_callback(self._ended.put)
         return inner
+
+    def _start_lost_workers(self) -> None:
+        with contextlib.suppress(Exception):  # there is no cluster object, or it is closing
+            self._workers.start_lost(self.pool.cluster)
 
     def _forget(self, inner: Iterable[Any], goes_on: bool = False) -> None:
         """Forget groups that have ended; with `goes_on`, start the next suspect. The lock is held."""
@@ -234,8 +237,7 @@ class DaskExecutor(PoolExecutor):
             time.sleep(SECONDS_BETWEEN_CHECKS)
             if not self._sent or ended is not self._ended:
                 return
-            with contextlib.suppress(Exception):  # the cluster or the client is closing
-                self._workers.ask_for_lost(self.pool.cluster)
+            self._start_lost_workers()
             with contextlib.suppress(Exception):
                 last_seen = time.monotonic() if self.pool.nthreads() else last_seen
             longest = LONGEST_WITHOUT_WORKER if self._longest_wait is None else self._longest_wait
@@ -247,53 +249,36 @@ class DaskExecutor(PoolExecutor):
 
 
 class _Workers:
-    """Which workers of a cluster have started, and since when workers are absent.
+    """Starts workers of a cluster again that were present, and are absent although the cluster wants them.
 
     If a worker is absent 15 s after it was lost (``distributed.deploy.lost-worker-timeout``), dask closes its nanny and
     never starts the worker again, although on a busy machine the new process may need longer, or a simulation may have
-    killed it once more. So the worker is requested again, as is a worker that has not started within
-    `SECONDS_TO_START`. A dask-jobqueue cluster never notices that a job with several workers has ended, for example at
-    its walltime. The job is submitted again if its workers were present and are gone; queued jobs are left alone.
+    killed it once more. A dask-jobqueue cluster never notices that a job with several workers has ended, for example at
+    its walltime, so such a job is submitted again. Queued jobs are left alone.
     """
 
     def __init__(self) -> None:
-        self._started: set = set()
-        self._seen: dict[Any, float] = {}  # when a worker was last present, or requested
+        self._seen: dict[Any, float] = {}  # when a worker or a job that has started was last present
 
-    def note(self, cluster: Any) -> tuple[dict, set, set]:
-        """Workers and jobs: wanted by the cluster, known to it, and present with a process."""
-        wanted, present = (
-            dict(getattr(cluster, "worker_spec", None) or {}),
-            set(getattr(cluster, "workers", None) or ()),
-        )
+    def start_lost(self, cluster: Any) -> None:
+        """Note which workers and jobs are present, and start those again that the cluster has lost."""
+        wanted, known = dict(getattr(cluster, "worker_spec", {})), set(getattr(cluster, "workers", ()))
         jobs = {name: spec["group"] for name, spec in wanted.items() if "group" in spec}
-        info = cluster.scheduler_info["workers"].values() if jobs else ()
-        names = {worker["name"] for worker in info}
-        here = {n for n in present if n not in jobs or any(f"{n}{suffix}" in names for suffix in jobs[n])}
+        names = {worker["name"] for worker in cluster.scheduler_info["workers"].values()} if jobs else set()
+        here = {n for n in known if n not in jobs or any(f"{n}{suffix}" in names for suffix in jobs[n])}
         now = time.monotonic()
-        self._seen = {name: now if name in here else self._seen.get(name, now) for name in wanted}
-        self._started = (self._started | here) & wanted.keys()
-        return wanted, present, here
-
-    def ask_for_lost(self, cluster: Any) -> None:
-        """Request the workers and jobs that a cluster has given up although its specification contains them."""
-        wanted, present, here = self.note(cluster)
-        absent = {name: time.monotonic() - seen for name, seen in self._seen.items() if name not in here}
-        jobs = {name for name in wanted if "group" in wanted[name]}
-        ended = {n for n in self._started & jobs & present & absent.keys() if absent[n] > SECONDS_TO_RETURN}
-        lost = self._started & absent.keys() - jobs
-        late = {n for n in absent.keys() - jobs - self._started if absent[n] > SECONDS_TO_START}
-        if lost or ended:
-            what = f"{len(lost | ended)} of its {len(wanted)} {'jobs' if ended else 'workers'}"
+        self._seen = {name: now if name in here else seen for name, seen in self._seen.items() if name in wanted}
+        self._seen |= {name: now for name in here & wanted.keys()}
+        absent = self._seen.keys() - here
+        ended = {n for n in absent & jobs.keys() & known if now - self._seen[n] > SECONDS_TO_RETURN}
+        lost = ended | (absent - jobs.keys())
+        if lost:
+            what = f"{len(lost)} of its {len(wanted)} {'jobs' if ended else 'workers'}"
             logger.warning("The dask cluster has given up %s: starting them again", what)
-        if late:
-            text = "%d of %d workers of the dask cluster have not started within %g s: asking for them again"
-            logger.warning(text, len(late), len(wanted), SECONDS_TO_START)
-        if ended:
-            cluster.sync(cluster.scale_down, ended)
-        if lost or late or ended:
-            self._started -= lost | ended
-            self._seen |= dict.fromkeys(lost | late, time.monotonic())
+            for name in lost:
+                del self._seen[name]
+            if ended:
+                cluster.sync(cluster.scale_down, ended)
             cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))
 
 

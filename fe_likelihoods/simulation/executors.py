@@ -10,17 +10,13 @@ The rule for ``pool=``:
   multiprocessing and schwimmbad.
 
 The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
-is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once: in a `LocalPool` through the
-worker's pipe, in other pools on the same machine through a private temporary file, whose digest is checked. A worker
-that has neither the function nor the file gets the function together with the items. Later tasks consist of the
-function's digest and the parameters. A function is sent again when anything that it uses has changed.
+is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once, and again when anything that it
+uses has changed; later tasks consist of its digest and the parameters (`fe_likelihoods.simulation.sent_functions`).
 
 ``submit(function, item)`` returns a `concurrent.futures.Future` with the result that ``map`` would return, even if the
-item kills every process that runs it. ``submit_all(function, items)`` returns a list of futures, and
-``give_up(futures)`` cancels futures. Futures work with `concurrent.futures.as_completed`. A pool that only has ``map``
-cannot submit items; the attribute ``submits`` is then False.
-
-Results do not depend on the pool, to the last bit.
+item kills every process that runs it; ``submit_all(function, items)`` returns a list of futures, and
+``give_up(futures)`` cancels futures. A pool that only has ``map`` cannot submit items; its attribute ``submits`` is
+False. Results do not depend on the pool, to the last bit.
 """
 
 from typing import Any
@@ -34,24 +30,11 @@ __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 
 
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | PoolExecutor | None":
-    """Executor for a pool, by the rule above.
+    """Executor for a pool, by the rule above; None for None.
 
-    Parameters
-    ----------
-    pool : None, int, or a pool
-    model : Model, optional
-        Checked before anything runs: it must be picklable if the workers are other processes.
-
-    Returns
-    -------
-    LocalPool, DaskExecutor, PoolExecutor or None
-        None for None, otherwise an object whose ``map(function, items)`` returns a list. The functions must return an
-        `Outcome`; an item that kills every process that runs it also gets an `Outcome`, if the pool survives.
-
-    Raises
-    ------
-    ValueError
-        If `pool` is none of these, or the model cannot be sent to its processes.
+    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`; an item that kills every
+    process that runs it also gets an `Outcome`, if the pool survives. ValueError if `pool` is of no such kind, or its
+    workers are other processes and the model cannot be sent to them.
     """
     if pool is None or isinstance(pool, LocalPool | PoolExecutor):
         executor = pool

@@ -26,32 +26,19 @@ __all__ = [
 ]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
-
-
 _LONGEST_REASON = 2000  # characters
 
 
 class FailedRun(RuntimeError):
-    """Base of exceptions that say in words why a run failed.
-
-    Attributes
-    ----------
-    reason : str
-        Why it failed; a `TransientReason` or `MisfitReason` keeps its kind.
-    """
+    """Base of exceptions that say in words, their `reason`, why a run failed; a `TransientReason` keeps its kind."""
 
     reason: str
 
 
 class RunFailed(FailedRun):
-    """A run in another process failed.
+    """A run in another process failed: its `reason`, and its duration `seconds` [s] or None.
 
-    Attributes
-    ----------
-    reason : str
-        Why it failed, in words; a `TransientReason` if the process was stopped, was killed or crashed.
-    seconds : float or None
-        Duration of the run [s], if known.
+    The reason is a `TransientReason` if the process was stopped, was killed or crashed.
     """
 
     def __init__(self, reason: str, seconds: float | None = None) -> None:
@@ -63,10 +50,7 @@ class RunFailed(FailedRun):
 class ChangedModel(ValueError):
     """A model has changed since its fingerprint was computed. The message says what to do.
 
-    Attributes
-    ----------
-    ends_run : bool
-        True: samplers stop, since no point can be evaluated any more.
+    Samplers stop (`ends_run`), since no point can be evaluated any more.
     """
 
     ends_run = True
@@ -75,17 +59,7 @@ class ChangedModel(ValueError):
 class TransientReason(str):
     """Reason of a failure whose cause is not the model.
 
-    Parameters
-    ----------
-    text : str
-        The reason.
-    time_limit : float
-        The time limit that stopped the simulation [s]; 0 for other causes.
-
-    Attributes
-    ----------
-    time_limit : float
-        As given.
+    `time_limit` is the limit that stopped the simulation [s]; 0 for other causes.
     """
 
     time_limit: float
@@ -144,18 +118,7 @@ def _is_raised(error: BaseException) -> bool:
 
 
 def reason_of(error: BaseException) -> str:
-    """Failure reason for a simulation that raised an exception.
-
-    Parameters
-    ----------
-    error : BaseException
-        The reason of a `FailedRun` is kept, together with its kind.
-
-    Returns
-    -------
-    str
-        A `TransientReason` for faults of the infrastructure.
-    """
+    """Reason of a simulation that raised an exception; a `TransientReason` for faults of the infrastructure."""
     if isinstance(error, FailedRun):
         return error.reason
     text = f"{type(error).__name__}: {error}"

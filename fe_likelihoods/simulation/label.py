@@ -79,12 +79,8 @@ _sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 class ModelLabel:
     """Label of a model in its present state, completed by its simulations.
 
-    Parameters
-    ----------
-    model : Model
-        Its code is the mapping ``code_parts()`` if it has this method; for other user models, the object itself.
-    statistic : function, optional
-        The residual statistic that is stored.
+    Its code is the mapping ``code_parts()`` if the model has this method; for other user models, the object itself; and
+    the residual statistic that is stored, if the user has defined one.
 
     Attributes
     ----------
@@ -193,10 +189,7 @@ def cpu_name() -> str:
 def value_digest(value: Any) -> str:
     """Digest of a value, a function or a class, with everything that its code names.
 
-    Raises
-    ------
-    ValueError
-        If the value contains an object whose content cannot be read, such as an open file.
+    ValueError if the value contains an object whose content cannot be read, such as an open file.
     """
     walk = _Walk()
     items = walk.items({"value": value})

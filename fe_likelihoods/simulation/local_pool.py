@@ -5,7 +5,6 @@ has a pipe and a thread in this process, which sends it one item at a time. So t
 is known. Only this item is run again, and it is given up after the third death.
 """
 
-import math
 import os
 import threading
 from collections import deque
@@ -79,32 +78,19 @@ class LocalPool:
     Parameters
     ----------
     workers : int
-        Number of processes.
-    runs_per_process : int, optional
-        Number of items after which a process is replaced, which limits memory leaks in compiled models; never by
-        default.
-
-    Raises
-    ------
-    ValueError
-        If `workers` or `runs_per_process` is not a positive whole number.
+        Number of processes; ValueError if it is not a positive whole number.
     """
 
     other_processes = True
     submits = True
 
-    def __init__(self, workers: int, runs_per_process: int | None = None) -> None:
+    def __init__(self, workers: int) -> None:
         if not _is_positive_whole(workers):
             raise ValueError(
                 "pool must be None, a positive number of processes, or an object with map(function, items); "
                 f"got {workers!r}"
             )
-        if runs_per_process is not None and not _is_positive_whole(runs_per_process):
-            raise ValueError(
-                f"LocalPool: runs_per_process must be None or a positive whole number; got {runs_per_process!r}"
-            )
         self.workers = int(workers)
-        self.runs_per_process = None if runs_per_process is None else int(runs_per_process)
         self._environment = {
             f"{library}_NUM_THREADS": "1" for library in _THREADS if f"{library}_NUM_THREADS" not in os.environ
         }
@@ -126,7 +112,7 @@ class LocalPool:
         self.close()
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.workers, self.runs_per_process)
+        return type(self), (self.workers,)
 
     @property
     def n_workers(self) -> int:
@@ -311,12 +297,8 @@ class LocalPool:
             self._end(worker)
             job.set_exception(error)
             return None
-        if worker.calls >= (self.runs_per_process or math.inf):
-            self._end(worker)
-            worker = None
-        else:
-            with self._changed:
-                self._busy[worker] = None
+        with self._changed:
+            self._busy[worker] = None
         if answer.error is None:
             job.set_result(answer.value)
         else:

@@ -51,16 +51,8 @@ _RESPONSE_VALUES = 2**23  # largest number of response values in memory at once:
 class SimulationFailed(FailedRun):
     """A simulation that failed.
 
-    Parameters
-    ----------
-    reason : str
-        Why it failed, in words. It may end with the duration of the run, as in "crashed after 12.3 s" (see
-        `split_seconds`).
-
-    Attributes
-    ----------
-    reason : str
-        As given.
+    `reason` says why, in words. It may end with the duration of the run, as in "crashed after 12.3 s"
+    (`split_seconds`).
     """
 
     def __init__(self, reason: str) -> None:
@@ -69,7 +61,7 @@ class SimulationFailed(FailedRun):
 
 
 def split_seconds(reason: str) -> tuple[str, float | None]:
-    """Split a reason such as "crashed after 12.3 s" into the reason itself and the duration [s], None if not given."""
+    """Split a reason such as "crashed after 12.3 s" into the reason and the duration [s], None if it is not given."""
     found = re.fullmatch(r"(.+) after ([0-9.]+(?:e[-+]?[0-9]+)?) s", reason, re.DOTALL)
     return (found[1], float(found[2])) if found else (reason, None)
 
@@ -181,23 +173,10 @@ def most_responses(model: Model) -> int:
 
 
 def first_part(model: Model, seconds: float) -> Model:
-    """The same model under the first part of its excitation.
+    """The same model under the first part of its excitation, up to the sample time `seconds` [s].
 
-    Parameters
-    ----------
-    model : Model
-        With a method ``first(seconds)``, or with ``with_record`` and a `Record` in the attribute ``record``.
-    seconds : float
-        Time of the last response sample [s].
-
-    Returns
-    -------
-    Model
-
-    Raises
-    ------
-    ValueError
-        If the model has none of these methods, or the time is not within its response.
+    By the model's method ``first(seconds)``, or by ``with_record`` and a `Record` in its attribute ``record``.
+    ValueError if the model has none of these methods, or the time is not within its response.
     """
     if hasattr(model, "first"):
         return model.first(seconds)
@@ -221,10 +200,6 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     pool : object with ``map(function, items)``, optional
         Runs the simulations one by one, even if the model has a batch method (which would run in this process). The
         results do not depend on the pool.
-
-    Returns
-    -------
-    SimulationBatch
     """
     shape = (len(model.channels), model.n_steps)
     if pool is None and getattr(model, "simulate_batch", None) is not None:
@@ -250,10 +225,6 @@ def misfit_batch(
         Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
     statistic : Statistic, optional
         Residual statistic, by default the sums of squares. If given, the model's own ``misfit_batch`` is not used.
-
-    Returns
-    -------
-    MisfitBatch
     """
     shape = (statistic_width(measured, statistic),)
     own = (
@@ -274,17 +245,8 @@ def sent_simulation(
 ) -> Callable[[np.ndarray], tuple[np.ndarray | None, str]]:
     """A function that runs one simulation, in this process or in a pool's worker.
 
-    Parameters
-    ----------
-    model : Model
-    measured, statistic
-        As for `misfit_batch`. Without `measured`, the result is the response.
-
-    Returns
-    -------
-    callable
-        Takes parameters (n_parameters,); returns the result with an empty reason, or None and the reason of a failure,
-        as in `misfit_batch` or `simulate_batch`.
+    It takes parameters (n_parameters,) and returns the result with an empty reason, or None and the reason of a
+    failure. The result is that of `misfit_batch` for these arguments, or the response without `measured`.
     """
     run = _response if measured is None else partial(_misfit, measured, statistic or sums_of_squares)
     return partial(_attempt, run, model)
@@ -325,24 +287,9 @@ def _response(model: Model, theta: np.ndarray) -> np.ndarray:
 
 
 def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """Response of one simulation as floats.
+    """What a model returned as a response (n_channels, n_steps) of floats [SI], which may be infinite or NaN.
 
-    Parameters
-    ----------
-    response : array_like
-        What a model returned.
-    channels : sequence of Channel
-    n_steps : int
-
-    Returns
-    -------
-    (n_channels, n_steps) float
-        [SI]; its values may be infinite or NaN.
-
-    Raises
-    ------
-    SimulationFailed
-        If it is complex, has another shape, or is not an array of numbers.
+    `SimulationFailed` if it is complex, has another shape, or is not an array of numbers.
     """
     try:
         response = np.asarray(response)

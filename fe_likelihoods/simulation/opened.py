@@ -32,13 +32,7 @@ _digests: dict[str, tuple[tuple, float, str]] = {}
 
 
 class Opened(NamedTuple):
-    """What one simulation opened.
-
-    Attributes
-    ----------
-    files : dict of str to str
-        Digests of the contents, by path.
-    """
+    """What one simulation opened: digests of the contents of files, by path."""
 
     files: dict[str, str]
 
@@ -79,15 +73,8 @@ class _Observer:
 
 
 class Observed:
-    """A function for other processes, whose results include what it opened there.
+    """A function of one item for other processes, whose results include what it opened there.
 
-    Parameters
-    ----------
-    function : callable
-        Takes one item.
-
-    Notes
-    -----
     A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
     files if there are more than 100 in all; None if there is nothing to report.
     """

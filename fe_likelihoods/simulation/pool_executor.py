@@ -39,10 +39,6 @@ class PoolExecutor:
 
     A `multiprocessing.Pool` replaces a process that dies but does not run its item again, so the call never returns.
     Use a `LocalPool` if simulations may crash.
-
-    Parameters
-    ----------
-    pool : object
     """
 
     def __init__(self, pool: Any) -> None:
@@ -85,13 +81,7 @@ class PoolExecutor:
         return self.submit_all(function, [item])[0]
 
     def submit_all(self, function: Callable[[Any], Outcome], items: Sequence[Any]) -> list[Future]:
-        """Futures as from `submit`, for several items.
-
-        Raises
-        ------
-        ValueError
-            If the pool only has ``map``.
-        """
+        """Futures as from `submit`, for several items; ValueError if the pool only has ``map``."""
         if not self.submits:
             raise ValueError(
                 f"{type(self.pool).__name__} has map, and neither submit nor apply_async: its items cannot be "

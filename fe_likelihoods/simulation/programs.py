@@ -85,7 +85,7 @@ def run_program(
     place: Path,
     watch: Callable[[float], float],
 ) -> int:
-    """Run a program to its end and kill all processes that it leaves behind.
+    """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
 
     Parameters
     ----------
@@ -102,11 +102,6 @@ def run_program(
     watch : callable
         Called repeatedly with the time since the start of the program [s]. It returns the time until the next call [s],
         or raises an exception, which stops the program and is passed on.
-
-    Returns
-    -------
-    int
-        Exit code, as in `subprocess`: negative for a signal.
 
     Raises
     ------

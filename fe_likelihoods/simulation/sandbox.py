@@ -28,7 +28,7 @@ class Sandbox:
     Parameters
     ----------
     function : callable
-        Takes one argument.
+        Takes one argument. ValueError if it cannot be sent to another process.
     time_limit : float, optional
         Largest duration of a call [s], without the start of the process.
     memory_limit : int
@@ -37,11 +37,6 @@ class Sandbox:
         Largest output per call [bytes].
     runs_per_process : int, optional
         Number of calls after which a process is replaced; never by default.
-
-    Raises
-    ------
-    ValueError
-        If the function cannot be sent to another process.
     """
 
     def __init__(
@@ -61,14 +56,9 @@ class Sandbox:
         return vars(self) | {"_free": []}
 
     def __call__(self, item: Any) -> Any:
-        """Result of the function for one item.
+        """Result of the function for one item; raises any exception that the function raises.
 
-        Raises
-        ------
-        RunFailed
-            If the process died, or was killed because it took too long or printed too much.
-        Exception
-            Any exception that the function raises.
+        RunFailed if the process died, or was killed because it took too long or printed too much.
         """
         worker = self._take(Pickled.of(self.function))
         start = time.monotonic()

@@ -44,11 +44,6 @@ class FunctionReference:
     """A function that is pickled as a reference: its digest and the path of a file with the pickled function.
 
     Called in this process, it calls the function. In another process it becomes a `_LoadedFunction`.
-
-    Parameters
-    ----------
-    function : callable
-    files : PrivateFiles
     """
 
     def __init__(self, function: Callable, files: PrivateFiles) -> None:

@@ -21,25 +21,16 @@ def map_threads(
     shape: tuple[int, ...],
     measured: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[str]]:
-    """Results of many simulations, on as many threads as numba uses.
+    """Results of many simulations, NaN where one failed, and the reasons; on as many threads as numba uses.
 
     Parameters
     ----------
     run : callable
-        Takes one row of `thetas` and returns a response, or raises `SimulationFailed`.
-    thetas : (n, n_parameters) float
-        Parameter sets.
-    shape : tuple of int
-        Shape of one result.
+        Takes one row of `thetas` (n, n_parameters) and returns a response, or raises `SimulationFailed`.
+    thetas, shape
+        Parameter sets; shape of one result.
     measured : (n_channels, n_steps) float, optional
         Measured response [SI]: results are the sums of squared residuals (n_channels,) instead of responses.
-
-    Returns
-    -------
-    out : (n, ...) float
-        NaN where a simulation failed.
-    reasons : list of str
-        Reasons of failures; empty where a simulation succeeded.
     """
     out = np.full((len(thetas), *shape), np.nan)
     reasons = [""] * len(thetas)

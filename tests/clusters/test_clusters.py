@@ -95,8 +95,8 @@ def check_result(place, interruptions, unwritten=0):
     """Every simulation that ended is kept, and the evidence is that of one machine without interruptions.
 
     No evaluation has failed, so that none was given up because of the ends of its workers. Every simulation that ended
-    is in the record. `unwritten` of them may not be in the cache, whose rows of the last second are lost by
-    ``kill -9``. Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
+    is in the record. `unwritten` of them may not be in the cache: they ended in a worker when the parent died.
+    Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
     """
     text = (place / "output.txt").read_text()
     estimate, error = map(float, PRINTED.search(text).groups())
@@ -217,7 +217,7 @@ def test_a_parent_and_a_controller_that_are_killed(slurm, place):
     slurm.wait_until(lambda: not slurm.jobs("RUNNING,PENDING"), 120.0)  # workers whose scheduler has died end
     again = int(re.search(r"(\d+) simulations by this process", (place / "output.txt").read_text())[1])
     assert done >= 800 and again < len(lines(place, "ends.txt")) - 700
-    check_result(place, ended_workers(place), unwritten=40)  # a second of four workers
+    check_result(place, ended_workers(place), unwritten=4 * LARGEST_GROUP)  # groups of four workers
 
 
 @needs_slurm

@@ -258,7 +258,7 @@ def test_caches(folder):
     assert "0 of which do not match" in call("cache", "verify", file)
     assert "stored points were simulated again" in call("cache", "verify", file, "--settings", "oscillator.toml")
     assert "simulations copied to all.sqlite" in call("cache", "export", file, "--out", "all.sqlite")
-    assert "0 could not be read" in call("cache", "salvage", file, "--out", "new.sqlite")
+    assert "simulations and " in call("cache", "salvage", file, "--out", "new.sqlite")
     told, copied = (call("cache", "info", name).splitlines() for name in (file, "new.sqlite"))
     assert told[1] == copied[1] and told[3] == copied[3] and not told[3].startswith("responses    0,")
     assert "there is no file" in call("cache", "info", "nothing.sqlite", code=1)
@@ -286,8 +286,8 @@ def test_a_damaged_cache_is_told_and_not_changed(folder):
         assert "is damaged" in output and "cache salvage cache.sqlite" in output
     assert Path("cache.sqlite").read_bytes() == bytes(data) and {path.name for path in folder.iterdir()} == files
     output = call("cache", "salvage", "cache.sqlite", "--out", "new.sqlite")
-    kept, lost, responses, lost_responses = (int(word) for word in output.split() if word.isdigit())
-    assert kept + lost == n == responses + lost_responses and 0 < lost + lost_responses < n
+    kept, responses = (int(word) for word in output.split() if word.isdigit())
+    assert max(kept, responses) <= n and n < kept + responses < 2 * n
     assert "good" not in output and SimulationCache("new.sqlite").info()[1:4] == (kept, 0, responses)
 
 

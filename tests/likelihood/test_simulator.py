@@ -404,7 +404,7 @@ def test_a_simulator_stands_on_its_own(thetas):
 def test_start_and_wait_are_one_way_with_and_without_a_pool(pool, thetas, path):
     simulator = likelihood_of(Line(), pool=MapOnly() if pool == "map" else pool, cache=path).simulator
     arrived = SimpleQueue()
-    waiting = simulator.start([theta.tobytes() for theta in thetas], thetas, True, arrived)
+    waiting = simulator.start([theta.tobytes() for theta in thetas], True, arrived)
     results = {}
     while waiting:
         for ended in simulator.wait(waiting, arrived):
@@ -415,7 +415,6 @@ def test_start_and_wait_are_one_way_with_and_without_a_pool(pool, thetas, path):
         found = results[theta.tobytes()]
         np.testing.assert_array_equal(found.response, response)
         assert bool(found.reason) == bool(reason)
-    simulator.flush()
     assert simulator.simulations == simulator.cache.info().simulations == len(thetas)
     simulator.simulate(thetas)
     assert simulator.simulations == len(thetas)
@@ -424,7 +423,7 @@ def test_start_and_wait_are_one_way_with_and_without_a_pool(pool, thetas, path):
 def test_simulations_that_are_left_before_they_ran_cost_nothing(thetas):
     model = Line()
     simulator, arrived = likelihood_of(model).simulator, SimpleQueue()
-    waiting = simulator.start([theta.tobytes() for theta in thetas], thetas, False, arrived)
+    waiting = simulator.start([theta.tobytes() for theta in thetas], False, arrived)
     assert simulator.leave(waiting, arrived, running=True) == []
     assert model.runs == simulator.simulations == 0
 

@@ -17,9 +17,10 @@ from fe_likelihoods.simulation import by_value, user_code
 from fe_likelihoods.simulation.by_value import NotSent, Pickled
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.model import simulate_batch
 from fe_likelihoods.simulation.sandbox import Sandbox
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, line
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
 LAW = """
 import functools
@@ -208,13 +209,6 @@ def test_every_change_reaches_a_worker_that_has_loaded_the_function(how, user, p
         del sys.modules["changing"]
 
 
-def test_functions_of_which_no_snapshot_can_be_taken_are_pickled_each_time(user, monkeypatch):
-    monkeypatch.setattr(by_value, "_snapshot", lambda thing: (None, []))
-    for _ in range(3):
-        assert [Pickled.of(f).load()(1.0) for f in (user.by_module, user.deep)] == [3.0, 3.0]
-        assert len({Pickled.of(f).key for f in (user.by_module, user.deep, user.late)}) == 3
-
-
 def test_a_global_that_is_not_defined_yet_is_not_none(pool):
     """As in a notebook whose cells are run in another order."""
     script = sys.modules["__main__"]
@@ -232,14 +226,15 @@ def test_a_global_that_is_not_defined_yet_is_not_none(pool):
         vars(script).pop("_late_value", None)
 
 
-def test_an_unchanged_function_is_not_pickled_again(user, monkeypatch):
-    for _ in range(2):
-        Pickled.of(user.by_module)
-    monkeypatch.delattr(by_value, "dumps")
-    assert Pickled.of(user.by_module).key
+def test_an_unchanged_function_has_the_same_key_and_is_loaded_once(user):
+    keys = {Pickled.of(user.by_module).key for _ in range(3)}
     user.law.K = 5.0
-    with pytest.raises(ValueError, match="dumps"):
-        Pickled.of(user.by_module)
+    assert len(keys) == 1 and Pickled.of(user.by_module).key not in keys
+
+
+def test_a_sent_model_has_the_same_label(pool):
+    model = Treacherous()
+    assert pool.map(lambda _: ModelLabel(model).items, [0]) == [ModelLabel(model).items]
 
 
 @pytest.mark.parametrize("start", ["spawn", "fork"])

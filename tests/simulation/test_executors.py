@@ -1,6 +1,5 @@
 """Executors of ``pool=``: same bits, one transfer of the model per process, early errors for invalid pools."""
 
-import math
 import multiprocessing
 import os
 import pickle
@@ -277,16 +276,6 @@ def test_local_pool_maps_any_function_and_raises_its_exceptions():
             ValueError, match=r"cannot be sent to another process \(TypeError: cannot pickle 'generator'"
         ):
             pool.map(lambda x: next(numbers), [1])
-
-
-def test_a_worker_is_replaced_after_a_number_of_runs():
-    with LocalPool(1, runs_per_process=3) as pool:
-        pids = pool.map(os.getsid, [0] * 7) + pool.map(os.getsid, [0] * 2)  # a worker leads a session
-        assert pickle.loads(pickle.dumps(pool)).runs_per_process == 3
-    assert [pids.index(pid) for pid in pids] == [0, 0, 0, 3, 3, 3, 6, 6, 6]
-    for wrong in (0, 2.5, True, "3", math.inf):
-        with pytest.raises(ValueError, match="runs_per_process must be None or a positive whole number"):
-            LocalPool(1, wrong)
 
 
 def test_threads_in_workers_are_limited(monkeypatch):
