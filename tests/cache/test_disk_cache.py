@@ -370,7 +370,7 @@ def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
         np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
     assert model.sizes[0] == min(300, 8 * (os.cpu_count() or 1))  # every worker is busy
-    assert sum(model.sizes) == 300
+    assert sum(model.sizes) == 300 + likelihood.simulator.verifications  # its own list changes, on a busy machine
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
@@ -411,7 +411,10 @@ class Pool:
 def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
     monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
     pool = Pool(**attributes)
-    likelihood_of(Line(), path, pool=pool).misfit(thetas[:100])
+    likelihood = likelihood_of(Line(), path, pool=pool)
+    likelihood.misfit(thetas[:100])
+    if likelihood.simulator.verifications:  # of two points, on a busy machine, since the model counts its runs
+        pool.sizes.remove(2)
     assert pool.sizes == sizes
 
 
