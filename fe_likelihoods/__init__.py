@@ -11,12 +11,12 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # names that were public in 0.2: what takes their place, or their module
 _REPLACED = {
-    "BandNoise": "GaussianNoise(groups=(edges [Hz]))",
-    "EventNoise": 'GaussianNoise(groups="event")',
+    "BandNoise": 'GaussianNoise(channels, groups=edges, level="response", sensor=...), without level= for SI units',
+    "EventNoise": 'GaussianNoise(channels, groups="event")',
     "MarginalNoise": "posterior.marginal()",
-    "ModulatedNoise": 'GaussianNoise(level="response", window=...)',
-    "RelativeNoise": 'GaussianNoise(level="measured")',
-    "SharedGaussianNoise": 'GaussianNoise(groups="all")',
+    "ModulatedNoise": 'GaussianNoise(channels, level="response", window=..., sensor=...)',
+    "RelativeNoise": 'GaussianNoise(channels, level="measured")',
+    "SharedGaussianNoise": 'GaussianNoise(channels, groups="all")',
     "TimeShiftNoise": "FELikelihood(..., time_shifts={channel: largest shift [s]})",
 }
 _IN_MODULES = {

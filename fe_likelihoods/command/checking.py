@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..signals.error_measures import rrmse
+from ..signals.error_measures import opposite_sign, rrmse
 from ..units import from_si
 from .events import read_events
 from .job import read_job
@@ -99,13 +99,20 @@ def _say_simulation(problem: Problem, own: bool, say: Callable[[str], None]) -> 
             f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
             "check [model] and [priors]"
         )
-    errors = rrmse(measured.values - likelihood.residuals(mean), measured.values)
+    response = measured.values - likelihood.residuals(mean)
+    errors, opposite = rrmse(response, measured.values), opposite_sign(response, measured.values)
     start = time.perf_counter()
     likelihood.model.simulate(1.0001 * mean[:n])
     seconds = time.perf_counter() - start
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
     say(f"One simulation takes {seconds:.2g} s. At the mean of the prior the error of the response (RRMSE) is {fit}")
-    if own and errors.max() > LARGE_ERROR:
+    if opposite.any():
+        names = ", ".join(c.name for c, each in zip(measured.channels, opposite, strict=True) if each)
+        say(
+            f"CAUTION: response and measurements have opposite signs: {names}. Where the sensor counts the other way, "
+            "multiply its column in the file by -1"
+        )
+    if own and np.where(opposite, rrmse(-response, measured.values), errors).max() > LARGE_ERROR:
         say(
             "CAUTION: a large error of a model of your own may come from its units: it must return SI units (m, m/s², "
             "N, Pa, rad), whatever the units in [model.channels] and of the measurements"
@@ -118,7 +125,10 @@ def _say_cost(problem: Problem, sampler: object, guided: bool, budget: dict, say
 
     estimate = estimate_cost(problem.posterior, sampler.nwalkers, type(sampler), seed=1)
     if guided:
-        say(f"The run uses a guide: how many simulations it needs is not predicted; 500 take {estimate.time_of(500)}")
+        say(
+            f"The run uses a guide: how many simulations it needs is not predicted; 500 take "
+            f"{estimate.time_of(500)}, to which the guide adds its own computations, half a minute for 7 parameters"
+        )
     else:
         say(f"Estimated cost until beta = 1:\n{estimate}")
     if "max_simulations" in budget:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..signals.error_measures import opposite_sign
 from .failures import Failures
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits
 from .run import LONGEST_AUTOCORRELATION, FinishedRun
@@ -193,6 +194,17 @@ def _of_the_responses(fits: Fits) -> list[Advice]:
     ]
     if poor:
         text = f"After the update, the relative error (RRMSE) is still large: {_listed(poor)}."
+        opposite = [
+            _place(fit, each)
+            for fit in fits.fits
+            if fits.after in fit.responses
+            for each, yes in zip(
+                fit.channels, opposite_sign(fit.responses[fits.after], fit.measurements.values), strict=True
+            )
+            if yes
+        ]
+        if opposite:
+            text += f" Response and measurements have opposite signs: {_listed(opposite)}."
         action = (
             "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
             "the model before you interpret the parameters."

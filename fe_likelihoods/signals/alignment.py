@@ -71,6 +71,9 @@ class Alignment(NamedTuple):
         text = f"lag {self.lag:.5g} s, standard error {self.standard_error:.2g} s, correlation " + ", ".join(
             f"{name} {value:.3f}" for name, value in self.correlation.items()
         )
+        opposite = [name for name, value in self.correlation.items() if value < -_GOOD]
+        if opposite:
+            text += f"; the sign is opposite: {', '.join(opposite)}"
         if self.own_lags:
             lags = ", ".join(f"{name} {lag:.5g} s" for name, lag in self.own_lags.items())
             text += (

@@ -268,7 +268,13 @@ def _with_lags(
 
 def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:
     """Raise ValueError if the measurements do not end with the response."""
-    end, last = (n_steps - 1) * dt, measurements.end
+    begin, end, last = min(measurements.starts), (n_steps - 1) * dt, measurements.end
+    if begin > end:
+        raise ValueError(
+            f"the response ends at {end:g} s, and the measurements begin at {begin:g} s; give the time in "
+            'their file at which the excitation begins, as zero=12.5 or zero="10:32:07" of read_columns (zero in a '
+            "TOML file)"
+        )
     if measurements.simultaneous and measurements.start == 0.0 and same_step(dt, measurements.dt):
         fits = measurements.n_steps == n_steps
     else:

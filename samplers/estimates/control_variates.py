@@ -81,15 +81,23 @@ class SignedSample(NamedTuple):
     log_evidence: float
     log_evidence_error: float
 
+    def __repr__(self) -> str:
+        m, ndim = self.coords.shape
+        return (
+            f"<SignedSample of {m} points, {ndim} parameters, log-evidence {self.log_evidence:.3f} +- "
+            f"{self.log_evidence_error:.3f}>"
+        )
+
     def expectation(self, function: Callable[[np.ndarray], np.ndarray] | None = None) -> Expectation:
         """Expectation of a function of points (m, ndim), which returns (m,) or (m, k); by default of the parameters."""
         values = self.coords if function is None else np.asarray(function(self.coords), dtype=float)
-        if values.shape[:1] != (len(self.coords),) or not np.all(np.isfinite(values)):
+        if values.shape[:1] != (len(self.coords),):
             raise ValueError(
-                f"function must return a finite number, or an array of finite numbers, for each of {len(self.coords)} "
-                f"points; got an array of shape {values.shape}, {np.sum(~np.isfinite(values))} of whose numbers are "
-                "not finite"
+                f"function must return one row for each of the {len(self.coords)} points, whose array it gets: "
+                f"lambda x: x[:, 0] < 1.1, not x[0] < 1.1; got an array of shape {values.shape}"
             )
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"function must return finite numbers; {np.sum(~np.isfinite(values))} are not")
         value = self.weights @ values
         apart = values - value
         parts = (self.weights * apart.T).T
@@ -114,8 +122,8 @@ class SignedSample(NamedTuple):
 
     def quantile(self, probability: float) -> Expectation:
         """Quantiles (ndim,) of the parameters at a probability between 0 and 1."""
-        if not 0.0 < probability < 1.0:
-            raise ValueError(f"probability must be between 0 and 1; got {probability}")
+        if np.ndim(probability) or not 0.0 < probability < 1.0:
+            raise ValueError(f"probability must be one number between 0 and 1; got {probability}")
         value = np.array([_at(column, self.weights, probability) for column in self.coords.T])
         error = self.expectation(lambda coords: (coords <= value).astype(float)).error
         error = np.where(error > 0.0, error, np.inf)  # all points on one side

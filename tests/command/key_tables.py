@@ -1,7 +1,7 @@
 """Tables of the keys of the TOML file: ``python -m tests.command.key_tables`` writes them into docs/keys.rst."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from fe_likelihoods.command.models import USER_MODELS
@@ -37,9 +37,8 @@ def _table(title: str, keys: Iterable[Key]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _without(keys: Iterable[Key], others: Iterable[Key]) -> list[Key]:
-    names = {key.name for key in others}
-    return [key for key in keys if key.name not in names]
+def _without(keys: Iterable[Key], others: Collection[Key]) -> list[Key]:
+    return [key for key in keys if key not in others]
 
 
 def key_tables() -> str:

@@ -394,6 +394,19 @@ def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     assert "it must return SI units" in call("check", "function.toml")
 
 
+def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
+    """And the units, which are right, are not suspected."""
+    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    comment, header, *lines = (tmp_path / "synthetic_measured.csv").read_text().splitlines()
+    rows = [line.rpartition(",") for line in lines]
+    turned = [f"{before},{-float(last)!r}" for before, _, last in rows]
+    assert "opposite" not in call("check", "function.toml")
+    (tmp_path / "synthetic_measured.csv").write_text("\n".join([comment, header, *turned]))
+    output = call("check", "function.toml")
+    assert "opposite signs: displacement. Where" in output and "it must return SI units" not in output
+
+
 def test_debug_shows_where_an_error_was_raised(folder):
     result = CliRunner().invoke(main, ["--debug", "run", "nothing.toml"])
     assert isinstance(result.exception, ValueError)

@@ -190,6 +190,18 @@ def test_correlated_errors_and_edges_are_named():
     assert notes["Simulations failed"].level == "caution"
 
 
+def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
+    finished = read_run(*vibrating)
+    rows, fits = parameter_rows(finished), fit_data_sets(finished)
+    (fit,) = fits.fits
+    turned = fit._replace(
+        responses={title: -response for title, response in fit.responses.items()},
+        channels=tuple(each._replace(after=2.0) for each in fit.channels),
+    )
+    notes = {n.title: n for n in advise(finished, rows, fits._replace(fits=(turned,)), Failures((), 0, 1))}
+    assert notes["A channel is hardly reproduced"].text.endswith("have opposite signs: top.")
+
+
 def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_named(vibrating):
     sampler, posterior = vibrating
     finished = read_run(sampler, posterior)

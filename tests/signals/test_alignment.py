@@ -56,6 +56,7 @@ def test_lag_without_noise(rng, lag):
     assert found.lag == pytest.approx(lag, abs=1e-5)
     assert found.correlation["base"] == pytest.approx(-1.0, abs=1e-6) and found.probability > 0.999
     assert found.statement.startswith("lag ") and "NOT SURE" not in found.statement
+    assert found.statement.endswith("; the sign is opposite: base")
     corrected = late(lag, rng).shift(-found.lag)
     assert align(RECORD, corrected).lag == pytest.approx(0.0, abs=1e-5)
 

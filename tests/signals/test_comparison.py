@@ -166,6 +166,9 @@ def test_measurements_outside_the_response_are_refused(model):
     ):
         with pytest.raises(ValueError, match="use the same part of record and measurements"):
             FELikelihood(model, wrong)
+    clock = Measurements(CHANNELS, 0.02, np.ones((2, 201)), start=86395.5)
+    with pytest.raises(ValueError, match=r'begin at 86395.5 s; give .* zero=12.5 or zero="10:32:07" of read_columns'):
+        FELikelihood(model, clock)
     ended = Measurements(CHANNELS, 0.02, np.where(np.arange(201) < 150, 1.0, np.nan) * np.ones((2, 1)))
     assert FELikelihood(model, ended).n_samples.samples.tolist() == [150, 150]
 

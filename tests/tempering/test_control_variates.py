@@ -98,9 +98,13 @@ def test_wrong_arguments(rng):
     sample = signed_sample(rounds_of(rng, 30, 1))
     with pytest.raises(ValueError, match="between 0 and 1; got 1.5"):
         sample.quantile(1.5)
-    with pytest.raises(ValueError, match="for each of 2030 points; got an array of shape"):
-        sample.expectation(lambda coords: 1.0)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="one number between 0 and 1"):
+        sample.quantile([0.05, 0.95])
+    for wrong in (lambda coords: 1.0, lambda coords: coords[0]):
+        with pytest.raises(ValueError, match=r"each of the 2030 points, .* got an array of shape"):
+            sample.expectation(wrong)
+    assert repr(sample).startswith("<SignedSample of 2030 points, 3 parameters, log-evidence 3.9")
+    with pytest.raises(ValueError, match="finite numbers; .* are not"):
         sample.expectation(lambda coords: np.where(coords[:, 0] > 0.0, np.inf, 1.0))
 
 
