@@ -4,9 +4,8 @@
 format in their error.
 
 Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
-ValueError if neither states them or if they disagree. The formats themselves are in
-`fe_likelihoods.signals.file_formats` (AT2, V2), `fe_likelihoods.signals.network_formats` (SMC, GeoNet, K-NET, ESM) and
-`fe_likelihoods.signals.tables` (CSV). Measured responses have their readers in
+ValueError if neither states them or if they disagree. The formats themselves are in the modules `at2_v2_formats`,
+`smc_geonet_knet_esm_formats` and `tables` (CSV) of this folder. Measured responses have their readers in
 `fe_likelihoods.signals.measurement_readers`.
 """
 
@@ -18,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..units import to_si
-from . import file_formats, network_formats, tables
+from . import at2_v2_formats, smc_geonet_knet_esm_formats, tables
 from .records import Record
 from .text_files import Series, agree_on_unit, read_bytes, read_text
 
@@ -60,7 +59,7 @@ def read_at2(path: str | Path, units: str | None = None) -> Record:
         number of samples than NPTS, or has a sample that is not a finite number.
     """
     with named_format(path, "read_at2"):
-        series = file_formats.parse_at2(read_text(path), str(path))
+        series = at2_v2_formats.parse_at2(read_text(path), str(path))
     return _record(series, units, path, Path(path).stem)
 
 
@@ -84,7 +83,7 @@ def read_smc(path: str | Path) -> Record:
         that its header states.
     """
     with named_format(path, "read_smc"):
-        series = network_formats.parse_smc(read_text(path), str(path))
+        series = smc_geonet_knet_esm_formats.parse_smc(read_text(path), str(path))
     return _record(series, None, path, Path(path).stem)
 
 
@@ -110,7 +109,7 @@ def read_geonet(path: str | Path, component: str | None = None) -> Record:
         component does not have the number of samples and the peak that its header states.
     """
     with named_format(path, "read_geonet"):
-        found = network_formats.parse_geonet(read_text(path), str(path))
+        found = smc_geonet_knet_esm_formats.parse_geonet(read_text(path), str(path))
     chosen = [each for each in found if component is None or each.component.lower() == component.lower()]
     if len(chosen) != 1:
         raise ValueError(
@@ -140,7 +139,7 @@ def read_knet(path: str | Path) -> Record:
         header states.
     """
     with named_format(path, "read_knet"):
-        series = network_formats.parse_knet(read_text(path), str(path))
+        series = smc_geonet_knet_esm_formats.parse_knet(read_text(path), str(path))
     return _record(series, None, path, Path(path).name)
 
 
@@ -164,7 +163,7 @@ def read_esm(path: str | Path) -> Record:
         that its header states.
     """
     with named_format(path, "read_esm"):
-        series = network_formats.parse_esm(read_text(path), str(path))
+        series = smc_geonet_knet_esm_formats.parse_esm(read_text(path), str(path))
     return _record(series, None, path, Path(path).stem)
 
 
@@ -203,7 +202,7 @@ def read_record(
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
         return read_v2(path, channel, member)
-    name, reader = network_formats.recognise(content.decode("latin-1"))
+    name, reader = smc_geonet_knet_esm_formats.recognise(content.decode("latin-1"))
     if name and reader is None:
         raise ValueError(f"{path}: {_looks_like(name, None)}")
     if reader == "read_at2":
@@ -244,7 +243,7 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
         damaged.
     """
     with named_format(path, "read_v2"):
-        candidates = file_formats.find_v2_channels(path, member)
+        candidates = at2_v2_formats.find_v2_channels(path, member)
     chosen = [each for each in candidates if channel is None or each.channel == channel]
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
@@ -252,7 +251,7 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
             f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; choose "
             f"with channel= and member= among\n  {listing}"
         )
-    series = file_formats.parse_v2(chosen[0])
+    series = at2_v2_formats.parse_v2(chosen[0])
     record = _record(series, None, chosen[0].file, series.title)
     return replace(record, source=chosen[0].file.removeprefix(f"{Path(path).parent}/"))
 
@@ -335,7 +334,7 @@ def named_format(path: str | Path, reader: str) -> Iterator[None]:
         yield
     except ValueError as error:
         try:
-            name, other = network_formats.recognise(read_text(path))
+            name, other = smc_geonet_knet_esm_formats.recognise(read_text(path))
         except ValueError:
             raise error from None
         if not name or other == reader:

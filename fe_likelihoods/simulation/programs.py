@@ -1,7 +1,7 @@
 """Programs that run under a supervisor, which kills all processes that they leave behind.
 
-See `fe_likelihoods.simulation.supervisor`. A supervisor runs one program at a time and is kept for the next program,
-since its start takes about 50 ms.
+See `fe_likelihoods.simulation.program_supervisor`. A supervisor runs one program at a time and is kept for the next
+program, since its start takes about 50 ms.
 """
 
 import json
@@ -15,7 +15,7 @@ from contextlib import suppress
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from . import supervisor
+from . import program_supervisor
 from .faults import RunFailed, TransientReason
 
 __all__ = ["run_program"]
@@ -30,7 +30,7 @@ class _Supervisor:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", supervisor.__file__],
+            [sys.executable, "-I", "-S", program_supervisor.__file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -47,7 +47,7 @@ class _Supervisor:
         return self._owner == os.getpid() and self._process.poll() is None
 
     def send(self, request: dict | None) -> None:
-        """Send a request, as `supervisor.main` describes it."""
+        """Send a request, as `program_supervisor.main` describes it."""
         with suppress(OSError):  # `receive` reports that the supervisor has died
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
 

@@ -1,7 +1,7 @@
 """File formats of strong-motion networks: USGS SMC, GeoNet V1A and V2A, K-NET and KiK-net, ESM and ITACA.
 
 The functions return plain numbers with the unit, the step and the title that a file states, as in
-`fe_likelihoods.signals.file_formats`. The stated number of samples and the stated peak are compared with the samples,
+`fe_likelihoods.signals.at2_v2_formats`. The stated number of samples and the stated peak are compared with the samples,
 so that a file with another layout is refused instead of misread.
 
 USGS SMC
