@@ -75,12 +75,17 @@ def verify_cache(file: Path, settings: Path | None = None) -> Verified:
     if settings is None:
         cache.close()
         return Verified(not damaged, text)
-    again = _simulated_again(cache, settings)
+    agree = _agree_with(cache, settings)
+    if agree:
+        text += f"; {cache.verified} stored points were simulated again and agree"
+    else:
+        text += f"; new simulations of the model in {settings.name} differ from the stored ones, which are not used"
     cache.close()
-    return Verified(not damaged, f"{text}; {again} stored points were simulated again and agree")
+    return Verified(agree and not damaged, text)
 
 
-def _simulated_again(cache: SimulationCache, settings: Path) -> int:
+def _agree_with(cache: SimulationCache, settings: Path) -> bool:
+    """Simulate stored points of the model in `settings` again; False if they differ and a new generation has begun."""
     from .job import read_job
     from .models import make_problem
 
@@ -90,8 +95,10 @@ def _simulated_again(cache: SimulationCache, settings: Path) -> int:
         raise ValueError(
             f"{cache.path} has no simulations of the model in {settings.name}; give the TOML file of its run"
         )
+    key = likelihood.simulator.simulation_key
+    before = cache.generations_of(key)
     likelihood.misfit(stored[None, :])
-    return cache.verified
+    return cache.generations_of(key) == before
 
 
 def export_cache(file: Path, out: Path) -> str:

@@ -115,7 +115,8 @@ def _say_simulation(problem: Problem, own: bool, say: Callable[[str], None]) -> 
     if own and np.where(opposite, rrmse(-response, measured.values), errors).max() > LARGE_ERROR:
         say(
             "CAUTION: a large error of a model of your own may come from its units: it must return SI units (m, m/s², "
-            "N, Pa, rad), whatever the units in [model.channels] and of the measurements"
+            "N, Pa, rad), whatever the units in [model.channels] and of the measurements. Or from times: zero in "
+            "[measurements] is the time in their file at which the base motion begins"
         )
     return seconds
 

@@ -187,7 +187,7 @@ def info(file: Path) -> None:
 def verify(file: Path, settings: Path | None) -> None:
     """Compare every row of FILE with its checksum; with --settings, some of them with new simulations.
 
-    Exit code 1 if FILE is damaged; it is not changed.
+    Exit code 1 if FILE is damaged (it is not changed), or new simulations differ from the stored ones.
     """
     from .caches import verify_cache
 

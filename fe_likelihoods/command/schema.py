@@ -4,6 +4,7 @@ Every section has a table of `Key`. A value is read by the kind of its key, and 
 file, the section and the key, and propose the nearest known key for an unknown one.
 """
 
+import datetime
 import difflib
 import importlib
 import inspect
@@ -423,6 +424,8 @@ def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict
     for name, value in given.items():
         kind = known[name].kind
         if kind == _ZERO:
+            if isinstance(value, datetime.time | datetime.datetime):  # a clock time without quotes
+                value = value.isoformat()
             if isinstance(value, str) and is_clock(value):
                 values[name] = value
                 continue

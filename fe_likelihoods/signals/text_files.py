@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import find_unit
+from ..units import DIMENSIONS, find_unit
 
 __all__ = [
     "LARGEST_FILE",
@@ -92,7 +92,8 @@ def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: s
     """
     names = [name for name in (stated, given) if name is not None]
     if not names:
-        raise ValueError(f"{file} does not state the unit of its {dimension}: give units=, for instance 'g'")
+        example = "g" if dimension == "acceleration" else DIMENSIONS[dimension]
+        raise ValueError(f"{file} does not state the unit of its {dimension}: give units=, for instance {example!r}")
     try:
         units = [find_unit(name, dimension) for name in names]
     except ValueError as error:
@@ -113,7 +114,8 @@ def parse_number(field: str, where: str) -> float:
     try:
         value = _as_float(field)
     except ValueError:
-        raise ValueError(f"{where}: expected a number, got {field[:100]!r}") from None
+        clock = ", or a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010'" if ":" in field else ""
+        raise ValueError(f"{where}: expected a number{clock}, got {field[:100]!r}") from None
     if not math.isfinite(value):
         raise ValueError(f"{where}: expected a finite number, got {field[:100]!r}")
     return value

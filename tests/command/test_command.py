@@ -67,6 +67,15 @@ def write_oscillator(folder: Path) -> None:
     (folder / "oscillator.toml").write_text(OSCILLATOR)
 
 
+def write_function(folder: Path, name: str, old: str = "", new: str = "") -> None:
+    """The template of a function as NAME.py and NAME.toml, with another line; a module is imported once by its name."""
+    shutil.copytree(ROOT / "data" / "templates", folder, dirs_exist_ok=True)
+    for kind, before, now in (("py", old, new), ("toml", "my_function.py", f"{name}.py")):
+        text = (folder / ("my_function.py" if kind == "py" else "function.toml")).read_text()
+        assert before in text
+        (folder / f"{name}.{kind}").write_text(text.replace(before, now) if before else text)
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with the test of an oscillator, which is the current one."""
@@ -176,8 +185,13 @@ def test_a_program_needs_a_time_limit_and_zero_may_be_a_clock_time(tmp_path):
         return make_problem(read_job(tmp_path / "other.toml")).posterior.likelihood.measurements
 
     usual = measured("", "")
-    for zero in ("2024-05-14 10:32:07.000", "37927 s"):
-        np.testing.assert_array_equal(measured('"10:32:07"', f'"{zero}"').values, usual.values)
+    for zero in (
+        '"2024-05-14 10:32:07.000"',
+        '"37927 s"',
+        "10:32:07",
+        "2024-05-14T10:32:07.000",
+    ):  # also without quotes
+        np.testing.assert_array_equal(measured('"10:32:07"', zero).values, usual.values)
     later = measured('"10:32:07"', '"10:32:08"').values
     np.testing.assert_array_equal(later[:, :-50], usual.values[:, 50:])  # 1 s at 0.02 s
     for old, new, message in (
@@ -263,6 +277,18 @@ def test_caches(folder):
     assert told[1] == copied[1] and told[3] == copied[3] and not told[3].startswith("responses    0,")
     assert "there is no file" in call("cache", "info", "nothing.sqlite", code=1)
     assert not Path("nothing.sqlite").exists()
+
+
+def test_verify_tells_that_new_simulations_differ(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_function(tmp_path, "weaker")
+    write_function(tmp_path, "stronger", "0.02 * STIFFNESS", "0.021 * STIFFNESS")
+    posterior = make_problem(read_job(tmp_path / "weaker.toml"), SimulationCache("stored.sqlite")).posterior
+    posterior(posterior.sample_prior(3, 1))
+    posterior.likelihood.simulator.cache.close()
+    verify = ["cache", "verify", "stored.sqlite", "--settings"]
+    assert "points were simulated again and agree" in call(*verify, "weaker.toml")
+    assert "in stronger.toml differ from the stored ones" in call(*verify, "stronger.toml", code=1)
 
 
 def test_a_damaged_cache_is_told_and_not_changed(folder):
@@ -385,25 +411,21 @@ def test_check_warns_of_what_is_likely_wrong(folder):
 
 
 def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
-    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    code = (tmp_path / "my_function.py").read_text().replace("    return response", "    return 1000.0 * response")
-    (tmp_path / "my_function_mm.py").write_text(code)
-    text = (tmp_path / "function.toml").read_text().replace("my_function.py", "my_function_mm.py")
-    (tmp_path / "function.toml").write_text(text)
-    assert "it must return SI units" in call("check", "function.toml")
+    write_function(tmp_path, "in_mm", "    return response", "    return 1000.0 * response")
+    assert "it must return SI units" in call("check", "in_mm.toml")
 
 
 def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     """And the units, which are right, are not suspected."""
-    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
+    write_function(tmp_path, "upright")
     comment, header, *lines = (tmp_path / "synthetic_measured.csv").read_text().splitlines()
     rows = [line.rpartition(",") for line in lines]
     turned = [f"{before},{-float(last)!r}" for before, _, last in rows]
-    assert "opposite" not in call("check", "function.toml")
+    assert "opposite" not in call("check", "upright.toml")
     (tmp_path / "synthetic_measured.csv").write_text("\n".join([comment, header, *turned]))
-    output = call("check", "function.toml")
+    output = call("check", "upright.toml")
     assert "opposite signs: displacement. Where" in output and "it must return SI units" not in output
 
 
