@@ -1,4 +1,4 @@
-"""What the command ``check`` does: read everything, simulate once, estimate the cost, draw the prior predictive."""
+"""What the command ``check`` does: read everything, simulate a few times, estimate the cost, draw the picture."""
 
 import time
 from collections.abc import Callable

@@ -130,7 +130,7 @@ def _say_assumed(problem: Any) -> None:
 @click.argument("file", type=_FILE)
 @click.option("--out", type=_FILE, help="PNG file of the prior predictive picture.", show_default="check-NAME.png")
 def check(file: Path, out: Path | None) -> None:
-    """Read FILE and its data, make one simulation, and say what a run will do and cost.
+    """Read FILE and its data, make a few simulations, and say what a run will do and cost.
 
     A picture compares the measurements with simulations at draws of the prior: the measurements should lie within
     their band.
