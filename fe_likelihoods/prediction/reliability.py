@@ -46,6 +46,8 @@ __all__ = [
     "warn_of_missing_error",
 ]
 
+_FAR = 10.0  # factor beyond all values from which a threshold is far from them
+
 
 class Exceedance(NamedTuple):
     """Probability that a quantity exceeds a threshold.
@@ -152,7 +154,8 @@ def exceedance(
     Warns
     -----
     UserWarning
-        If a prediction contains no model error: its probability is then too close to 0 or to 1.
+        If a prediction contains no model error: its probability is then too close to 0 or to 1. If a threshold without
+        a unit seems to be in the unit of the channel.
 
     Examples
     --------
@@ -194,6 +197,8 @@ def exceedance(
             f"{limits.shape}"
         )
     check_level(level)
+    if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
+        _warn_of_unit(limits, values, channels[0])
     said, unit = contents(has_error, spread), unit_of_threshold(unit, channels)
     if spread.ratios is None and spread.weights is None:
         if values.ndim == 1:
@@ -347,6 +352,20 @@ def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[C
             "units, without a unit"
         )
     return np.asarray(to_si(limits, unit, *dimensions))
+
+
+def _warn_of_unit(limits: np.ndarray, values: np.ndarray, channel: Channel) -> None:
+    """Warn if thresholds are far from all values [SI], and among them in the unit of the channel."""
+    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
+    low, high = np.abs(values).min() / _FAR, np.abs(values).max() * _FAR
+    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
+    if np.all(inside & outside):
+        unit, largest = channel.unit, np.abs(values).max()
+        warnings.warn(
+            f"the threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all "
+            f'predicted values (up to {largest:.3g}): is it in {unit}? Then pass unit="{unit}"',
+            stacklevel=3,
+        )
 
 
 def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:

@@ -1,5 +1,7 @@
 """Probability of exceedance: closed forms, intervals, units and shapes."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -49,6 +51,13 @@ def test_units_and_shapes_of_thresholds(record, rng):
     p = propagate(model, samples, quantity=peak("displacement"), progress=False)
     assert np.array_equal(exceedance(p, 10.0, unit="cm").probability, exceedance(p, 0.1).probability)
     assert exceedance(p, [[0.05, 0.1], [0.15, 0.2]]).probability.shape == (2, 2)
+    shown = {"m": 1.0, "cm": 100.0, "mm": 1000.0}[p.channels[0].unit]
+    with pytest.warns(UserWarning, match=f'far from all predicted values .* pass unit="{p.channels[0].unit}"'):
+        exceedance(p, 0.1 * shown)
+    with warnings.catch_warnings():  # a rare event is no mistake of units
+        warnings.filterwarnings("error", message=".*far from all")
+        exceedance(p, 0.3)
+        exceedance(p, 0.1 * shown, unit=p.channels[0].unit)
     with pytest.raises(ValueError, match="expected a unit of displacement, got 'kN'"):
         exceedance(p, 10.0, unit="kN")
     with pytest.raises(ValueError, match="unknown unit"):
