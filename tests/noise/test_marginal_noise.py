@@ -199,7 +199,7 @@ def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
     expected = np.square(named["sigma_displacement"]).mean()
     np.testing.assert_allclose((with_noise.variance - without.variance)[1], expected, rtol=1e-9)
     np.testing.assert_array_equal(fit_measures(marginal, samples), fit_measures(full, samples))
-    with pytest.raises(ValueError, match="shape"):
+    with pytest.raises(ValueError, match="draw_noise"):
         propagate(marginal, samples, noise=True, progress=False)
     with pytest.raises(ValueError, match="are in the samples of this posterior"):
         full.draw_noise(samples)
