@@ -52,15 +52,10 @@ _NOT_A_MODE = (
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
 _REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
 _LONGEST = 4  # such directions at whose ends runs are made
-_MOST_EXTENSIONS, _GROWTH = 10, 0.05  # of an emulator along these, while the log-evidence changes by as much
+_MOST_EXTENSIONS, _GROWTH = 6, 0.05  # of an emulator along these, while the log-evidence changes by as much
 _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
-)
-_LATE = 0.2  # growth of the emulated log-evidence after draws were made that is a reason for concern
-_GREW = (
-    "the draws of the first rounds did not reach along a direction that the data leave to the prior, so the evidence "
-    "may be too small"
 )
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
@@ -221,13 +216,7 @@ class ResponseGuide:
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
         """Learn from evaluated points (n, ndim): ascents from surprising ones, and new emulators."""
         yield from self._ascend_from_surprises(parameters, log_prob, session)
-        earlier = self._emulated
         self._emulate(session.random)
-        if earlier is None or self._emulated is None:
-            return
-        if self._emulated.log_evidence > earlier.log_evidence + _LATE and len(self._free_directions()[0]):
-            self._add_concern(_GREW)
-            yield from self._follow_ridges(session)
 
     # ------------------------------------------------------------------ parts
 
@@ -246,7 +235,6 @@ class ResponseGuide:
 
     def _follow_ridges(self, session: Any) -> Iterator[None]:
         """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
-        settled = 0  # twice, because the first runs at the ends of a new stretch may add nothing
         for _ in range(_MOST_EXTENSIONS):
             free, _ = self._free_directions()
             if not len(free):
@@ -260,8 +248,7 @@ class ResponseGuide:
             self.simulations += new
             yield
             self._emulate(session.random)
-            settled = settled + 1 if abs(self._emulated.log_evidence - earlier.log_evidence) < _GROWTH else 0
-            if settled == 2:
+            if abs(self._emulated.log_evidence - earlier.log_evidence) < _GROWTH:
                 break
         self.concerns = tuple(concern for concern in self.concerns if concern != _SHORT_OF_THE_RIDGE)
         if np.any(self._free_directions()[1] < _REACHED):
