@@ -23,7 +23,7 @@ from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
 from .stacked import is_joint
-from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
+from .student import StudentMixture, draw_mixture, mixture_log_density
 from .target import ResponseTarget
 
 __all__ = ["ResponseGuide"]
@@ -37,7 +37,7 @@ _WIDENED = 1.5  # variances of the wide components, as multiples of their region
 _SHARE_OF_MODES = 0.25  # of the wide mixture around the modes that were found, the rest around the emulated means
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
-_FEWEST_RUNS = 1.0, 4.0  # training runs that an emulator needs: per dimension, and in addition
+_FEWEST_RUNS = 2.0, 6.0  # training runs that an emulator needs: per dimension, and in addition
 _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
@@ -48,14 +48,6 @@ _MOST_ASCENTS = 2  # of these, per refinement
 _NOT_A_MODE = (
     "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
     "use more starts"
-)
-_FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
-_REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
-_LONGEST = 4  # such directions at whose ends runs are made
-_MOST_EXTENSIONS, _GROWTH = 6, 0.05  # of an emulator along these, while the log-evidence changes by as much
-_SHORT_OF_THE_RIDGE = (
-    "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
-    "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
 )
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
@@ -178,8 +170,6 @@ class ResponseGuide:
                 f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: "
                 "use more starts"
             )
-        self._emulate(session.random)
-        yield from self._follow_ridges(session)
 
     def evaluation_queue(self) -> Any:
         """The queue of the posterior, which keeps the responses for `observe`."""
@@ -216,16 +206,10 @@ class ResponseGuide:
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
         """Learn from evaluated points (n, ndim): ascents from surprising ones, and new emulators."""
         yield from self._ascend_from_surprises(parameters, log_prob, session)
-        self._emulate(session.random)
-
-    # ------------------------------------------------------------------ parts
-
-    def _emulate(self, random: np.random.RandomState) -> None:
-        """Fit emulators to all runs, and the emulated posterior; an implausible one is not used."""
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
-            emulated = EmulatedPosterior(self._target, self._regions, random)
+            emulated = EmulatedPosterior(self._target, self._regions, session.random)
             if emulated.top > self._best + _IMPLAUSIBLE + self._target.ndim:
                 logger.info("the emulators have a top (%.1f) far above all runs (%.1f)", emulated.top, self._best)
                 return
@@ -233,42 +217,7 @@ class ResponseGuide:
             self._regions = self._emulated.moments()
             self._wide = self._wide_mixture()
 
-    def _follow_ridges(self, session: Any) -> Iterator[None]:
-        """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
-        for _ in range(_MOST_EXTENSIONS):
-            free, _ = self._free_directions()
-            if not len(free):
-                break
-            earlier = self._emulated
-            points = earlier.extremes(free[:_LONGEST])[:, : self._target.n_structural]
-            new = self._target.new_points(points)
-            if not session.fits(new):
-                break
-            self._target.run(points, session.remember)
-            self.simulations += new
-            yield
-            self._emulate(session.random)
-            if abs(self._emulated.log_evidence - earlier.log_evidence) < _GROWTH:
-                break
-        self.concerns = tuple(concern for concern in self.concerns if concern != _SHORT_OF_THE_RIDGE)
-        if np.any(self._free_directions()[1] < _REACHED):
-            self._add_concern(_SHORT_OF_THE_RIDGE)
-
-    def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions (n, ndim) that the data leave to the prior, the longest first, and how far the draws reach along.
-
-        The reach (n,) is the variance of the draws as a share of the variance at the mode.
-        """
-        directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
-        if self._emulated is not None:
-            spread = self._emulated.covariance()
-            # the draws themselves as well: differences of a rough response make a mode too narrow
-            for covariance in (spread, *(mode.covariance for mode in self._modes)):
-                values, vectors = np.linalg.eigh(covariance)
-                free, allowed = vectors[:, values > _FREE].T[::-1], values[values > _FREE][::-1]
-                directions.append(free)
-                reached.append(((free @ spread) * free).sum(axis=1) / allowed)
-        return np.concatenate(directions), np.concatenate(reached)
+    # ------------------------------------------------------------------ parts
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
@@ -334,7 +283,7 @@ class ResponseGuide:
         # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
         centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self._modes)]
         covariances = [*(region.covariance for region in self._regions), *(mode.covariance for mode in self._modes)]
-        factors = [factor_of(_WIDENED * covariance) for covariance in covariances]
+        factors = [np.linalg.cholesky(_WIDENED * covariance) for covariance in covariances]
         weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
         return StudentMixture(weights, np.array(centres), np.array(factors), _WIDE_FREEDOM)
 

@@ -6,17 +6,19 @@ and their misfit is smoother, because errors in a period have had less time to a
 centred on each start, so that starts keep their differences in parameters without effect on the early part.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Batches, Jacobians, ascend, axes_of, distinct_ends
+from .levenberg_marquardt import TOLERANCE, Ascent, Batches, ascend, distinct_ends
 from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = ["Mode", "ModeSearch", "check_starts", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
 
+_FIRST_WAVE = 3  # starts whose ascents are made first, on the first part of the record
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
@@ -24,7 +26,6 @@ _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
 _APART_OF_ALL = 2.0  # the same, times the number of starts
-_FEW = 6  # parameters whose differences cost about as much as two steps
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -80,13 +81,13 @@ class ModeSearch(NamedTuple):
     finished: bool
 
 
-def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -> Mode:
+def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     """Laplace approximation at the end of an ascent, over structural and noise coordinates together.
 
     The residuals are taken as linear in the structural coordinates, so that nothing is simulated. The Hessian of the
     log-density is computed by central differences with steps of 1/3 standard deviation.
     """
-    statistics = end.statistics
+    statistics = target.statistic(end.residuals)
     noise = max(end.noise, target.fit_noise(statistics), key=lambda fit: fit.log_density)
     d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
     along = 2.0 * bilinear_form(target.statistic, end.slopes, end.residuals[None])[:, 0]
@@ -118,16 +119,19 @@ def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -
     top = float(log_density(at[None])[0])
     log_evidence = top + 0.5 * target.ndim * float(np.log(2.0 * np.pi)) - 0.5 * float(np.log(values).sum())
     parameters = target.parameters(at[None])[0]
-    return Mode(parameters, at, covariance, top, log_evidence, starts, end.converged)
+    return Mode(parameters, at, covariance, top, log_evidence, end.starts, end.converged)
 
 
-class _Part(NamedTuple):
-    """A part of the record, with the ends found on it by the numbers of their starts."""
-
-    target: ResponseTarget
-    share: float
-    ends: dict[int, Ascent]
-    jacobians: Jacobians
+def _finish(fronts: Sequence[tuple], ends: list[Ascent], index: int, end: Ascent | None) -> None:
+    """Enter where an ascent from a front has ended, or that it joined an earlier end."""
+    if end is None:
+        return
+    starts = fronts[index][2]
+    if end.merged >= 0:
+        joined = ends[end.merged]
+        ends[end.merged] = joined._replace(starts=(*joined.starts, *starts))
+    else:
+        ends.append(end._replace(starts=starts))
 
 
 def search_modes(
@@ -157,77 +161,43 @@ def search_modes(
     float
         Cost of each batch, in simulations of the whole record.
     """
-    n, d, spent, modes, interrupted = len(starts), target.n_structural, 0.0, [], False
-    shortened = [*target.shortened(_SHARES), target]
-    parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in shortened]
-    small = FIRST_DIFFERENCE * np.eye(d) if len(parts) > 1 else None
-    standing_for = list(range(n))  # start that has taken the place of each; -1 for none
-
-    def mode_of(k: int) -> int:
-        while k >= 0 and standing_for[k] != k:
-            k = standing_for[k]
-        return next((number for number, mode in enumerate(modes) if k in mode.starts), -1)
-
-    # again, with differences at every step, where a mode has one start only and differences are cheap
-    cheap = len(parts) > 1 or d <= _FEW
-    for exact in (False, True) if cheap else (False,):
-        again = [k for k in range(n) if mode_of(k) < 0]
-        fronts = {k: (starts[k], small) for k in again}
-        standing_for = [k if k in fronts else other for k, other in enumerate(standing_for)]
-        for part, following in zip(parts, [*parts[1:], None], strict=True):
-            whole = part.target is target
-            tolerance = TOLERANCE if whole else min(TOLERANCE / part.share, _LOOSEST)
-            # many starts are close together, and none may be lost before the part of the record where they differ
-            apart = np.inf if whole else min(_APART, _APART_OF_ALL / n)
-            batches = Batches(part.target, remember, lambda points, share=part.share: fits(share * points), overlap)
-            ascents = {
-                k: ascend(
-                    part.target,
-                    part.jacobians if whole and not exact and d > _FEW else Jacobians(),
-                    k,
-                    start,
-                    np.zeros(d) if whole else start,
-                    part.ends,
-                    tolerance,
-                    apart,
-                    steps,
-                    exact,
-                    whole,
-                )
-                for k, (start, steps) in fronts.items()
-            }
-            # the best end of the part before first: others often lead to it, which costs them no derivatives
-            first = n if overlap or part is parts[0] else 1
-            for wave in (list(ascents)[:first], list(ascents)[first:]):
-                for points in batches.complete({k: ascents[k] for k in wave}, standing_for.__setitem__):
-                    spent += part.share * points
-                    yield part.share * points
-                if batches.interrupted:
-                    break
-            interrupted = batches.interrupted
-            if not part.ends or interrupted:
+    spent, interrupted, mode_of = 0.0, False, {}
+    parts = [*target.shortened(_SHARES), target]
+    fronts = [(start, start, (k,)) for k, start in enumerate(starts)]
+    for part in parts:
+        share = part.n_steps / target.n_steps
+        whole = part is target
+        ends: list[Ascent] = []
+        tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
+        # many starts are close together, and none may be lost before the part of the record where they differ
+        apart = np.inf if whole else min(_APART, _APART_OF_ALL / len(starts))
+        origin = np.zeros(target.n_structural)
+        batches = Batches(part, remember, lambda points, share=share: fits(share * points), overlap)
+        # two waves: ascents of the second wave stop as soon as they head for an end of the first. That saves a few
+        # simulations and doubles the time, so that it is left out where the time matters
+        first = len(fronts) if overlap else _FIRST_WAVE if part is parts[0] else 1
+        for wave in (fronts[:first], fronts[first:]):
+            ascents = [
+                ascend(part, start, origin if whole else centre, ends, tolerance, apart) for start, centre, _ in wave
+            ]
+            for points in batches.complete(ascents, partial(_finish, wave, ends)):
+                spent += share * points
+                yield share * points
+            if batches.interrupted:
                 break
-            for k, other in distinct_ends(part.ends, apart).items():
-                if k != other:
-                    standing_for[k] = other
-                    del part.ends[k]
-            best = max(end.value for end in part.ends.values())
-            # a model that is not exact may fit a part of the record best where it does not fit the whole one
-            good = {k: e for k, e in part.ends.items() if k in fronts and e.value > best - _HOPELESS * e.residuals.size}
-            for k in fronts.keys() & part.ends.keys() - good.keys():
-                standing_for[k] = -1
-            ordered = sorted(good, key=lambda k: -part.ends[k].value)
-            wide = following is not None and following.target is target
-            fronts = {k: (good[k].coords, axes_of(good[k]) if wide else small) for k in ordered}
-        if interrupted:
+        interrupted = batches.interrupted
+        if not ends or interrupted or whole:
             break
-        modes = sorted((laplace(target, end, (k,)) for k, end in parts[-1].ends.items()), key=lambda m: -m.log_evidence)
+        # a model that is not exact may fit a part of the record best where it does not fit the whole one
+        least = max(end.log_density for end in ends) - _HOPELESS * part.measured.size
+        fronts = [(end.coords, end.coords, end.starts) for end in distinct_ends(ends, apart) if end.log_density > least]
+    modes: list[Mode] = []
+    if part is target and ends:
+        modes = sorted((laplace(target, end) for end in distinct_ends(ends)), key=lambda mode: -mode.log_evidence)
         modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
-        led = [mode_of(k) for k in range(n)]
-        if not any(led.count(number) == 1 for number in range(len(modes))):
-            break
-    modes = [m._replace(starts=tuple(k for k in range(n) if mode_of(k) == number)) for number, m in enumerate(modes)]
-    return ModeSearch(tuple(modes), tuple(mode_of(k) for k in range(n)), spent, not interrupted)
+    for number, mode in enumerate(modes):
+        mode_of.update(dict.fromkeys(mode.starts, number))
+    return ModeSearch(tuple(modes), tuple(mode_of.get(k, -1) for k in range(len(starts))), spent, not interrupted)
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
@@ -304,9 +274,13 @@ def search_from(
     target: ResponseTarget, start: np.ndarray, remember: Remember, fits: Callable[[float], bool]
 ) -> Generator[float, None, Mode | None]:
     """One ascent on the whole record from a point (n_structural,); returns the mode, or None if the budget ended it."""
-    known: dict[int, Ascent] = {}
-    ascent = ascend(target, Jacobians(), 0, start, np.zeros(target.n_structural), known)
+    ends: list[Ascent] = []
+
+    def finish(_: int, end: Ascent | None) -> None:
+        if end is not None:
+            ends.append(end)
+
     batches = Batches(target, remember, fits)
-    for points in batches.complete({0: ascent}, lambda *_: None):
+    for points in batches.complete([ascend(target, start, np.zeros(target.n_structural))], finish):
         yield float(points)
-    return laplace(target, known[0]) if known and not batches.interrupted else None
+    return laplace(target, ends[0]) if ends else None

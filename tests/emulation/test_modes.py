@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, problems
-from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _Climb, _Point, _valley
+from fe_likelihoods.emulation.levenberg_marquardt import Ascent, _connected, _has_valley
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
@@ -131,10 +131,9 @@ def test_a_rough_likelihood_neither_splits_a_mode_nor_prolongs_an_ascent():
 
 
 def test_a_valley_is_a_point_below_points_on_both_sides():
-    assert _valley(np.array([480.0, 300.0, 100.0, 0.0, -98.0])) < 0.0  # descends: left to the check of the height
-    assert _valley(np.array([0.0, -2.0, 1.0, -1.0, 0.5])) == 2.0 < _DIP
-    # over the top of a mode, and a valley, to another one
-    assert _valley(np.array([-15.0, 0.0, -18.0, -2.0, 0.0])) == 18.0
+    assert not _has_valley(np.array([480.0, 300.0, 100.0, 0.0, -98.0]))  # descends: left to the check of the height
+    assert not _has_valley(np.array([0.0, -2.0, 1.0, -1.0, 0.5]))
+    assert _has_valley(np.array([-15.0, 0.0, -18.0, -2.0, 0.0]))  # over the top of a mode, and a valley, to another one
 
 
 @pytest.mark.parametrize("value", [100.0, 480.0])
@@ -142,16 +141,13 @@ def test_an_ascent_does_not_join_an_end_of_another_height(value):
     """The end of an ascent that is stuck in a local maximum is not the end of one that is already far above it."""
     target = ResponseTarget(vibration())
     start, *_ = find_modes(vibration(), starts=1, seed=1).modes
-    coords, noise = start.coords[:2], target.fit_noise(np.ones(2))
-    zero, nothing = np.zeros(2), np.zeros((2, 2, 200))
-    known = {7: Ascent(coords + 0.1, nothing[0], zero, noise, 300.0, nothing, zero, zero, np.eye(2))}
-    known[0] = known[7]._replace(value=value)
-    climb = _Climb(target, Jacobians(), zero, known, np.inf, 0, False)
-    climb.here = _Point(coords, nothing[0], zero, noise, value)
-    search = climb.connected()
+    coords = start.coords[:2]
+    nothing = np.zeros((2, 2, 200))
+    low = Ascent(coords + 0.1, 300.0, np.eye(2), target.fit_noise(np.ones(2)), nothing[0], nothing, 0.0, 3)
+    search = _connected(target, coords, value, low.noise, np.zeros(2), [low], np.inf)
     with pytest.raises(StopIteration) as end:
         next(search)
-    assert end.value.value is None
+    assert end.value.value == -1
 
 
 def test_an_end_that_fits_only_the_first_part_worse_is_kept():
