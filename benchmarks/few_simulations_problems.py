@@ -5,7 +5,8 @@ seeds.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from fe_likelihoods import (
 from fe_likelihoods.signals.readers import read_csv
 from tests import opensees_frame
 
-from . import tested_column
+from . import many_stiffnesses, tested_column
 from .targets import SHARED
 
 __all__ = ["PROBLEMS", "Problem"]
@@ -54,6 +55,8 @@ class Problem(NamedTuple):
     reference_draws, reference_rounds : int
         Draws per round of the reference by importance sampling, and rounds. No draws: the reference is a longer run of
         the default sampler, where importance sampling from a known mode fails (many local modes).
+    exact : callable, optional
+        Function of the posterior that returns its `Reference` by quadrature, at once.
     """
 
     what: str
@@ -66,6 +69,7 @@ class Problem(NamedTuple):
     measured: bool = False
     reference_draws: int = 400
     reference_rounds: int = 8
+    exact: Callable[[Posterior], Any] | None = None
 
 
 def oscillator(seed: int) -> Posterior:
@@ -193,5 +197,26 @@ PROBLEMS = {
         measured=True,
         reference_draws=0,
     ),
+}
+PROBLEMS |= {
+    f"shear{storeys}": Problem(
+        f"shear building, {storeys} stiffnesses, 4 accelerations",
+        partial(many_stiffnesses.shear_building, storeys),
+        lambda posterior: np.ones((1, posterior.ndim)),
+        goal,
+        reference_draws=40 * storeys**2,
+        reference_rounds=6,
+    )
+    for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
+}
+PROBLEMS |= {
+    name: Problem(
+        f"only the product E h^3 is identified, {name}",
+        partial(many_stiffnesses.ridge, name),
+        lambda posterior: np.array([[1.3, 0.9]]),
+        500,
+        exact=partial(many_stiffnesses.ridge_reference, name),
+    )
+    for name in many_stiffnesses.RIDGES
 }
 """All problems by name."""

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from own_program import solve
 
-from fe_likelihoods import Channel
-from fe_likelihoods.problems import table_motion
+from fe_likelihoods import Channel, problems
 
 NAMES = ("stiffness", "strength")
 CHANNELS = (
@@ -22,7 +21,7 @@ STIFFNESS = (2.0 * np.pi / 0.8) ** 2  # per unit mass [1/s²]: a period of 0.8 s
 STRENGTH = 0.02 * STIFFNESS  # per unit mass [m/s²]: yields at 20 mm
 HARDENING = 0.05  # ratio of the stiffness after yielding to the initial one
 DAMPING = 2.0 * 0.03 * np.sqrt(STIFFNESS)  # per unit mass [1/s]: 3 % of critical damping
-RECORD = table_motion().trim(0.0, 8.0).resample(0.01)
+RECORD = problems.table_motion().trim(0.0, 8.0).resample(0.01)
 
 PROGRAM = Path(__file__).with_name("own_program.py")
 INPUT = """# multiples, then nominal values: stiffness [1/s2], strength [m/s2], hardening, damping [1/s], step [s]
