@@ -658,7 +658,7 @@ def test_data_files_are_found_at_any_depth(tmp_path, monkeypatch):
 
 
 def test_tutorials_have_the_form_that_the_documentation_renders():
-    """A docstring with an underlined title, cells of reStructuredText, imports of public names or from their modules."""
+    """A docstring with an underlined title, cells of reStructuredText, imports of public names."""
     for path in TUTORIALS:
         text = path.read_text()
         opening, title, underline = text.split("\n")[:3]
