@@ -3,11 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from .budget import Budget, as_limit
 from .estimates.control_variates import SignedSample
-from .estimates.genealogy import standard_error_of_mean
+from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
 from .evaluation.user_functions import OptionalAttributes
@@ -145,7 +144,7 @@ class RunResults:
         shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
         groups = 1.0 / np.sum(shares**2)
         errors = standard_error_of_mean(self.get_chain(discard=discard, thin=thin), self.founders)
-        return errors if len(shares) == 1 else errors * stdtrit(groups - 1.0, 0.975) / ndtri(0.975)
+        return errors if len(shares) == 1 else errors * student_factor(groups - 1.0)
 
     def _repr_html_(self) -> str:
         """In notebooks: summary of the run, or how to start it."""

@@ -142,12 +142,7 @@ class EmulatedPosterior:
 
     def _log_density_of(self, parameters: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of parameters (n, ndim)."""
-        coords, log_volume = self._target.to_coordinates(parameters)
-        inside = np.isfinite(log_volume)
-        result = np.full(len(parameters), -np.inf)
-        if inside.any():
-            result[inside] = self.log_density(coords[inside]) - self.log_evidence + log_volume[inside]
-        return result
+        return self._target.density_of_parameters(self.log_density, parameters) - self.log_evidence
 
     def _nearest(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Region (n,) that coordinates (n, ndim) belong to, and squared distances (n_regions, n) from all of them."""

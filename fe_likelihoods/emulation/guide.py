@@ -190,12 +190,7 @@ class ResponseGuide:
 
     def log_density(self, parameters: np.ndarray) -> np.ndarray:
         """Normalised log-density (n,) of the draws at parameters (n, ndim)."""
-        coords, log_volume = self._target.to_coordinates(parameters)
-        inside = np.isfinite(log_volume)
-        result = np.full(len(parameters), -np.inf)
-        if inside.any():
-            result[inside] = self._log_density(coords[inside]) + log_volume[inside]
-        return result
+        return self._target.density_of_parameters(self._log_density, parameters)
 
     def observe(self, parameters: np.ndarray, session: Any) -> None:
         """Simulate the responses of points (n, ndim) that are evaluated next, or take cached ones, and keep them."""

@@ -250,16 +250,17 @@ class ResponseTarget:
         """Coordinates (n, ndim) of parameters (n, ndim)."""
         return _finite(self._prior.to_normal(parameters))
 
-    def to_coordinates(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates (n, ndim) of parameters, and the logarithm (n,) of their volume over the parameters' volume.
-
-        The logarithm is -inf outside the support of the prior.
-        """
-        coords, log_volume = self.coordinates(parameters), np.full(len(parameters), -np.inf)
+    def density_of_parameters(
+        self, log_density: Callable[[np.ndarray], np.ndarray], parameters: np.ndarray
+    ) -> np.ndarray:
+        """Log-density (n,) of parameters (n, ndim), from a log-density of coordinates; -inf outside the support."""
+        coords, result = self.coordinates(parameters), np.full(len(parameters), -np.inf)
         log_prior = np.atleast_1d(self._prior.logpdf(parameters))
         inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
-        log_volume[inside] = log_prior[inside] - self.log_prior(coords[inside])
-        return coords, log_volume
+        if inside.any():
+            volume = log_prior[inside] - self.log_prior(coords[inside])
+            result[inside] = log_density(coords[inside]) + volume
+        return result
 
     def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""

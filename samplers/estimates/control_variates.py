@@ -29,8 +29,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
+from .genealogy import student_factor
 from .importance import Round
 
 __all__ = ["Expectation", "SignedSample", "signed_sample"]
@@ -115,7 +115,7 @@ class SignedSample(NamedTuple):
 
     def standard_deviation(self) -> Expectation:
         """Standard deviations (ndim,) of the parameters."""
-        mean = self.expectation().value
+        mean = self.weights @ self.coords
         variance, error = self.expectation(lambda coords: np.square(coords - mean))
         value = np.sqrt(np.maximum(variance, 0.0))
         return Expectation(value, 0.5 * error / np.where(value > 0.0, value, np.inf))
@@ -210,5 +210,5 @@ def _variance_of_sum(parts: np.ndarray) -> np.ndarray:
     parts = parts - parts.mean(axis=0)
     squares, fourth = np.square(parts).sum(axis=0), np.square(np.square(parts)).sum(axis=0)
     count = np.where(fourth > 0.0, squares**2 / np.where(fourth > 0.0, fourth, 1.0), n)
-    factor = stdtrit(np.maximum(count, FEWEST_CONTRIBUTIONS), 0.975) / ndtri(0.975)
+    factor = student_factor(np.maximum(count, FEWEST_CONTRIBUTIONS))
     return (1.0 + FEW / n) * squares * np.square(factor)

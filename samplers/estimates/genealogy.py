@@ -20,8 +20,9 @@ Olsson & Douc (2019), Bernoulli 25(2), doi:10.3150/18-BEJ1029 (founders a few ge
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
-__all__ = ["standard_error_of_mean", "trace_founders", "worst_effective_sample_size"]
+__all__ = ["standard_error_of_mean", "student_factor", "trace_founders", "worst_effective_sample_size"]
 
 MIN_FOUNDER_SHARE = 0.1
 # With few walkers, a tenth of them are too few groups for a variance: with 6 founders of 60 walkers, standard errors
@@ -29,6 +30,11 @@ MIN_FOUNDER_SHARE = 0.1
 MIN_FOUNDERS = 10
 # eigenvalues of the correlation matrix below which a direction has no variance
 SMALLEST_VARIANCE = 1e-12
+
+
+def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
+    """Factor of a standard error whose variance has few degrees of freedom: two errors then cover 95 %."""
+    return stdtrit(freedom, 0.975) / ndtri(0.975)
 
 
 def trace_founders(
