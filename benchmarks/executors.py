@@ -1,7 +1,7 @@
-"""Overhead of the executors of ``pool=`` per simulation, and their behaviour when a worker or the parent is killed.
+"""Overhead of the executors of ``pool=``, simulations per second of the parent, and what happens when one is killed.
 
 The model takes almost no time, so the result is the overhead of sending and receiving. Each case runs in a separate
-process, ``python -m benchmarks.executors WHAT POOL REPEATS``, which is killed if it hangs.
+process, ``python -m benchmarks.executors WHAT POOL REPEATS WORKERS``, killed if it hangs.
 """
 
 import contextlib
@@ -21,10 +21,21 @@ import numpy as np
 
 from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.simulation.executors import as_executor
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import simulate_batch
 from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
-from tests.faults.treacherous import CHANNELS, DT, KILLED, N_STEPS, DiesOnce, Treacherous, descendants, gone, line
+from tests.faults.treacherous import (
+    CHANNELS,
+    DT,
+    KILLED,
+    N_STEPS,
+    DiesOnce,
+    Treacherous,
+    descendants,
+    gone,
+    line,
+    posterior_of,
+)
 
 from .rows import Row
 
@@ -32,7 +43,9 @@ __all__ = ["executors"]
 
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
-ITEMS, LIMIT = 1000, 60.0
+ITEMS = 1000
+LIMIT = 20.0  # seconds of a case, after which it hangs: a worker of multiprocessing that dies is never answered for
+SECONDS_TO_DIE = 5.0  # after which processes whose parent was killed count as left
 THREADS = 64
 
 
@@ -51,6 +64,11 @@ def executors(repeats: int) -> list[Row]:
         answer = _answer("death", name, repeats)
         rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["note"]))
         rows.append(Row("executor: the parent is killed (SIGKILL)", case, *_left_over(name)))
+    for count in (1, 4, 16):
+        answer = _answer("parent", "local", repeats, count)
+        case = f"local, {count} worker{'s' if count > 1 else ''}"
+        for way in ("a batch", "one by one"):
+            rows.append(Row("executor: simulations of 0 s per second", f"{case}, {way}", answer.get(way), "1/s"))
     for name in ("isolated function", "program"):
         answer = _answer("overhead", name, repeats)
         rows.append(Row("executor: overhead per simulation", f"{name}, no pool", answer.get("microseconds"), "us"))
@@ -93,10 +111,10 @@ def _kill(process: subprocess.Popen) -> int:
     return process.wait()
 
 
-def _answer(what: str, name: str, repeats: int) -> dict:
+def _answer(what: str, name: str, repeats: int, count: int = WORKERS) -> dict:
     """The last line of JSON that the process of one case prints, or how the process ended."""
     with tempfile.TemporaryFile("w+") as output:
-        command = _command("benchmarks.executors", name, what, name, repeats)
+        command = _command("benchmarks.executors", name, what, name, repeats, count)
         process = _start(command, output)
         stop = time.monotonic() + LIMIT
         while process.poll() is None and time.monotonic() < stop:
@@ -111,7 +129,7 @@ def _answer(what: str, name: str, repeats: int) -> dict:
 
 
 def _left_over(name: str) -> tuple[float | None, str, str]:
-    """Number of processes left ten seconds after the process with the pool was killed."""
+    """Number of processes left some seconds after the process with the pool was killed."""
     with tempfile.TemporaryDirectory() as folder:
         command = _command("tests.faults.pooled_run", name, name, folder)
         parent = _start(command, subprocess.DEVNULL)
@@ -127,7 +145,7 @@ def _left_over(name: str) -> tuple[float | None, str, str]:
                 os.kill(first, 9)
             else:
                 parent.kill()
-            gone(children, 10.0)
+            gone(children, SECONDS_TO_DIE)
             left = [pid for pid in children if not gone([pid], 0.0)]
             return len(left), "processes left", f"of {len(children)}"
         finally:
@@ -170,6 +188,23 @@ def _overhead(name: str, repeats: int) -> dict:
     else:
         seconds = _seconds(Treacherous(), thetas, as_executor(POOLS[name]()), repeats)
     return {"microseconds": 1e6 * (seconds - cheap)}
+
+
+def _parent(count: int, repeats: int) -> dict:
+    """Simulations per second that a parent sends to a pool and receives, in a batch and one by one as they end."""
+    thetas = _thetas()
+    with LocalPool(count) as pool:
+        batch = 1.0 / _seconds(Treacherous(), thetas, pool, repeats)
+        points = np.column_stack([thetas, np.full(ITEMS, 0.5)])
+        rates = []
+        for _ in range(repeats):
+            with posterior_of(Treacherous(), pool=pool).evaluation_queue() as queue:
+                for some in (points[: 2 * count] + [0.0, 1.0, 0.0], points):  # the first ones load the model
+                    start, left = time.perf_counter(), len(queue.submit(some))
+                    while left > 0:
+                        left -= len(queue.collect())
+                rates.append(ITEMS / (time.perf_counter() - start))
+    return {"a batch": batch, "one by one": median(rates)}
 
 
 class Sleeper(Treacherous):
@@ -218,10 +253,14 @@ def _death(name: str) -> dict:
 
 def main() -> None:
     """One case: print its answer as JSON, and end without waiting for the pool."""
-    what, name, repeats = sys.argv[1:]
-    answer = {"overhead": lambda: _overhead(name, int(repeats)), "death": lambda: _death(name), "cluster": _cluster}[
-        what
-    ]()
+    what, name, repeats, count = sys.argv[1:]
+    cases = {
+        "overhead": lambda: _overhead(name, int(repeats)),
+        "parent": lambda: _parent(int(count), int(repeats)),
+        "death": lambda: _death(name),
+        "cluster": _cluster,
+    }
+    answer = cases[what]()
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
     if name != "mpi":
