@@ -241,6 +241,8 @@ class AnnealingResult(NamedTuple):
         How the limit of simulations ended the annealing; None if it did not.
     concerns : tuple of str
         Reasons of the guide why parts of the posterior may be missing.
+    refusals : tuple of str
+        Reasons of the guide why the result is not to be used.
     basis : str
         How the guide searched for parts of the posterior; empty if it does not say.
     findings : tuple of Concern
@@ -257,6 +259,7 @@ class AnnealingResult(NamedTuple):
     signed: SignedSample | None = None
     early_stop: EarlyStop | None = None
     concerns: tuple[str, ...] = ()
+    refusals: tuple[str, ...] = ()
     basis: str = ""
     findings: tuple[Concern, ...] = ()
     independent_points: float | None = None

@@ -579,9 +579,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
             recording.result = recording.result._replace(ladder=stored)  # with the wall times of the evaluations
         self._result = recording.result._replace(
             concerns=() if guidance is None else guidance.guide.concerns,
+            refusals=() if guidance is None else guidance.guide.refusals,
             basis="" if guidance is None else guidance.guide.basis,
             independent_points=independent_points(recording.result, population.coords),
         )
+        for concern in (*self._result.concerns, *self._result.refusals):
+            warn(f"the result may miss a part of the posterior: {concern}")
         if self._result.start is not None and self._result.start.used:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .emulator import ResponseEmulator
-from .student import StudentMixture, draw_mixture, mixture_log_density
+from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import ResponseTarget
 
 __all__ = ["EmulatedPosterior", "KnownDensity", "Region", "effective_sample_size"]
@@ -35,6 +35,7 @@ _KERNEL_SHARE = 0.7
 _KERNEL_FREEDOM = 8.0
 _STEPS = 6  # independence Metropolis steps of a draw
 _RIDGE = 1e-9
+_SMALLEST_SLOPE = 1e-9
 
 
 class Region(NamedTuple):
@@ -152,14 +153,45 @@ class EmulatedPosterior:
 
     def draw(self, n: int, random: np.random.RandomState) -> np.ndarray:
         """Draws (n, ndim) of the emulated posterior that are practically independent."""
-        coords = self._pool[random.choice(len(self._pool), n, p=self._weights)]
-        ratio = self.log_density(coords) - mixture_log_density(self._mixture, coords)
+        rows = random.choice(len(self._pool), n, p=self._weights)
+        coords, ratio = self._pool[rows], self._log_weights[rows]
         for _ in range(_STEPS):
-            proposed = draw_mixture(self._mixture, n, random)
-            other = self.log_density(proposed) - mixture_log_density(self._mixture, proposed)
+            _, proposed, other = self._propose(self._mixture, n, random)
             accepted = np.log(random.random_sample(n)) < other - ratio
             coords[accepted], ratio[accepted] = proposed[accepted], other[accepted]
         return coords
+
+    def _propose(
+        self, mixture: StudentMixture, n: int, random: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draws (n, ndim) of a mixture in scaled parameters, their coordinates and their log-weights (n,)."""
+        scaled = draw_mixture(mixture, n, random)
+        coords, log_volume = self._target.unscaled(scaled)
+        log_weights = np.full(n, -np.inf)
+        inside = np.flatnonzero(log_volume > -np.inf)
+        log_weights[inside] = self.log_density(coords[inside]) + log_volume[inside]
+        log_weights[inside] -= mixture_log_density(mixture, scaled[inside])
+        return scaled, coords, log_weights
+
+    def _in_scaled(self, region: Region) -> Region:
+        """A region with its centre and covariance in scaled parameters."""
+        sd = np.sqrt(np.diag(region.covariance))
+        low, at, high = self._target.scaled(np.stack([region.centre - sd, region.centre, region.centre + sd]))
+        slopes = np.maximum((high - low) / (2.0 * sd), _SMALLEST_SLOPE)
+        return region._replace(centre=at, covariance=region.covariance * np.outer(slopes, slopes))
+
+    def covariance(self) -> np.ndarray:
+        """Covariance (ndim, ndim) of the coordinates."""
+        apart = self._pool - self._weights @ self._pool
+        return (apart * self._weights[:, None]).T @ apart
+
+    def extremes(self, directions: np.ndarray) -> np.ndarray:
+        """Points (2 n, ndim) of the pool at the 1 and 99 % quantiles along directions (n, ndim)."""
+        rows = []
+        for along in (self._pool @ directions.T).T:
+            order = np.argsort(along)
+            rows += list(order[np.searchsorted(np.cumsum(self._weights[order]), [0.01, 0.99])])
+        return self._pool[rows]
 
     def moments(self) -> list[Region]:
         """The regions with the mean, covariance and evidence that the pool gives them, where it suffices."""
@@ -187,17 +219,16 @@ class EmulatedPosterior:
 
     def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> StudentMixture:
         weights = 0.9 * _normalised(log_shares) + 0.1 / len(regions)
-        factors = [np.linalg.cholesky(_WIDENED * region.covariance) for region in regions]
+        factors = [factor_of(_WIDENED * region.covariance) for region in regions]
         return StudentMixture(weights, np.array([region.centre for region in regions]), np.array(factors), _FREEDOM)
 
     def _adapt(self, random: np.random.RandomState) -> None:
-        regions = list(self._regions)
+        regions = [self._in_scaled(region) for region in self._regions]
         shares = np.array([region.log_evidence for region in regions])
         mixture = self._mixture_of(regions, shares)
         enough = _ENOUGH_PER_DIMENSION * self._target.ndim
         for _ in range(_ROUNDS):
-            coords = draw_mixture(mixture, _DRAWS, random)
-            log_weights = self.log_density(coords) - mixture_log_density(mixture, coords)
+            scaled, coords, log_weights = self._propose(mixture, _DRAWS, random)
             nearest, _ = self._nearest(coords)
             for k, region in enumerate(regions):
                 rows = np.flatnonzero((nearest == k) & (log_weights > -np.inf))
@@ -208,7 +239,7 @@ class EmulatedPosterior:
                 power = 1.0
                 while power > 1e-4 and effective_sample_size(power * own) < 1.5 * enough:
                     power *= 0.7  # too few effective points: a smaller step towards the target
-                fitted = self._fit(coords[rows], power * own)
+                fitted = self._fit(scaled[rows], power * own)
                 if fitted is not None:
                     regions[k] = region._replace(centre=fitted[0], covariance=fitted[1])
             mixture = self._mixture_of(regions, shares)
@@ -219,16 +250,16 @@ class EmulatedPosterior:
     def _kernels(self, regions: Sequence[Region], random: np.random.RandomState) -> StudentMixture:
         """The components, and narrower ones around weighted points: for a posterior that no ellipsoid covers."""
         ndim = self._target.ndim
-        centres = self._pool[random.choice(len(self._pool), _KERNELS, p=self._weights)]
+        rows = random.choice(len(self._pool), _KERNELS, p=self._weights)
         width = (4.0 / (ndim + 2.0)) ** (1.0 / (ndim + 4.0)) * _KERNELS ** (-1.0 / (ndim + 4.0))
-        nearest, _ = self._nearest(centres)
-        narrow = [width * np.linalg.cholesky(region.covariance) for region in regions]
+        nearest, _ = self._nearest(self._pool[rows])
+        narrow = [width * factor_of(region.covariance) for region in regions]
         weights = np.concatenate(
             [(1.0 - _KERNEL_SHARE) * self._mixture.weights, np.full(_KERNELS, _KERNEL_SHARE / _KERNELS)]
         )
         return StudentMixture(
             weights,
-            np.concatenate([self._mixture.centres, centres]),
+            np.concatenate([self._mixture.centres, self._target.scaled(self._pool[rows])]),
             np.concatenate([self._mixture.factors, [narrow[k] for k in nearest]]),
             _KERNEL_FREEDOM,
         )
@@ -236,10 +267,10 @@ class EmulatedPosterior:
     def _fill(self, mixture: StudentMixture, random: np.random.RandomState) -> None:
         """Draw the pool."""
         self._mixture = mixture
-        self._pool = draw_mixture(mixture, _POOL, random)
-        log_density = self.log_density(self._pool)
-        self.top = float(log_density.max())
-        self._log_weights = log_density - mixture_log_density(mixture, self._pool)
+        _, self._pool, self._log_weights = self._propose(mixture, _POOL, random)
+        # outside the support of the prior, coordinates are infinite
+        self._pool[self._log_weights == -np.inf] = 0.0
+        self.top = float(self.log_density(self._pool[np.argsort(-self._log_weights)[:1000]]).max())
         self._weights = _normalised(self._log_weights)
         self.log_evidence = _log_mean(self._log_weights)
         effective = effective_sample_size(self._log_weights)

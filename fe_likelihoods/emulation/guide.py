@@ -21,9 +21,9 @@ import numpy as np
 from .density import EmulatedPosterior, KnownDensity, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
-from .modes import Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes
+from .modes import UNSEEN, Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes, unseen_share
 from .stacked import is_joint
-from .student import StudentMixture, draw_mixture, mixture_log_density
+from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import ResponseTarget
 
 __all__ = ["ResponseGuide"]
@@ -37,17 +37,31 @@ _WIDENED = 1.5  # variances of the wide components, as multiples of their region
 _SHARE_OF_MODES = 0.25  # of the wide mixture around the modes that were found, the rest around the emulated means
 _SMALLEST_WEIGHT = 0.1  # of a component of the wide mixture, over their number
 _FEWEST_CACHED = 10_000  # simulations that the likelihood must cache in memory
-_FEWEST_RUNS = 2.0, 6.0  # training runs that an emulator needs: per dimension, and in addition
+_FEWEST_RUNS = 1.0, 4.0  # training runs that an emulator needs: per dimension, and in addition
 _MOST_RUNS = 300
 _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs train the emulator of a region
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
 _IMPLAUSIBLE = 10.0  # emulated log-density above all runs, besides 1 per dimension, at which a fit is refused
+_MOST_UNSEEN = 0.3  # `unseen_share` above which a result is refused
 _SURPRISE = 10.0  # a far point starts an ascent if its log-density is above any known mode minus this
 _MOST_ASCENTS = 2  # of these, per refinement
 _NOT_A_MODE = (
     "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
     "use more starts"
+)
+_FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
+_REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
+_LONGEST = 4  # such directions at whose ends runs are made
+_MOST_EXTENSIONS, _GROWTH = 10, 0.05  # of an emulator along these, while the log-evidence changes by as much
+_SHORT_OF_THE_RIDGE = (
+    "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
+    "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
+)
+_LATE = 0.2  # growth of the emulated log-evidence after draws were made that is a reason for concern
+_GREW = (
+    "the draws of the first rounds did not reach along a direction that the data leave to the prior, so the evidence "
+    "may be too small"
 )
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
@@ -74,8 +88,6 @@ class ResponseGuide:
         Simulations run by the guide itself, parts of a record counted as fractions.
     log_density_error : float
         Standard error of the log normalising constant of `log_density`.
-    concerns : tuple of str
-        Why parts of the posterior may be missing.
     """
 
     # a response does not depend on how long its simulation takes
@@ -93,7 +105,7 @@ class ResponseGuide:
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
         self.simulations = 0.0
-        self.concerns: tuple[str, ...] = ()
+        self._concerns: tuple[str, ...] = ()
         self._regions: list[Region] = []
         self._modes: list[Mode] = []
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
@@ -118,11 +130,32 @@ class ResponseGuide:
         return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts})"
 
     @property
+    def concerns(self) -> tuple[str, ...]:
+        """Why parts of the posterior may be missing."""
+        return (*self._concerns, *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN))
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Why parts of the posterior are probably missing."""
+        return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
+
+    def _of_unseen_modes(self, least: float, most: float) -> tuple[str, ...]:
+        """A sentence if the expected share of unseen modes is above `least` and not above `most`."""
+        unseen = 0.0 if self.search is None else unseen_share(self.search)
+        if not least < unseen <= most:
+            return ()
+        return (
+            f"{len(self.search.ends)} starts led to {len(self.search.modes)} modes, to some of them only once, so "
+            f"about {100.0 * unseen:.0f} % of further starts would lead to modes that were not found: use more starts, "
+            "or a larger limit of simulations",
+        )
+
+    @property
     def basis(self) -> str:
         """What a verdict without concerns rests on."""
         if self.search is None or not self.search.modes:
             return ""
-        n, modes = len(self.search.ends), len(self._modes)
+        n, modes = sum(end >= 0 for end in self.search.ends), len(self._modes)
         missed = 1.0 - 0.05 ** (1.0 / n)
         return (
             f"{n} starts led to {modes} mode{'s' if modes > 1 else ''}; with 95 % probability, they would have found "
@@ -149,7 +182,15 @@ class ResponseGuide:
         if session.asynchronous:
             self._check_memory()
         starts = draw_starts(self._target, self._starts, session.random)
-        search = search_modes(self._target, starts, session.remember, session.fits, session.asynchronous)
+        search = search_modes(
+            self._target,
+            starts,
+            session.remember,
+            session.fits,
+            session.asynchronous,
+            self._starts,
+            session.remaining,
+        )
         self.search = yield from self._counted(search)
         self._add_modes(self.search.modes)
         residuals = self._target.archive.residuals
@@ -165,11 +206,8 @@ class ResponseGuide:
             self._add_concern("no start of the search led to a mode: the simulations of all starts fail")
         elif not all(mode.converged for mode in self.search.modes):
             self._add_concern(_NOT_AT_THE_TOP)
-        elif any(self.search.ends.count(number) == 1 for number in range(len(self.search.modes))) and self._starts > 1:
-            self._add_concern(
-                f"only one of {self._starts} starts led to one of the modes, so there may be modes to which none led: "
-                "use more starts"
-            )
+        self._emulate(session.random)
+        yield from self._follow_ridges(session)
 
     def evaluation_queue(self) -> Any:
         """The queue of the posterior, which keeps the responses for `observe`."""
@@ -201,10 +239,22 @@ class ResponseGuide:
     def refine(self, parameters: np.ndarray, log_prob: np.ndarray, session: Any) -> Iterator[None]:
         """Learn from evaluated points (n, ndim): ascents from surprising ones, and new emulators."""
         yield from self._ascend_from_surprises(parameters, log_prob, session)
+        earlier = self._emulated
+        self._emulate(session.random)
+        if earlier is None or self._emulated is None:
+            return
+        if self._emulated.log_evidence > earlier.log_evidence + _LATE and len(self._free_directions()[0]):
+            self._add_concern(_GREW)
+            yield from self._follow_ridges(session)
+
+    # ------------------------------------------------------------------ parts
+
+    def _emulate(self, random: np.random.RandomState) -> None:
+        """Fit emulators to all runs, and the emulated posterior; an implausible one is not used."""
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
-            emulated = EmulatedPosterior(self._target, self._regions, session.random)
+            emulated = EmulatedPosterior(self._target, self._regions, random)
             if emulated.top > self._best + _IMPLAUSIBLE + self._target.ndim:
                 logger.info("the emulators have a top (%.1f) far above all runs (%.1f)", emulated.top, self._best)
                 return
@@ -212,7 +262,44 @@ class ResponseGuide:
             self._regions = self._emulated.moments()
             self._wide = self._wide_mixture()
 
-    # ------------------------------------------------------------------ parts
+    def _follow_ridges(self, session: Any) -> Iterator[None]:
+        """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
+        settled = 0  # twice, because the first runs at the ends of a new stretch may add nothing
+        for _ in range(_MOST_EXTENSIONS):
+            free, _ = self._free_directions()
+            if not len(free):
+                break
+            earlier = self._emulated
+            points = earlier.extremes(free[:_LONGEST])[:, : self._target.n_structural]
+            new = self._target.new_points(points)
+            if not session.fits(new):
+                break
+            self._target.run(points, session.remember)
+            self.simulations += new
+            yield
+            self._emulate(session.random)
+            settled = settled + 1 if abs(self._emulated.log_evidence - earlier.log_evidence) < _GROWTH else 0
+            if settled == 2:
+                break
+        self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
+        if np.any(self._free_directions()[1] < _REACHED):
+            self._add_concern(_SHORT_OF_THE_RIDGE)
+
+    def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Directions (n, ndim) that the data leave to the prior, the longest first, and how far the draws reach along.
+
+        The reach (n,) is the variance of the draws as a share of the variance at the mode.
+        """
+        directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
+        if self._emulated is not None:
+            spread = self._emulated.covariance()
+            # the draws themselves as well: differences of a rough response make a mode too narrow
+            for covariance in (spread, *(mode.covariance for mode in self._modes)):
+                values, vectors = np.linalg.eigh(covariance)
+                free, allowed = vectors[:, values > _FREE].T[::-1], values[values > _FREE][::-1]
+                directions.append(free)
+                reached.append(((free @ spread) * free).sum(axis=1) / allowed)
+        return np.concatenate(directions), np.concatenate(reached)
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
@@ -238,8 +325,8 @@ class ResponseGuide:
             yield
 
     def _add_concern(self, text: str) -> None:
-        if text not in self.concerns:
-            self.concerns = (*self.concerns, text)
+        if text not in self._concerns:
+            self._concerns = (*self._concerns, text)
 
     def _shares(self) -> tuple[float, float]:
         """Shares of the wide mixture and of the prior in the draws."""
@@ -278,7 +365,7 @@ class ResponseGuide:
         # the modes themselves as well: where an emulator is wrong, so are the moments that it gives
         centres = [*(region.centre for region in self._regions), *(mode.coords for mode in self._modes)]
         covariances = [*(region.covariance for region in self._regions), *(mode.covariance for mode in self._modes)]
-        factors = [np.linalg.cholesky(_WIDENED * covariance) for covariance in covariances]
+        factors = [factor_of(_WIDENED * covariance) for covariance in covariances]
         weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
         return StudentMixture(weights, np.array(centres), np.array(factors), _WIDE_FREEDOM)
 
@@ -329,7 +416,7 @@ class ResponseGuide:
         self._modes[number], self._regions[number] = mode, self._region_of(mode)
         self._emulated, self._wide = None, self._wide_mixture()
         if all(mode.converged for mode in self._modes):
-            self.concerns = tuple(concern for concern in self.concerns if concern != _NOT_AT_THE_TOP)
+            self._concerns = tuple(concern for concern in self._concerns if concern != _NOT_AT_THE_TOP)
 
     def _fit_emulators(self) -> None:
         archive, d = self._target.archive, self._target.n_structural

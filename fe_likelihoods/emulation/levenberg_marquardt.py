@@ -1,23 +1,27 @@
-"""Levenberg-Marquardt on the responses: ascents to modes, run side by side.
+"""Levenberg-Marquardt on the responses: ascents to modes, run side by side, with derivatives from all their runs.
 
 The log-density in the coordinates of `fe_likelihoods.emulation.target` is log L(S(r)) - z.z / 2 with residuals r that
-enter the log-likelihood through quadratic statistics S. With J = dr/dz by finite differences and
-f = d log L / dS at the noise parameters that fit best, its gradient and its Gauss-Newton Hessian are::
+enter the log-likelihood through quadratic statistics S. With J = dr/dz and f = d log L / dS at the noise parameters
+that fit best, its gradient and its Gauss-Newton Hessian are::
 
     g = 2 sum_a f_a B_a(J, r) - z,        H = -2 sum_a f_a B_a(J, J) + 1,
 
-where B_a is the bilinear form of S_a. A step solves (H + lambda diag H) dz = g. Several lambda are simulated at once:
-they cost one parallel batch, and the largest improvement is taken. That reaches modes at the end of narrow curved
-valleys, where one lambda at a time does not. Steps of the differences are a small part of a posterior standard
-deviation: larger ones average over the valley, much smaller ones follow the roughness of the likelihood.
+where B_a is the bilinear form of S_a. A step solves (H + lambda diag H) dz = g. Three lambda are simulated at once, and
+the largest improvement is taken; after a step that gained what the quadratic promised, one is enough.
+
+J is found by differences at few points only, and from there by regression over all runs of all ascents
+(`Jacobians`). An ascent whose secants mislead makes differences of its own. It stops as soon as the derivatives at the
+end of another ascent predict its residuals, or a line without a valley leads there: then it is in the same mode. At the
+top of a mode, one step of a standard deviation is simulated along every axis of the Laplace approximation. These runs
+make the derivatives sure, show whether the top is a saddle, and train the emulator.
 
 References
 ----------
 K. Levenberg (1944), Quarterly of Applied Mathematics 2, 164-168; D. W. Marquardt (1963), Journal of the Society for
-Industrial and Applied Mathematics 11, 431-441.
+Industrial and Applied Mathematics 11, 431-441; C. G. Broyden (1965), Mathematics of Computation 19, 577-593 (secants).
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,99 +29,366 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["POINTS_PER_STEP", "TOLERANCE", "Ascent", "Batches", "ascend", "distinct_ends"]
+__all__ = ["POINTS_PER_STEP", "TOLERANCE", "Ascent", "Batches", "Jacobians", "ascend", "axes_of", "distinct_ends"]
 
-_DAMPINGS = 10.0 ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+_DAMPINGS = 10.0 ** np.array([-1.5, 0.0, 1.5])
 POINTS_PER_STEP = len(_DAMPINGS)
 _FIRST_DAMPING = 1e-2
-_LARGEST_DAMPING = 1e8
+_DAMPING_LIMITS = 1e-8, 1e8
 _LARGEST_STEP = 2.0  # prior standard deviations
-_FIRST_DIFFERENCE = 3e-3  # prior standard deviations
+FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE = 0.1  # of a posterior standard deviation
 _DIFFERENCE_LIMITS = 3e-4, 2e-2
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
+_NEAREST_RUNS = 3.0, 10.0  # runs that secants are fitted to: per dimension, and in addition
+_TOO_CLOSE = 1e-12  # squared distance of runs that tell nothing about derivatives
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
-_PATIENCE = 3  # iterations after which an ascent that is far below a known end and slow is given up
+_PATIENCE = 4  # iterations after which an ascent that is far below a known end and slow is given up
 _LEFT = 6.0  # iterations like the last one that would be needed to reach the known end
 _ROUGH = 5.0  # gain that the quadratic approximation may promise where no step gains anything
-_STALLED = 0.1  # gain in log-density below which a step counts as failed
+_STALLED = 0.1, 0.02  # gain in log-density below which a step counts as failed, and the same as a share of what is left
+_MISLED = 0.7  # share of the promised gain below which an ascent with derivatives of its own makes new differences
+_KEPT_PROMISE = 0.5  # share of the promised gain from which one damping is enough for the next step
 _HOPELESS = 200.0  # log-density below the best end at which another one is given up
 _SAME_MODE = 4.0  # squared distance per dimension, in units of the Laplace approximation
-_NEAR = 20.0  # largest log-density below a known end at which the straight line to it is examined
-_ALONG = np.array([0.25, 0.5, 0.75])  # points of this line
-_PRIOR_ALONE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
+# loss by the error of a prediction that shows the same mode: share per dimension, at most, and constant
+_EXPLAINED = 0.01, 0.1, 1.0
+_NEAR = 20.0  # largest difference of log-densities at which the line between ends is examined
+_ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
+_ROUGHNESS = 4.0  # depth of a valley between points of one rough mode, as a multiple of the cost of a step
+_TOO_SHORT = 0.02  # squared length of a step, in units of the Laplace approximation, with which a design is repeated
+_DESIGNS = 4  # at most, around one end
+_DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the first one is made
+_FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1, with little of the data's
+_LONGEST = 4  # such directions along which steps are simulated
+_FAR = 2.0  # standard deviations that are simulated along such directions
 _DIP = 3.0  # depth of a valley in log-density that separates modes
 
 
+class _Point(NamedTuple):
+    """A simulated point, with the noise parameters that fit best."""
+
+    coords: np.ndarray
+    residuals: np.ndarray
+    statistics: np.ndarray
+    noise: NoiseFit
+    value: float
+
+
 class Ascent(NamedTuple):
-    """Where an ascent from one start ended.
+    """Where an ascent from one start has arrived, with the log-density around it.
 
     Attributes
     ----------
     coords : (n_structural,) float
         Structural coordinates.
-    log_density : float
-        Log-density there, in standard normal coordinates, at the best noise parameters.
-    hessian : (n_structural, n_structural) float
-        Gauss-Newton Hessian of minus the log-density.
-    noise : NoiseFit
-        The best noise parameters.
     residuals : (n_channels, n_steps) float
         Residuals.
+    statistics : (n_numbers,) float
+        Their statistics.
+    noise : NoiseFit
+        The best noise parameters.
+    value : float
+        Log-density, in standard normal coordinates, at the best noise parameters.
     slopes : (n_structural, n_channels, n_steps) float
-        Their derivatives by the coordinates.
-    gain_left : float
-        Log-density still to gain according to the quadratic approximation.
-    iterations : int
-        Number of steps.
-    merged : int
-        Index of the ascent in whose mode this ascent would have ended, -1 if it ran to the end.
-    starts : tuple of int
-        Starts that ended here.
+        Derivatives of the residuals by the coordinates.
+    weights : (n_numbers,) float
+        Derivatives of the log-likelihood by the statistics.
+    gradient : (n_structural,) float
+        Gradient of the log-density.
+    hessian : (n_structural, n_structural) float
+        Gauss-Newton Hessian of minus the log-density.
     """
 
     coords: np.ndarray
-    log_density: float
-    hessian: np.ndarray
-    noise: NoiseFit
     residuals: np.ndarray
+    statistics: np.ndarray
+    noise: NoiseFit
+    value: float
     slopes: np.ndarray
-    gain_left: float
-    iterations: int
-    merged: int = -1
-    starts: tuple[int, ...] = ()
+    weights: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+    @property
+    def gain_left(self) -> float:
+        """Log-density still to gain according to the quadratic approximation."""
+        return 0.5 * float(self.gradient @ np.linalg.solve(self.hessian, self.gradient))
 
     @property
     def converged(self) -> bool:
         """Whether little is left to gain; differences of a rough likelihood promise a few units at its top as well."""
-        return self.gain_left < _ROUGH or self.merged >= 0
+        return self.gain_left < _ROUGH
+
+
+class Jacobians:
+    """Derivatives of the residuals on one part of the record, from differences at few points and all runs.
+
+    At a point z, with the derivatives J_0 of the nearest point z_0 at which they are known, and runs at z + s_i whose
+    residuals differ by y_i from those at z, the derivatives are J_0 + D. D minimises::
+
+        sum_i |y_i - (J_0 + D) s_i|^2 / |s_i|^4 + |D|^2 / |z - z_0|^2 .
+
+    A run at a distance s has an error of the second order, s^2, from curvature, whence the weights; and J_0 is as
+    uncertain as a difference with a step of |z - z_0|.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[tuple[np.ndarray, np.ndarray]] = []
+        self._coords: list[np.ndarray] = []
+        self._residuals: list[np.ndarray] = []
+        self._claimed = False
+
+    def note(self, points: np.ndarray, runs: Runs) -> None:
+        """Enter runs at points (n, d)."""
+        for k in np.flatnonzero(~runs.failed):
+            self._coords.append(points[k])
+            self._residuals.append(runs.residuals[k])
+
+    def claim(self) -> bool:
+        """Whether the caller is the first, which makes the first differences."""
+        claimed, self._claimed = self._claimed, True
+        return not claimed
+
+    def __bool__(self) -> bool:
+        return bool(self._known)
+
+    def add(self, coords: np.ndarray, slopes: np.ndarray) -> None:
+        """Enter derivatives (d, n_channels, n_steps) that are known at coordinates (d,)."""
+        self._known.append((coords, slopes))
+
+    def known_at(self, coords: np.ndarray) -> bool:
+        """Whether derivatives were entered for this very point."""
+        return any(np.array_equal(coords, point) for point, _ in self._known)
+
+    def at(self, coords: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        """Derivatives (d, n_channels, n_steps) at coordinates (d,) with known residuals."""
+        origin, slopes = min(reversed(self._known), key=lambda each: float(np.square(each[0] - coords).sum()))
+        far = float(np.square(origin - coords).sum())
+        d = len(coords)
+        steps = np.array(self._coords) - coords
+        squared = np.square(steps).sum(axis=1)
+        rows = np.flatnonzero(squared > _TOO_CLOSE)
+        rows = rows[np.argsort(squared[rows])[: int(_NEAREST_RUNS[0] * d + _NEAREST_RUNS[1])]]
+        if far < _TOO_CLOSE or not len(rows):
+            return slopes
+        steps, weighted = steps[rows], steps[rows] / np.square(squared[rows])[:, None]
+        solved = np.linalg.solve(weighted.T @ steps + np.eye(d) / far, weighted.T)
+        changes = np.array([self._residuals[row] for row in rows]) - residuals
+        changes = changes.reshape(len(rows), -1) - steps @ slopes.reshape(d, -1)
+        return slopes + (solved @ changes).reshape(slopes.shape)
+
+
+class _Climb:
+    """An ascent from a simulated point; see `ascend` for the parameters."""
+
+    def __init__(
+        self,
+        target: ResponseTarget,
+        jacobians: Jacobians,
+        centre: np.ndarray,
+        known: dict[int, Ascent],
+        apart: float,
+        number: int,
+    ) -> None:
+        self._number, self._shared = number, np.isinf(apart)
+        self._target, self._jacobians, self._centre, self._known = target, jacobians, centre, known
+        self._apart = apart
+        self.here: _Point
+        self.values: list[float] = []  # at the points simulated last
+        self.dip = _DIP
+
+    def begin(self, start: np.ndarray, steps: np.ndarray | None) -> Generator[np.ndarray, Runs, int | None]:
+        """Simulate the start, and points around it for derivatives, `steps` or small ones, where these are needed.
+
+        Returns the number of the ascent that the start leads to, -1 if its simulation fails, else None.
+        """
+        small = FIRST_DIFFERENCE * np.eye(len(start))
+        first = steps is None and self._jacobians.claim()  # with the start, so that the others find derivatives
+        runs = yield np.concatenate([start[None], start + small]) if first else start[None]
+        higher = self.highest(start[None], Runs(*(column[:1] for column in runs)), -np.inf)
+        if higher is None:
+            return -1
+        self.here = higher
+        if first:
+            rest = Runs(*(column[1:] for column in runs))
+            self._jacobians.note(start + small, rest)
+            yield from self.difference(small, rest)
+            return None
+        joined = self._explained()
+        if joined is None and steps is not None:
+            joined = yield from self.connected()
+        if joined is None and (steps is not None or not self._jacobians):
+            yield from self.difference(small if steps is None else steps)
+        return joined
+
+    def highest(self, points: np.ndarray, runs: Runs, least: float) -> _Point | None:
+        """The highest simulated point; None if none is above `least`."""
+        found = None
+        self._jacobians.note(points, runs)
+        self.values = []
+        for k in np.flatnonzero(~runs.failed):
+            fit = self._target.fit_noise(runs.statistics[k], None if least == -np.inf else self.here.noise.coords)
+            value = fit.log_density + float(self._target.log_prior(points[k] - self._centre))
+            self.values.append(value)
+            if value > (least if found is None else found.value):
+                found = _Point(points[k], runs.residuals[k], runs.statistics[k], fit, value)
+        return found
+
+    def difference(self, steps: np.ndarray, runs: Runs | None = None) -> Generator[np.ndarray, Runs, None]:
+        """Derivatives at the present point from steps (d, d) of it; zero along a step that fails at every length."""
+        here = self.here
+        if runs is None:
+            runs = yield here.coords + steps
+            self._jacobians.note(here.coords + steps, runs)
+        changes, used = runs.residuals - here.residuals, steps.copy()
+        for k in np.flatnonzero(runs.failed):
+            changes[k] = 0.0
+            for factor in _RETRIES:
+                again = yield here.coords + factor * steps[None, k]
+                if not again.failed[0]:
+                    changes[k], used[k] = again.residuals[0] - here.residuals, factor * steps[k]
+                    break
+        slopes = np.linalg.solve(used, changes.reshape(len(used), -1)).reshape(changes.shape)
+        self._jacobians.add(here.coords, slopes)
+
+    def quadratic(self) -> Ascent:
+        """The log-density around the present point."""
+        here = self.here
+        slopes = self._jacobians.at(here.coords, here.residuals)
+        weights = self._target.slopes(here.statistics, here.noise.coords)
+        form = bilinear_form(self._target.statistic, slopes, here.residuals[None])[:, 0]
+        gradient = 2.0 * form @ weights - (here.coords - self._centre)
+        hessian = -2.0 * bilinear_form(self._target.statistic, slopes) @ weights + np.eye(len(slopes))
+        self._known[self._number] = Ascent(*here, slopes, weights, gradient, hessian)
+        return self._known[self._number]
+
+    def climb(self, merging: bool, tolerance: float) -> Generator[np.ndarray, Runs, int | None]:
+        """Steps to the top; returns the number of the ascent that this joins, -1 if it is given up, None at a top."""
+        damping, good, failures, gain = _FIRST_DAMPING, False, 0, np.inf
+        for iteration in range(_MAX_ITERATIONS):
+            at = self.quadratic()
+            if merging and (joined := self._explained()) is not None:
+                return joined
+            behind = max(other.value for other in self._known.values()) - at.value
+            if merging and iteration >= _PATIENCE and behind > max(_HOPELESS, _LEFT * gain):
+                return -1
+            if at.gain_left < tolerance or failures > 3:
+                return None
+            dampings = damping * _DAMPINGS[: 1 if good else None]
+            scale = np.diag(np.diag(at.hessian))
+            moves = np.array([np.linalg.solve(at.hessian + each * scale, at.gradient) for each in dampings])
+            moves *= np.minimum(1.0, _LARGEST_STEP / np.abs(moves).max(axis=1, keepdims=True))
+            points = self._target.moved(at.coords, moves)
+            runs = yield points
+            higher, misled = self.highest(points, runs, at.value), False
+            gain = 0.0 if higher is None else higher.value - at.value
+            if higher is not None:
+                k = int(np.argmin(np.square(points - higher.coords).sum(axis=1)))
+                promised = float(at.gradient @ moves[k] - 0.5 * moves[k] @ at.hessian @ moves[k])
+                good, damping = gain > _KEPT_PROMISE * promised, float(np.clip(dampings[k], *_DAMPING_LIMITS))
+                misled = gain < _MISLED * promised
+                self.here = higher
+            if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
+                failures = 0
+                if misled and not self._shared:
+                    yield from self._own_differences(at, 1.0)
+                continue
+            good, failures = False, failures + 1
+            damping = max(damping, _FIRST_DAMPING)
+            # the first time, the runs that gained nothing have corrected the secants
+            if failures > 1 and not self._jacobians.known_at(self.here.coords):
+                yield from self._own_differences(at, failures)
+            elif failures > 1:
+                damping = min(damping * 1e4, _DAMPING_LIMITS[1])
+        return None
+
+    def _own_differences(self, at: Ascent, factor: float) -> Generator[np.ndarray, Runs, None]:
+        """Differences with steps of a share of the standard deviations, times a factor."""
+        spread = factor * _DIFFERENCE_SHARE * np.sqrt(np.diag(np.linalg.inv(at.hessian)))
+        yield from self.difference(np.diag(np.clip(spread, *_DIFFERENCE_LIMITS)))
+
+    def _explained(self) -> int | None:
+        """Number of another ascent whose derivatives, at a higher point, predict the residuals here; None if none.
+
+        The same mode then lies uphill of both. At another mode, residuals are as small as at the higher point, which
+        its derivatives deny.
+        """
+        return next((number for number, other in self._known.items() if self._is_explained_by(other)), None)
+
+    def _is_explained_by(self, other: Ascent) -> bool:
+        move = self.here.coords - other.coords
+        if np.abs(move).max() >= self._apart or self.here.value >= other.value:
+            return False
+        predicted = np.tensordot(move, other.slopes, axes=1)
+        error = self.here.residuals - other.residuals - predicted
+        lost, whole = (-float(self._target.statistic(each) @ other.weights) for each in (error, predicted))
+        return lost < max(min(_EXPLAINED[0] * len(move), _EXPLAINED[1]) * whole, _EXPLAINED[2])
+
+    def connected(self) -> Generator[np.ndarray, Runs, int | None]:
+        """Number of the ascent that a line without a valley leads to from nearly the same height; None if none.
+
+        On a rough or curved likelihood, derivatives at one point do not describe the other points of its mode. The line
+        is straight in logarithms of positive parameters, in which a ridge of equal products is straight.
+        """
+        here = self.here
+        for number, end in list(self._known.items()):
+            if number == self._number:
+                continue
+            ahead = end.value - here.value
+            if not -_NEAR <= ahead <= _NEAR or np.abs(end.coords - here.coords).max() >= self._apart:
+                continue
+            points = self._target.line(here.coords, end.coords, _ALONG)
+            runs = yield points
+            if runs.failed.any() or number not in self._known:
+                continue  # it has joined another one meanwhile
+            fits = [self._target.fit_noise(each, here.noise.coords).log_density for each in runs.statistics]
+            heights = fits + self._target.log_prior(points - self._centre)
+            if _valley(np.array([here.value, *heights, end.value])) < self.dip:
+                if self._number in self._known:
+                    self._known[number] = max(end, self._known[self._number], key=lambda each: each.value)
+                return number
+        return None
 
 
 def ascend(
     target: ResponseTarget,
+    jacobians: Jacobians,
+    number: int,
     start: np.ndarray,
     centre: np.ndarray,
-    known: Sequence[Ascent] = (),
+    known: dict[int, Ascent],
     tolerance: float = TOLERANCE,
     apart: float = np.inf,
-) -> Generator[np.ndarray, Runs, Ascent | None]:
+    steps: np.ndarray | None = None,
+    designed: bool = True,
+) -> Generator[np.ndarray, Runs, int]:
     """Levenberg-Marquardt from one start.
 
     Parameters
     ----------
     target : ResponseTarget
         The posterior.
+    jacobians : Jacobians
+        Derivatives, which ascents may share.
+    number : int
+        Number of this ascent.
     start : (n_structural,) float
         Start.
     centre : (n_structural,) float
         Where the prior is centred.
-    known : sequence of Ascent
-        Ends of other ascents so far (the sequence grows): an ascent that would end in one of them stops.
+    known : dict of int and Ascent
+        Where every ascent on this part of the record has arrived, by its number. An ascent that would end where a
+        higher one goes stops, and leaves the dict; so does one that is given up.
     tolerance : float
         Log-density still to gain at which to stop.
     apart : float
-        Distance of one coordinate, in prior standard deviations, from which ends are different (`_is_same_mode`).
+        Distance of one coordinate, in prior standard deviations, from which ends are different.
+    steps : (n_structural, n_structural) float, optional
+        Steps from the start that are simulated with it, for the first derivatives.
+    designed : bool
+        Whether a step of a standard deviation is simulated along every axis of the Laplace approximation at the end.
 
     Yields
     ------
@@ -126,178 +397,70 @@ def ascend(
 
     Returns
     -------
-    Ascent or None
-        None if the simulation of the start fails, or if the ascent is slow and far below a known end.
+    int
+        Number of the ascent that it joins, its own at an end of its own; -1 if the start fails, or if the ascent is
+        slow and far below another one.
     """
-    d = target.n_structural
-    runs = yield start[None]
-    if runs.failed[0]:
-        return None
-    coords, residuals, statistics = start, runs.residuals[0], runs.statistics[0]
-    noise = target.fit_noise(statistics)
-    value = noise.log_density + target.log_prior(coords - centre)
-    differences, damping, failures, slopes = np.full(d, _FIRST_DIFFERENCE), _FIRST_DAMPING, 0, None
-    gain_left, merged, iteration, earlier = np.inf, -1, 0, -np.inf
-    for iteration in range(_MAX_ITERATIONS):  # noqa: B007  the number of iterations is part of the result
-        if slopes is None:
-            merged = yield from _connected(target, coords, value, noise, centre, known, apart)
-            if merged >= 0:
-                unknown = np.zeros((d, *residuals.shape))
-                return Ascent(coords, float(value), np.eye(d), noise, residuals, unknown, 0.0, iteration, merged)
-            slopes = yield from _difference(target, coords, residuals, differences)
-            weights = target.slopes(statistics, noise.coords)
-            gradient = 2.0 * bilinear_form(target.statistic, slopes, residuals[None])[:, 0] @ weights - (
-                coords - centre
-            )
-            hessian = -2.0 * bilinear_form(target.statistic, slopes) @ weights + np.eye(d)
-            scale = np.diag(np.diag(hessian))
-            whole = np.linalg.solve(hessian, gradient)
-            gain_left = 0.5 * float(gradient @ whole)
-            merged = next((k for k, end in enumerate(known) if _is_same_mode(coords + whole, end, apart)), -1)
-            if merged >= 0:
-                break
-            if gain_left < tolerance:
-                higher = yield from _leave_saddle(target, coords, value, hessian, noise, centre, tolerance)
-                if higher is None:
-                    break
-                coords, residuals, statistics, noise, value = higher
-                slopes, damping, earlier = None, _FIRST_DAMPING, -np.inf
-                continue
-            behind = max((end.log_density for end in known), default=-np.inf) - value
-            if iteration >= _PATIENCE and behind > max(_HOPELESS, _LEFT * (value - earlier)):
-                return None
-            earlier = value
-        dampings = damping * _DAMPINGS
-        steps = np.array([np.linalg.solve(hessian + each * scale, gradient) for each in dampings])
-        steps *= np.minimum(1.0, _LARGEST_STEP / np.abs(steps).max(axis=1, keepdims=True))
-        runs = yield coords + steps
-        best = _highest(target, coords + steps, runs, noise, centre, value)
-        stalled = best is None or best[0] < value + _STALLED
-        if best is not None:
-            value, k, noise = best
-            coords, residuals, statistics = coords + steps[k], runs.residuals[k], runs.statistics[k]
-            damping = float(np.clip(dampings[k], 1e-8, _LARGEST_DAMPING))
-            spread = np.sqrt(np.diag(np.linalg.inv(hessian)))
-            differences, slopes = np.clip(_DIFFERENCE_SHARE * spread, *_DIFFERENCE_LIMITS), None
-        if not stalled:
-            failures = 0
-        elif best is None and failures == 0:
-            failures, damping = 1, min(damping * 1e5, _LARGEST_DAMPING)
-        elif failures < 2:  # the differences may have met roughness: take larger ones
-            failures, differences, slopes, damping = 2, 3.0 * differences, None, 0.1
-        else:
+    climb = _Climb(target, jacobians, centre, known, apart, number)
+    joined = yield from climb.begin(start, steps)
+    if joined is not None:
+        return joined
+    joined = yield from climb.climb(True, max(tolerance, _DESIGN_FROM * len(start)) if designed else tolerance)
+    if joined is None:
+        joined = yield from climb.connected()
+    if joined is not None:
+        del known[number]
+        return joined
+    around, axes = (None, np.eye(len(start))) if steps is None else (start, steps)
+    for _ in range(_DESIGNS if designed else 0):
+        end = known[number]
+        short = np.einsum("kd,de,ke->k", axes, end.hessian, axes).min() < _TOO_SHORT
+        if around is not None and not short and _squared_distance(around, end) < _SAME_MODE * len(around):
             break
-    if slopes is None:  # stopped after a step
-        slopes = yield from _difference(target, coords, residuals, differences)
-        weights = target.slopes(statistics, noise.coords)
-        hessian = -2.0 * bilinear_form(target.statistic, slopes) @ weights + np.eye(d)
-    return Ascent(coords, float(value), hessian, noise, residuals, slopes, gain_left, iteration, merged)
-
-
-def _connected(
-    target: ResponseTarget,
-    coords: np.ndarray,
-    value: float,
-    noise: NoiseFit,
-    centre: np.ndarray,
-    known: Sequence[Ascent],
-    apart: float,
-) -> Generator[np.ndarray, Runs, int]:
-    """Number of the known end that a straight line without a valley leads to from nearly the same height; -1 if none.
-
-    On a rough or curved likelihood, the Laplace approximation of an end does not contain the other points of its mode.
-    """
-    for number, end in enumerate(known):
-        difference = end.coords - coords
-        level = end.log_density - _NEAR <= value <= end.log_density + _DIP
-        if not level or np.abs(difference).max() >= apart:
-            continue
-        points = coords + _ALONG[:, None] * difference
+        around, axes = end.coords, axes_of(end)
+        points = target.moved(around, axes)
+        axes = points - around
         runs = yield points
-        if runs.failed.any():
-            continue
-        fits = [target.fit_noise(statistics, noise.coords).log_density for statistics in runs.statistics]
-        if not _has_valley(np.array([value, *(fits + target.log_prior(points - centre)), end.log_density])):
-            return number
-    return -1
+        # at a saddle, such as the axis of symmetry of an even response, a point of the design is higher
+        higher = climb.highest(points, runs, end.value + tolerance)
+        # a step of a standard deviation costs 0.5; on a rough likelihood it costs more, and so do points on a line
+        climb.dip = max(_DIP, _ROUGHNESS * (end.value - float(np.median(climb.values or end.value))))
+        yield from climb.difference(axes, runs)
+        climb.here = higher or climb.here
+        yield from climb.climb(False, tolerance)
+    end = climb.quadratic()
+    if designed:  # where the data leave a direction to the prior, the emulator must reach as far as the prior
+        free = axes_of(end)[np.linalg.eigvalsh(end.hessian) < _FREE][:_LONGEST]
+        if len(free):
+            yield target.moved(end.coords, np.concatenate([_FAR * free, -_FAR * free]))
+    joined = (yield from climb.connected()) if designed else None
+    if joined is None:
+        return number
+    del known[number]
+    return joined
 
 
-def _leave_saddle(
-    target: ResponseTarget,
-    coords: np.ndarray,
-    value: float,
-    hessian: np.ndarray,
-    noise: NoiseFit,
-    centre: np.ndarray,
-    tolerance: float,
-) -> Generator[np.ndarray, Runs, tuple | None]:
-    """A higher point near an end of zero gradient that is a saddle or a minimum; None at a top.
+def axes_of(end: Ascent, free: float = 1.0) -> np.ndarray:
+    """Steps (d, d) of a standard deviation along the axes of the Laplace approximation, in both directions in turn.
 
-    Where a response is an even function of a parameter, its derivative is zero on the axis of symmetry and the
-    Gauss-Newton Hessian has the curvature of the prior alone, also where the likelihood increases on both sides. One
-    simulation in every direction of such a curvature, one standard deviation of the prior away, shows it.
+    Along directions that the data leave to the prior, steps have the length `free`.
     """
-    values, vectors = np.linalg.eigh(hessian)
-    flat = vectors[:, values < _PRIOR_ALONE].T
-    if not len(flat):
-        return None
-    points = coords + flat
-    runs = yield points
-    best = _highest(target, points, runs, noise, centre, value + tolerance)
-    if best is None:
-        return None
-    reached, k, fit = best
-    return points[k], runs.residuals[k], runs.statistics[k], fit, reached
+    values, vectors = np.linalg.eigh(end.hessian)
+    lengths = np.where(values < _FREE, free, 1.0 / np.sqrt(np.maximum(values, 1.0)))
+    return (vectors * ((-1.0) ** np.arange(len(values)) * lengths)).T
 
 
-def _highest(
-    target: ResponseTarget, points: np.ndarray, runs: Runs, noise: NoiseFit, centre: np.ndarray, least: float
-) -> tuple[float, int, NoiseFit] | None:
-    """Log-density, number and noise parameters of the highest simulated point; None if none is above `least`."""
-    best = None
-    for k in np.flatnonzero(~runs.failed):
-        fit = target.fit_noise(runs.statistics[k], noise.coords)
-        reached = fit.log_density + target.log_prior(points[k] - centre)
-        if reached > (least if best is None else best[0]):
-            best = reached, k, fit
-    return best
+def _squared_distance(coords: np.ndarray, end: Ascent) -> float:
+    """Squared distance in units of the Laplace approximation at an end."""
+    move = coords - end.coords
+    return float(move @ end.hessian @ move)
 
 
-def _has_valley(values: np.ndarray) -> bool:
-    """Whether one of the values lies deeper than `_DIP` below values on both sides of it."""
+def _valley(values: np.ndarray) -> float:
+    """Largest depth of one of the values below values on both sides of it; negative if there is none."""
     before = np.maximum.accumulate(values)[:-2]
     after = np.maximum.accumulate(values[::-1])[::-1][2:]
-    return bool((np.minimum(before, after) - values[1:-1]).max() >= _DIP)
-
-
-def _is_same_mode(coords: np.ndarray, end: Ascent, apart: float) -> bool:
-    """Whether coordinates (n_structural,) belong to the mode at the end of an ascent.
-
-    Their distance is measured in units of the Laplace approximation. A part of the record does not determine all
-    coordinates: in undetermined coordinates this distance is small, although a longer part may lead to different modes.
-    On a part of the record, no coordinate may therefore differ by `apart` or more.
-    """
-    difference = coords - end.coords
-    near = float(difference @ end.hessian @ difference) < _SAME_MODE * len(coords)
-    return near and float(np.abs(difference).max()) < apart
-
-
-def _difference(
-    target: ResponseTarget, coords: np.ndarray, residuals: np.ndarray, steps: np.ndarray
-) -> Generator[np.ndarray, Runs, np.ndarray]:
-    """Derivatives (d, n_channels, n_steps) of the residuals; zero for a parameter whose differences all fail."""
-    runs = yield coords + np.diag(steps)
-    slopes = (runs.residuals - residuals) / steps[:, None, None]
-    for k in np.flatnonzero(runs.failed):
-        slopes[k] = 0.0
-        for factor in _RETRIES:
-            point = coords.copy()
-            point[k] += factor * steps[k]
-            again = yield point[None]
-            if not again.failed[0]:
-                slopes[k] = (again.residuals[0] - residuals) / (factor * steps[k])
-                break
-    return slopes
+    return float((np.minimum(before, after) - values[1:-1]).max())
 
 
 class Batches:
@@ -321,9 +484,9 @@ class Batches:
         self._running = target.running_requests() if overlap else None
 
     def complete(
-        self, ascents: Sequence[Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
+        self, ascents: dict[int, Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
     ) -> Iterator[int]:
-        """Advance all generators to their ends; yields the number of points in each batch.
+        """Advance all generators, by their numbers, to their ends; yields the number of new points in each batch.
 
         Stops early, with `interrupted` set, when a batch does not fit in what remains of the budget; what runs by then
         is kept by the target.
@@ -338,19 +501,22 @@ class Batches:
             except StopIteration as end:
                 finished(index, end.value)
 
-        for index in range(len(ascents)):
+        for index in ascents:
             advance(index, None)
         try:
             while waiting:
-                if not self.interrupted and not self._fits(sum(len(points) for points in waiting.values())):
+                wanted = self._target.new_points(np.concatenate([*waiting.values()]))
+                if not self.interrupted and not self._fits(wanted):
                     self.interrupted = True
                     for index in waiting.keys() - begun:
                         del waiting[index]
                     continue
                 begun.update(waiting)
                 ended = self._wait(waiting)
-                runs = self._target.run(np.concatenate([waiting[index] for index in ended]), self._remember)
-                yield len(runs.failed)
+                points = np.concatenate([waiting[index] for index in ended])
+                new = self._target.new_points(points)
+                runs = self._target.run(points, self._remember)
+                yield new
                 place = 0
                 for index in ended:
                     rows = slice(place, place + len(waiting.pop(index)))
@@ -377,16 +543,23 @@ class Batches:
         return self._remember("ascents", wait)[0].tolist()
 
 
-def distinct_ends(ends: Sequence[Ascent], apart: float = np.inf) -> list[Ascent]:
-    """Ends that are different modes, the highest first; each carries the starts of all ends in its mode.
+def distinct_ends(ends: dict[int, Ascent], apart: float = np.inf) -> dict[int, int]:
+    """For the number of every end, the number of the highest end of the same mode.
 
-    `apart`: as in `_is_same_mode`.
+    Ends are in the same mode if their distance is small in units of one of their Laplace approximations, of which the
+    differences of a rough likelihood make some too narrow. A part of the record does not determine all coordinates: in
+    undetermined coordinates this distance is small, although a longer part may lead to different modes. On a part of
+    the record, no coordinate may therefore differ by `apart` or more.
     """
-    kept: list[Ascent] = []
-    for end in sorted(ends, key=lambda end: -end.log_density):
-        same = next((k for k, other in enumerate(kept) if _is_same_mode(end.coords, other, apart)), None)
-        if same is None:
-            kept.append(end)
-        else:
-            kept[same] = kept[same]._replace(starts=(*kept[same].starts, *end.starts))
-    return kept
+    highest: dict[int, int] = {}
+    for number in sorted(ends, key=lambda k: -ends[k].value):
+        end = ends[number]
+        near = (
+            k
+            for k in dict.fromkeys(highest.values())
+            if min(_squared_distance(end.coords, ends[k]), _squared_distance(ends[k].coords, end))
+            < _SAME_MODE * len(end.coords)
+            and np.abs(end.coords - ends[k].coords).max() < apart
+        )
+        highest[number] = next(near, number)
+    return highest

@@ -6,19 +6,28 @@ and their misfit is smoother, because errors in a period have had less time to a
 centred on each start, so that starts keep their differences in parameters without effect on the early part.
 """
 
-from collections.abc import Callable, Generator, Sequence
-from functools import partial
+from collections.abc import Callable, Generator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .levenberg_marquardt import TOLERANCE, Ascent, Batches, ascend, distinct_ends
+from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Batches, Jacobians, ascend, axes_of, distinct_ends
 from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
-__all__ = ["Mode", "ModeSearch", "check_starts", "draw_starts", "find_modes", "laplace", "search_from", "search_modes"]
+__all__ = [
+    "UNSEEN",
+    "Mode",
+    "ModeSearch",
+    "check_starts",
+    "draw_starts",
+    "find_modes",
+    "laplace",
+    "search_from",
+    "search_modes",
+    "unseen_share",
+]
 
-_FIRST_WAVE = 3  # starts whose ascents are made first, on the first part of the record
 _NEGLIGIBLE = 15.0  # a mode whose log-evidence is lower than the largest by more than this is dropped
 _LOOSEST = 5.0  # largest tolerance of a short part of the record
 _THIRD = 1.0 / 3.0  # steps of second differences, in standard deviations
@@ -26,6 +35,9 @@ _ROUNDS_OF_STEPS = 4
 _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times the variance of the prior
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
 _APART_OF_ALL = 2.0  # the same, times the number of starts
+_FEW = 6  # parameters whose differences cost about as much as two steps
+UNSEEN = 0.05  # share of starts alone in a mode above which further starts follow
+_ROUNDS_OF_STARTS = 4  # of the search for modes, the first one included
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -81,13 +93,13 @@ class ModeSearch(NamedTuple):
     finished: bool
 
 
-def laplace(target: ResponseTarget, end: Ascent) -> Mode:
+def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -> Mode:
     """Laplace approximation at the end of an ascent, over structural and noise coordinates together.
 
     The residuals are taken as linear in the structural coordinates, so that nothing is simulated. The Hessian of the
     log-density is computed by central differences with steps of 1/3 standard deviation.
     """
-    statistics = target.statistic(end.residuals)
+    statistics = end.statistics
     noise = max(end.noise, target.fit_noise(statistics), key=lambda fit: fit.log_density)
     d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
     along = 2.0 * bilinear_form(target.statistic, end.slopes, end.residuals[None])[:, 0]
@@ -119,19 +131,16 @@ def laplace(target: ResponseTarget, end: Ascent) -> Mode:
     top = float(log_density(at[None])[0])
     log_evidence = top + 0.5 * target.ndim * float(np.log(2.0 * np.pi)) - 0.5 * float(np.log(values).sum())
     parameters = target.parameters(at[None])[0]
-    return Mode(parameters, at, covariance, top, log_evidence, end.starts, end.converged)
+    return Mode(parameters, at, covariance, top, log_evidence, starts, end.converged)
 
 
-def _finish(fronts: Sequence[tuple], ends: list[Ascent], index: int, end: Ascent | None) -> None:
-    """Enter where an ascent from a front has ended, or that it joined an earlier end."""
-    if end is None:
-        return
-    starts = fronts[index][2]
-    if end.merged >= 0:
-        joined = ends[end.merged]
-        ends[end.merged] = joined._replace(starts=(*joined.starts, *starts))
-    else:
-        ends.append(end._replace(starts=starts))
+class _Part(NamedTuple):
+    """A part of the record, with the ends found on it by the numbers of their starts."""
+
+    target: ResponseTarget
+    share: float
+    ends: dict[int, Ascent]
+    jacobians: Jacobians
 
 
 def search_modes(
@@ -140,8 +149,13 @@ def search_modes(
     remember: Remember = run_at_once,
     fits: Callable[[float], bool] = lambda _: True,
     overlap: bool = False,
+    first: int | None = None,
+    remaining: Callable[[], float] = lambda: np.inf,
 ) -> Generator[float, None, ModeSearch]:
     """Search from given starts, on growing parts of the record where the model offers them.
+
+    Further starts follow the first ones while `unseen_share` is large: while modes that one start alone led to say that
+    others may have been missed.
 
     Parameters
     ----------
@@ -155,63 +169,143 @@ def search_modes(
         ``fits(n)``: whether n more simulations of the whole record fit into the budget.
     overlap : bool
         Whether each ascent goes on as soon as its own simulations have ended (`Batches`), and all begin together.
+    first : int, optional
+        Number of starts with which to begin, and of further ones at a time; by default all.
+    remaining : callable, optional
+        Returns the number of simulations left in the budget.
 
     Yields
     ------
     float
         Cost of each batch, in simulations of the whole record.
     """
-    spent, interrupted, mode_of = 0.0, False, {}
-    parts = [*target.shortened(_SHARES), target]
-    fronts = [(start, start, (k,)) for k, start in enumerate(starts)]
-    for part in parts:
-        share = part.n_steps / target.n_steps
-        whole = part is target
-        ends: list[Ascent] = []
-        tolerance = TOLERANCE if whole else min(TOLERANCE / share, _LOOSEST)
-        # many starts are close together, and none may be lost before the part of the record where they differ
-        apart = np.inf if whole else min(_APART, _APART_OF_ALL / len(starts))
-        origin = np.zeros(target.n_structural)
-        batches = Batches(part, remember, lambda points, share=share: fits(share * points), overlap)
-        # two waves: ascents of the second wave stop as soon as they head for an end of the first. That saves a few
-        # simulations and doubles the time, so that it is left out where the time matters
-        first = len(fronts) if overlap else _FIRST_WAVE if part is parts[0] else 1
-        for wave in (fronts[:first], fronts[first:]):
-            ascents = [
-                ascend(part, start, origin if whole else centre, ends, tolerance, apart) for start, centre, _ in wave
-            ]
-            for points in batches.complete(ascents, partial(_finish, wave, ends)):
-                spent += share * points
-                yield share * points
-            if batches.interrupted:
-                break
-        interrupted = batches.interrupted
-        if not ends or interrupted or whole:
+    first = len(starts) if first is None else first
+    shortened = [*target.shortened(_SHARES), target]
+    parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in shortened]
+    standing_for: list[int] = []  # start that has taken the place of each; -1 for none
+    spent, search = 0.0, ModeSearch((), (), 0.0, True)
+
+    def affordable() -> list[np.ndarray]:  # the search is worth nothing without draws after it
+        return [np.array(remaining() > 2.0 * spent)]
+
+    for begin in range(0, len(starts), first):
+        if begin and (unseen_share(search) <= UNSEEN or not remember("starts", affordable)[0]):
             break
+        fresh = range(begin, min(begin + first, len(starts)))
+        standing_for.extend(fresh)
+        ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
+        finished = True
+        while True:
+            try:
+                cost = next(ascents)
+            except StopIteration as end:
+                finished = end.value
+                break
+            spent += cost
+            yield cost
+        search = _modes_of(parts[-1], standing_for, spent, finished)
+        if not finished:
+            break
+    return search
+
+
+def unseen_share(search: ModeSearch) -> float:
+    """Share of further starts that are expected to lead to modes not seen yet: the share of starts alone in a mode.
+
+    Zero with one mode: where all other starts were given up, nothing speaks for several modes.
+    I. J. Good (1953), Biometrika 40, 237-264, eq. 9, with the modes as species.
+    """
+    alone = sum(search.ends.count(number) == 1 for number in range(len(search.modes)))
+    return alone / len(search.ends) if len(search.modes) > 1 else 0.0
+
+
+def _ascend_from(
+    parts: list[_Part],
+    starts: dict[int, np.ndarray],
+    standing_for: list[int],
+    remember: Remember,
+    fits: Callable[[float], bool],
+    overlap: bool,
+) -> Generator[float, None, bool]:
+    """Ascents from starts, by their numbers, on all parts of the record; returns False if the budget ended them."""
+    target, n = parts[-1].target, len(standing_for)
+    small = FIRST_DIFFERENCE * np.eye(target.n_structural) if len(parts) > 1 else None
+    fronts = {k: (start, small) for k, start in starts.items()}
+    for part, following in zip(parts, [*parts[1:], None], strict=True):
+        whole = part.target is target
+        tolerance = TOLERANCE if whole else min(TOLERANCE / part.share, _LOOSEST)
+        # many starts are close together, and none may be lost before the part of the record where they differ
+        apart = np.inf if whole else min(_APART, _APART_OF_ALL / n)
+        batches = Batches(part.target, remember, lambda points, share=part.share: fits(share * points), overlap)
+        ascents = {
+            k: ascend(
+                part.target,
+                part.jacobians if whole and target.n_structural > _FEW else Jacobians(),
+                k,
+                start,
+                np.zeros(target.n_structural) if whole else start,
+                part.ends,
+                tolerance,
+                apart,
+                steps,
+                whole,
+            )
+            for k, (start, steps) in fronts.items()
+        }
+        # the best end of the part before first: others often lead to it, which costs them no derivatives
+        leading = len(ascents) if overlap or part is parts[0] else 1
+        for wave in (list(ascents)[:leading], list(ascents)[leading:]):
+            for points in batches.complete({k: ascents[k] for k in wave}, standing_for.__setitem__):
+                yield part.share * points
+            if batches.interrupted:
+                return False
+        if not part.ends:
+            break
+        for k, other in distinct_ends(part.ends, apart).items():
+            if k != other:
+                standing_for[k] = other
+                del part.ends[k]
+        best = max(end.value for end in part.ends.values())
         # a model that is not exact may fit a part of the record best where it does not fit the whole one
-        least = max(end.log_density for end in ends) - _HOPELESS * part.measured.size
-        fronts = [(end.coords, end.coords, end.starts) for end in distinct_ends(ends, apart) if end.log_density > least]
-    modes: list[Mode] = []
-    if part is target and ends:
-        modes = sorted((laplace(target, end) for end in distinct_ends(ends)), key=lambda mode: -mode.log_evidence)
-        modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
-    for number, mode in enumerate(modes):
-        mode_of.update(dict.fromkeys(mode.starts, number))
-    return ModeSearch(tuple(modes), tuple(mode_of.get(k, -1) for k in range(len(starts))), spent, not interrupted)
+        good = {k: e for k, e in part.ends.items() if k in fronts and e.value > best - _HOPELESS * e.residuals.size}
+        for k in fronts.keys() & part.ends.keys() - good.keys():
+            standing_for[k] = -1
+        ordered = sorted(good, key=lambda k: -part.ends[k].value)
+        wide = following is not None and following.target is target
+        fronts = {k: (good[k].coords, axes_of(good[k], FIRST_DIFFERENCE) if wide else small) for k in ordered}
+    return True
+
+
+def _modes_of(part: _Part, standing_for: list[int], spent: float, finished: bool) -> ModeSearch:
+    """The modes at the ends on the whole record, and which of them each start led to."""
+    modes = sorted((laplace(part.target, end, (k,)) for k, end in part.ends.items()), key=lambda m: -m.log_evidence)
+    modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
+    number_of = {mode.starts[0]: number for number, mode in enumerate(modes)}
+
+    def end_of(k: int) -> int:
+        while k >= 0 and standing_for[k] != k:
+            k = standing_for[k]
+        return number_of.get(k, -1)
+
+    ends = tuple(end_of(k) for k in range(len(standing_for)))
+    led = [tuple(k for k, end in enumerate(ends) if end == number) for number in range(len(modes))]
+    return ModeSearch(tuple(m._replace(starts=s) for m, s in zip(modes, led, strict=True)), ends, spent, finished)
 
 
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
-    """Starts (n, n_structural) in standard normal coordinates: the median of the prior, then a Latin hypercube.
+    """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n.
 
-    Every parameter has one start in each of n - 1 intervals of equal prior probability, in random order.
+    These are the median of the prior, then a Latin hypercube: every parameter has one start in each of n - 1 intervals
+    of equal prior probability, in random order. Further Latin hypercubes of n starts follow; none for n = 1.
     """
     from scipy.special import ndtri
 
-    d, m = target.n_structural, n - 1
-    starts = np.zeros((n, d))
-    for k in range(d):
-        starts[1:, k] = ndtri((random.permutation(m) + random.uniform(size=m)) / max(m, 1))
-    return starts
+    d = target.n_structural
+    blocks = [np.zeros((1, d))]
+    for size in (n - 1, *[n] * (_ROUNDS_OF_STARTS - 1)) if n > 1 else ():
+        columns = [random.permutation(size) + random.uniform(size=size) for _ in range(d)]
+        blocks.append(ndtri(np.column_stack(columns) / size))
+    return np.concatenate(blocks)
 
 
 def check_starts(starts: Any) -> int:
@@ -262,7 +356,8 @@ def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulation
     def fits(simulations: float) -> bool:
         return spent + simulations <= budget
 
-    search = search_modes(target, draw_starts(target, starts, np.random.default_rng(seed)), fits=fits)
+    drawn = draw_starts(target, starts, np.random.default_rng(seed))
+    search = search_modes(target, drawn, fits=fits, first=starts, remaining=lambda: budget - spent)
     while True:
         try:
             spent += next(search)
@@ -274,13 +369,9 @@ def search_from(
     target: ResponseTarget, start: np.ndarray, remember: Remember, fits: Callable[[float], bool]
 ) -> Generator[float, None, Mode | None]:
     """One ascent on the whole record from a point (n_structural,); returns the mode, or None if the budget ended it."""
-    ends: list[Ascent] = []
-
-    def finish(_: int, end: Ascent | None) -> None:
-        if end is not None:
-            ends.append(end)
-
+    known: dict[int, Ascent] = {}
+    ascent = ascend(target, Jacobians(), 0, start, np.zeros(target.n_structural), known)
     batches = Batches(target, remember, fits)
-    for points in batches.complete([ascend(target, start, np.zeros(target.n_structural))], finish):
+    for points in batches.complete({0: ascent}, lambda *_: None):
         yield float(points)
-    return laplace(target, ends[0]) if ends else None
+    return laplace(target, known[0]) if known and not batches.interrupted else None

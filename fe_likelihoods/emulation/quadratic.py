@@ -41,7 +41,7 @@ def bilinear_form(
     """
     others = first if second is None else second
     if statistic is sums_of_squares:
-        return np.einsum("icn,jcn->ijc", first, others, optimize=True)
+        return np.matmul(first.transpose(1, 0, 2), others.transpose(1, 2, 0)).transpose(1, 2, 0)
     width = len(statistic(first[0]))
     form = np.empty((len(first), len(others), width))
     for i, a in enumerate(first):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-__all__ = ["StudentMixture", "draw_mixture", "mixture_log_density"]
+__all__ = ["StudentMixture", "draw_mixture", "factor_of", "mixture_log_density"]
 
 
 class StudentMixture(NamedTuple):
@@ -27,6 +27,15 @@ class StudentMixture(NamedTuple):
     centres: np.ndarray
     factors: np.ndarray
     freedom: float
+
+
+def factor_of(covariance: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor (d, d) of a covariance; variances that rounding made negative become small ones."""
+    sd = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    lower = np.linalg.qr(root.T, mode="r").T
+    return sd[:, None] * lower * np.sign(np.diag(lower))
 
 
 def draw_mixture(mixture: StudentMixture, n: int, random: np.random.RandomState) -> np.ndarray:

@@ -32,6 +32,9 @@ _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise par
 _WIDTHS_AROUND_START = 1.0, 0.1
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
+_LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
+_SMALL_STEP = 1e-4  # share of a step from which its direction in scaled parameters is found
+_LOG_LIMITS = -690.0, 690.0
 _SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _NEWTON_STEPS = 12
@@ -208,10 +211,20 @@ class ResponseTarget:
         if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
             self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
         check_quadratic(self.statistic, self.measured)
-        self._logarithmic = list(self._prior.logarithmic[: self.n_structural])
-        self._median = self._prior.from_normal(np.zeros(self.ndim))
+        low, self._median, high = self._prior.from_normal(np.array([[-2.0], [0.0], [2.0]]) * np.ones(self.ndim))
+        factors = (low > 0.0) & (high < _LARGEST_FACTOR * low) | np.array(self._prior.logarithmic)
+        self._logarithmic = list(factors[: self.n_structural])
+        self._factors = [*self._logarithmic, *([False] * self.n_noise)]
         self._noise_prior = self._prior_of_noise()
+        # of the noise coordinates over the noise parameters, at the median
+        self._median_volume = 0.0
+        if self._noise_prior is not None:
+            zero, at = np.zeros((1, self.n_noise)), self._median[None, self.n_structural :]
+            self._median_volume = float(np.squeeze(self._noise_prior.logpdf(at)) - self.log_prior(zero)[0])
+        elif self.n_noise:  # the volume of structural parameters alone is not known
+            self._logarithmic = [False] * self.n_structural
         self.archive = Archive()
+        self._simulated: set[bytes] = set()
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
@@ -250,16 +263,25 @@ class ResponseTarget:
         """Coordinates (n, ndim) of parameters (n, ndim)."""
         return _finite(self._prior.to_normal(parameters))
 
+    def _to_coordinates(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates (n, ndim) of parameters, and the logarithm (n,) of their volume over the parameters' volume.
+
+        The logarithm is -inf outside the support of the prior.
+        """
+        coords, log_volume = self.coordinates(parameters), np.full(len(parameters), -np.inf)
+        log_prior = np.atleast_1d(self._prior.logpdf(parameters))
+        inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
+        log_volume[inside] = log_prior[inside] - self.log_prior(coords[inside])
+        return coords, log_volume
+
     def density_of_parameters(
         self, log_density: Callable[[np.ndarray], np.ndarray], parameters: np.ndarray
     ) -> np.ndarray:
         """Log-density (n,) of parameters (n, ndim), from a log-density of coordinates; -inf outside the support."""
-        coords, result = self.coordinates(parameters), np.full(len(parameters), -np.inf)
-        log_prior = np.atleast_1d(self._prior.logpdf(parameters))
-        inside = np.isfinite(coords).all(axis=1) & np.isfinite(log_prior)
-        if inside.any():
-            volume = log_prior[inside] - self.log_prior(coords[inside])
-            result[inside] = log_density(coords[inside]) + volume
+        coords, result = self._to_coordinates(parameters)
+        inside = np.flatnonzero(result > -np.inf)
+        if len(inside):
+            result[inside] += log_density(coords[inside])
         return result
 
     def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
@@ -294,14 +316,53 @@ class ResponseTarget:
         return _finite(self._prior.to_normal(full)[:, : self.n_structural])
 
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters (n, n_structural), or their logarithms where the prior says that they vary by factors.
+        """Structural parameters (n, n_structural), or their logarithms where the prior keeps them away from zero.
 
-        Responses are smooth functions of these, but not of the coordinates, which go to infinity as a parameter goes to
+        A product of parameters, such as a stiffness E I, is linear in logarithms. Responses are smooth functions of
+        these, but not of the coordinates, which go to infinity as a parameter goes to
         a prior bound.
         """
         parameters = self.structural_parameters(coords)
         parameters[:, self._logarithmic] = np.log(np.maximum(parameters[:, self._logarithmic], _SMALLEST))
         return parameters
+
+    def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """Coordinates (n, n_structural) at shares (n,) of the way from one point to another, in scaled parameters."""
+        ends = self.scaled_parameters(np.stack([first, last]))
+        points = ends[0] + shares[:, None] * (ends[1] - ends[0])
+        points[:, self._logarithmic] = np.exp(points[:, self._logarithmic])
+        return self.structural_coordinates(points)
+
+    def moved(self, coords: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """Coordinates (n, n_structural) after steps (n, n_structural) that are straight in scaled parameters.
+
+        Along a ridge of equal products, such steps keep the product. Where a coordinate would move by another multiple
+        of its step than 0.3 to 3, as at a bound of the prior, the step is straight in the coordinates.
+        """
+        here = self.scaled_parameters(coords[None])
+        ends = here + (self.scaled_parameters(coords + _SMALL_STEP * steps) - here) / _SMALL_STEP
+        ends[:, self._logarithmic] = np.exp(ends[:, self._logarithmic])
+        reached = self.structural_coordinates(ends)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = (reached - coords) / steps
+        return np.where((ratio > 0.3) & (ratio < 3.0), reached, coords + steps)
+
+    def scaled(self, coords: np.ndarray) -> np.ndarray:
+        """Scaled parameters and noise coordinates (n, ndim) at coordinates (n, ndim): a ridge is straight in them."""
+        return np.column_stack([self.scaled_parameters(coords[:, : self.n_structural]), coords[:, self.n_structural :]])
+
+    def unscaled(self, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates (n, ndim) at scaled ones, and the logarithm (n,) of their volume over the scaled volume.
+
+        The logarithm is -inf outside the support of the prior.
+        """
+        d = self.n_structural
+        full = np.repeat(self._median[None], len(scaled), axis=0)
+        full[:, :d] = scaled[:, :d]
+        full[:, self._factors] = np.exp(np.clip(full[:, self._factors], *_LOG_LIMITS))
+        coords, log_volume = self._to_coordinates(full)
+        coords[:, d:] = scaled[:, d:]
+        return coords, log_volume + np.log(full[:, self._factors]).sum(axis=1) - self._median_volume
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""
@@ -309,8 +370,13 @@ class ResponseTarget:
 
     # ------------------------------------------------------------------ simulations
 
+    def new_points(self, coords: np.ndarray) -> int:
+        """Number of structural coordinates (n, n_structural) that `run` has not simulated yet."""
+        return len({row.tobytes() for row in coords} - self._simulated)
+
     def run(self, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:
         """Simulate structural coordinates (n, n_structural)."""
+        self._simulated.update(row.tobytes() for row in coords)
         return self.run_parameters(self.structural_parameters(coords), coords, remember)
 
     def run_parameters(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember = run_at_once) -> Runs:

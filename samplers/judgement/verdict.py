@@ -280,7 +280,8 @@ def judge(
         found.append(Concern(f"the draws of the guide were not used ({result.start.reason})", False))
     if result.start is not None or (stop is not None and stop.from_guide):
         found += [Concern(f"concern of the guide: {concern}", False) for concern in result.concerns]
-        if not result.concerns:
+        found += [Concern(f"concern of the guide: {refusal}", True) for refusal in result.refusals]
+        if not result.concerns and not result.refusals:
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
     if stage.log_evidence_error > LARGEST_ERROR and not result.has_better_check:
         found.append(

@@ -21,6 +21,7 @@ DEFAULTS = {
     "simulations": 0.0,
     "log_density_error": 0.0,
     "concerns": (UNKNOWN,),
+    "refusals": (),
     "basis": "",
     "observe": None,
     "learns_from_parts": False,
@@ -43,8 +44,8 @@ class GuideSession(NamedTuple):
         ``fits(n)``: whether n more simulations fit into the limit. To be called before each batch of simulations; if
         False, the guide makes none and returns.
     remaining : callable
-        ``remaining()``: simulations left, inf without a limit. No decision except to stop may depend on it, otherwise a
-        run that is continued with a larger limit cannot repeat its first part.
+        ``remaining()``: simulations left, inf without a limit. Decisions that depend on it, except to stop, are to be
+        stored with `remember`: otherwise a run that is continued with a larger limit cannot repeat its first part.
     asynchronous : bool
         Whether draws arrive in any order, and new draws are made while earlier draws are still running.
     """
@@ -86,6 +87,8 @@ class Guide(Protocol):
         Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any concern,
         the verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is
         known to miss nothing.
+    ``refusals`` : sequence of str
+        Graver reasons of the same kind, with which the verdict is "not usable". None by default.
     ``known_density`` : KnownDensity, optional
         A density close to the posterior with known expectations, such as an emulated posterior, as it is now
         (`samplers.estimates.importance.KnownDensity`). It makes expectations under the posterior more accurate

@@ -95,12 +95,14 @@ def test_a_parameter_that_varies_by_factors_enters_by_its_logarithm():
     coords = np.array([[0.0, -2.0], [0.0, 0.0], [0.0, 2.0]])
     scaled = target.scaled_parameters(coords)
     np.testing.assert_allclose(scaled[:, 1], np.log(0.8) + coords[:, 1])
-    np.testing.assert_allclose(scaled[:, 0], target.structural_parameters(coords)[:, 0])
+    np.testing.assert_allclose(scaled[:, 0], np.log(target.structural_parameters(coords)[:, 0]))
+    wide = ResponseTarget(vibration(damping=TruncatedNormal(1.0, 1.0)))  # reaches down to zero
+    np.testing.assert_allclose(wide.scaled_parameters(coords)[:, 1], wide.structural_parameters(coords)[:, 1])
 
 
 def test_uncertainty_enters_through_the_expected_likelihood():
     """Against a Monte Carlo average over the coefficients, with variances that are as large as those of the noise."""
-    target, emulator = emulator_of(vibration("white"))
+    target, emulator = emulator_of(vibration("white", damping=TruncatedNormal(1.0, 1.0)))
     emulator.process = emulator.process._replace(variances=emulator.process.variances * 1e8)
     noise = target.fit_noise(target.archive.statistics[0]).coords
     offsets = np.array([[0.0, 0.0], [0.02, 0.0], [0.05, 0.2], [-0.08, 0.1]])

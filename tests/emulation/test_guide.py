@@ -119,7 +119,7 @@ def test_a_second_sampler_repeats_no_simulation(tmp_path):
     assert counts[0] > 100
     parts = len({run[0] for run in guided_run.runs(log)})
     assert 0 < counts[2] <= counts[3] <= counts[2] + 2 * parts  # each sampler verifies two rows of every part
-    assert counts[3] < 0.12 * counts[0]
+    assert counts[3] < 0.15 * counts[0]
     assert results[:2] == results[2:]
 
 

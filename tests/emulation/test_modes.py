@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import minimize
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, problems
-from fe_likelihoods.emulation.levenberg_marquardt import Ascent, _connected, _has_valley
-from fe_likelihoods.emulation.modes import find_modes
+from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _Climb, _Point, _valley
+from fe_likelihoods.emulation.modes import UNSEEN, find_modes, unseen_share
 from fe_likelihoods.emulation.target import ResponseTarget
+from samplers import SamplingWarning, SMCSampler
 
 from .problems import acts_late, free_vibration, misleading, symmetric, vibration
 
@@ -63,6 +64,43 @@ def test_two_modes_are_found_and_the_starts_are_assigned_to_them():
     assert sorted(round(float(mode.parameters[0]), 1) for mode in search.modes) == [-0.7, 0.7]
     for number, mode in enumerate(search.modes):
         assert all(search.ends[start] == number for start in mode.starts)
+
+
+def _equal_modes(n):
+    """A parameter c whose n values (k + 1/2) / n give the same response, and one parameter that is identified."""
+    time = 0.02 * np.arange(100)
+
+    def respond(theta):
+        angle = 2.0 * np.pi * n * theta[1]
+        return (theta[0] * np.sin(3.0 * time) + 0.3 * np.cos(angle) * np.cos(7.0 * time) + 0.3 * np.sin(angle))[None]
+
+    channels = [Channel("top", "displacement", "m")]
+    model = FunctionModel(respond, ("a", "c"), channels, 0.02, 100, version=f"{n} modes")
+    noise = 0.02 * np.random.default_rng(n).standard_normal((1, 100))
+    measured = Measurements(channels, 0.02, model.simulate(np.array([1.0, 0.5 / n])) + noise)
+    prior = {"a": Uniform(0.0, 2.0), "c": Uniform(0.0, 1.0), "sigma_top": Uniform(0.005, 0.5)}
+    return Posterior(FELikelihood(model, measured), prior)
+
+
+@pytest.mark.parametrize(("n", "most"), [(1, 8), (2, 24), (6, 32)])
+def test_starts_are_added_until_few_unseen_modes_are_expected(n, most):
+    found = [find_modes(_equal_modes(n), seed=seed) for seed in range(1, 6)]
+    for search in found:
+        assert len(search.ends) <= most
+        assert unseen_share(search) <= UNSEEN or len(search.ends) == 32
+        assert len(search.modes) >= n - 1
+    assert sum(len(search.modes) for search in found) >= 5 * n - 1
+
+
+def test_a_result_with_many_modes_of_one_start_is_refused():
+    """The limit of simulations leaves no room for further starts."""
+    posterior = _equal_modes(10)
+    sampler = SMCSampler(50, 3, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=300)
+    with pytest.warns(SamplingWarning):
+        sampler.run_mcmc(None, 0)
+    assert sampler.verdict.status == "not usable"
+    assert "8 starts led to" in str(sampler.verdict) and "were not found" in str(sampler.verdict)
+    assert unseen_share(sampler.guide.search) > 0.3
 
 
 def test_a_failing_start_leads_nowhere_and_failing_steps_are_shortened():
@@ -131,9 +169,10 @@ def test_a_rough_likelihood_neither_splits_a_mode_nor_prolongs_an_ascent():
 
 
 def test_a_valley_is_a_point_below_points_on_both_sides():
-    assert not _has_valley(np.array([480.0, 300.0, 100.0, 0.0, -98.0]))  # descends: left to the check of the height
-    assert not _has_valley(np.array([0.0, -2.0, 1.0, -1.0, 0.5]))
-    assert _has_valley(np.array([-15.0, 0.0, -18.0, -2.0, 0.0]))  # over the top of a mode, and a valley, to another one
+    assert _valley(np.array([480.0, 300.0, 100.0, 0.0, -98.0])) < 0.0  # descends: left to the check of the height
+    assert _valley(np.array([0.0, -2.0, 1.0, -1.0, 0.5])) == 2.0 < _DIP
+    # over the top of a mode, and a valley, to another one
+    assert _valley(np.array([-15.0, 0.0, -18.0, -2.0, 0.0])) == 18.0
 
 
 @pytest.mark.parametrize("value", [100.0, 480.0])
@@ -141,13 +180,16 @@ def test_an_ascent_does_not_join_an_end_of_another_height(value):
     """The end of an ascent that is stuck in a local maximum is not the end of one that is already far above it."""
     target = ResponseTarget(vibration())
     start, *_ = find_modes(vibration(), starts=1, seed=1).modes
-    coords = start.coords[:2]
-    nothing = np.zeros((2, 2, 200))
-    low = Ascent(coords + 0.1, 300.0, np.eye(2), target.fit_noise(np.ones(2)), nothing[0], nothing, 0.0, 3)
-    search = _connected(target, coords, value, low.noise, np.zeros(2), [low], np.inf)
+    coords, noise = start.coords[:2], target.fit_noise(np.ones(2))
+    zero, nothing = np.zeros(2), np.zeros((2, 2, 200))
+    known = {7: Ascent(coords + 0.1, nothing[0], zero, noise, 300.0, nothing, zero, zero, np.eye(2))}
+    known[0] = known[7]._replace(value=value)
+    climb = _Climb(target, Jacobians(), zero, known, np.inf, 0)
+    climb.here = _Point(coords, nothing[0], zero, noise, value)
+    search = climb.connected()
     with pytest.raises(StopIteration) as end:
         next(search)
-    assert end.value.value == -1
+    assert end.value.value is None
 
 
 def test_an_end_that_fits_only_the_first_part_worse_is_kept():
