@@ -432,13 +432,17 @@ class ResponseGuide:
             noise = self._modes[k].coords[d:]
             density = self._target.log_likelihood(statistics[rows], np.repeat(noise[None], len(rows), axis=0))
             density = density + self._target.log_prior(coords[rows])
-            order = np.argsort(-density)
-            good = density[order] > density[order[0]] - _DEPTH[0] - _DEPTH[1] * d
+            best = rows[np.argmax(density)]
+            # runs where the last emulator was wrong as well: left out, it would be wrong there again
+            expected = (
+                density if region.emulator is None else np.fmax(density, self._expected(region, coords[rows], noise))
+            )
+            order = np.argsort(-expected)
+            good = expected[order] > density.max() - _DEPTH[0] - _DEPTH[1] * d
             good[: _ALWAYS * d] = True
             rows = rows[order[good][:_MOST_RUNS]]
             if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
                 continue
-            best = rows[0]
             residuals = archive.residuals[best].astype(float)
             scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max(axis=1)
             training = TrainingSet(coords[rows], np.array([archive.residuals[row] for row in rows]))
@@ -450,3 +454,9 @@ class ResponseGuide:
                 logger.info("no emulator could be fitted to %d runs: %s", len(rows), error)
                 continue
             self._regions[k] = region._replace(emulator=emulator)
+
+    def _expected(self, region: Region, coords: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Log-density (n,) at structural coordinates (n, d) by the emulator of a region; -inf beyond its reach."""
+        full = np.column_stack([coords, np.repeat(noise[None], len(coords), axis=0)])
+        density = region.emulator.log_likelihood(full) + self._target.log_prior(coords)
+        return np.where(region.emulator.squared_distance(coords) <= region.emulator.reach, density, -np.inf)
