@@ -10,7 +10,7 @@ __all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_mid
 
 _DATE = r"(\d{4})-(\d{2})-(\d{2})"
 _TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
-_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?(?:[AP]M|Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?([AP]M|Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
 _DAY_ONLY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
 _HOUR, _DAY = 3600, 86400
 
@@ -26,11 +26,14 @@ class ClockTime(NamedTuple):
         Seconds since the midnight before [s].
     decimals : int
         Digits after the decimal point of the seconds.
+    zone : int or None
+        Time zone: minutes by which the clock is before UTC, None without one.
     """
 
     day: int | None
     seconds: float
     decimals: int
+    zone: int | None
 
 
 def is_clock(cell: str) -> bool:
@@ -44,7 +47,7 @@ def is_date(cell: str) -> bool:
 
 
 def parse_clock(cell: str, where: str) -> ClockTime:
-    """Return the clock time in a cell; raise ValueError for anything else. A time zone is left out."""
+    """Return the clock time in a cell; raise ValueError for anything else."""
     found = _CLOCK.fullmatch(cell)
     if found is None:
         raise ValueError(
@@ -54,7 +57,7 @@ def parse_clock(cell: str, where: str) -> ClockTime:
         raise ValueError(
             f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}: write it without AM and PM"
         )
-    year, month, day, hour, minute, second, fraction = found.groups()
+    year, month, day, hour, minute, second, fraction, zone = found.groups()
     if int(hour) > 24:
         raise ValueError(f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}")
     number = None
@@ -64,7 +67,14 @@ def parse_clock(cell: str, where: str) -> ClockTime:
         except ValueError as error:
             raise ValueError(f"{where}: expected a date, got {cell[:100]!r} ({error})") from None
     whole = 3600 * int(hour) + 60 * int(minute) + int(second)
-    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""))
+    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""), _minutes(zone))
+
+
+def _minutes(zone: str | None) -> int | None:
+    """Minutes of a time zone such as ``+02:00``; ``Z`` and ``UTC`` are zero."""
+    if zone is None or zone.upper() in ("Z", "UTC"):
+        return None if zone is None else 0
+    return int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
 
 
 def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
@@ -75,12 +85,15 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
     Raises
     ------
     ValueError
-        If some times have a date and others have none, or 1 o'clock follows 12 o'clock, as on a 12-hour clock.
+        If some times have a date and others have none, time zones differ, or 1 o'clock follows 12 o'clock, as on a
+        12-hour clock.
     """
     known = [time for time in times if time is not None]
     dates = {time.day is None for time in known}
     if len(dates) > 1:
         raise ValueError(f"{where}: expected a date in all clock times or in none; write them alike")
+    if len(zones := {time.zone for time in known}) > 1:
+        raise ValueError(f"{where}: expected one time zone in all clock times, got {len(zones)}; write them alike")
     day, last, found = 0, 0.0, []
     for time in times:
         if time is None:

@@ -74,7 +74,8 @@ def read_columns(
         Number of lines above the table, if they are not found.
     zero : float or str, optional
         Time in the file at which the excitation begins [s]. For clock times, which count from midnight, it may be a
-        clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``.
+        clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``, in the time zone of the file unless it
+        states another one (``"03:19:53Z"``, ``"05:19:53+02:00"``).
     missing : sequence of float, optional
         Numbers that stand for missing samples; they are read as NaN. A warning names the numbers that no column has.
         If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them; -999,

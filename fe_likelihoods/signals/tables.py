@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
-from .clock_times import is_clock, is_date, parse_clock, seconds_since_midnight
+from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight
 from .table_rows import read_rows
 from .text_files import NUMBER, Series, agree_on_unit, check_count, parse_count, parse_number
 
@@ -64,8 +64,8 @@ class Table(NamedTuple):
         Columns of clock times. Their values are the seconds since the midnight before the first clock time.
     dates : frozenset of int
         Columns of dates, which have no values.
-    day : int or None
-        Day number of the first clock time, None without a date.
+    clock : ClockTime or None
+        The first clock time.
     """
 
     file: str
@@ -78,7 +78,7 @@ class Table(NamedTuple):
     time_unit: str | None = None
     clocks: frozenset[int] = frozenset()
     dates: frozenset[int] = frozenset()
-    day: int | None = None
+    clock: ClockTime | None = None
 
 
 def read_table(path: str | Path, skip: int | None = None, time_unit: str | None = None) -> Table:
@@ -111,7 +111,7 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     if time_unit is not None:
         find_unit(time_unit, "time")
     values = np.empty((len(rows.cells), width))
-    decimals, clocks, dates, day = [], set(), set(), None
+    decimals, clocks, dates, clock = [], set(), set(), None
     for column in range(width):
         cells = [(cells[column], f"{file}, line {number}") for number, cells in rows.cells]
         if any(is_clock(cell) for cell, _ in cells):
@@ -119,7 +119,7 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
             times = [parse_clock(cell, where) if cell else None for cell, where in cells]
             values[:, column] = seconds_since_midnight(times, file)
             decimals.append(max(time.decimals for time in times if time is not None))
-            day = next(time.day for time in times if time is not None) if day is None else day
+            clock = next(time for time in times if time is not None) if clock is None else clock
         elif any(is_date(cell) for cell, _ in cells) and all(is_date(cell) or not cell for cell, _ in cells):
             dates.add(column)
             values[:, column] = np.nan
@@ -130,7 +130,7 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     lines = tuple(number for number, _ in rows.cells)
     units = rows.units or ("",) * width
     numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
-    return Table(file, *numbers, frozenset(clocks), frozenset(dates), day)
+    return Table(file, *numbers, frozenset(clocks), frozenset(dates), clock)
 
 
 def value_column(table: Table, column: str | None = None) -> int:
@@ -338,14 +338,17 @@ def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
 
 
 def _clock_zero(table: Table, place: int | None, text: str) -> float:
-    """Return the clock time `zero` in the times of the table [s]; without a date, it is on the day of the first row."""
+    """Return the clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
     if place not in table.clocks:
         raise ValueError(f"{table.file}: zero={text!r} needs a column of clock times; give zero in seconds")
     zero = parse_clock(text, "zero")
-    if zero.day is not None and table.day is None:
+    first = table.clock
+    if zero.day is not None and first.day is None:
         raise ValueError(f"{table.file}: the times have no date; give zero={text!r} without one")
-    days = 0 if zero.day is None else zero.day - table.day
-    return 86400 * days + zero.seconds
+    if zero.zone is not None and first.zone is None:
+        raise ValueError(f"{table.file}: the times have no time zone; give zero={text!r} without one, as in the file")
+    days = 0 if zero.day is None else zero.day - first.day
+    return 86400 * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))
 
 
 def _time_column(table: Table) -> int | None:

@@ -96,6 +96,11 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         read_columns(path, (TOP,), ("acc_g",), zero="2019-07-06T23:59:59.5")
     path.write_text("Time,acc_g\n2020-01-01T00:00:01,1\n2020-01-01T00:00:02,2\n")
     assert read_columns(path, (TOP,), ("acc_g",), zero="2019-12-31T23:59:59").start == 2.0
+    with pytest.raises(ValueError, match="the times have no time zone; give zero='2020-01-01T00:00:00Z' without one"):
+        read_columns(path, (TOP,), ("acc_g",), zero="2020-01-01T00:00:00Z")
+    path.write_text("Time,acc_g\n2020-01-01T00:00:01+02:00,1\n2020-01-01T00:00:02+02:00,2\n")
+    for zero in ("2020-01-01T00:00:00", "2019-12-31T22:00:00Z", "2019-12-31 17:00:00-0500"):
+        assert read_columns(path, (TOP,), ("acc_g",), zero=zero).start == 1.0
     path.write_text(f"time_s,acc_g\n{ROWS}")
     with pytest.raises(ValueError, match="zero='00:00:01' needs a column of clock times; give zero in seconds"):
         read_columns(path, (TOP,), ("acc_g",), zero="00:00:01")
@@ -110,6 +115,7 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         ("12:00:00.00,1\n,2\n12:00:00.02,3\n", "line 3: expected a time, got an empty cell"),
         ("2019-02-30T12:00:00,1\n2019-02-30T12:00:01,2\n", "line 2: expected a date, got '2019-02-30T12:00:00'"),
         ("2019-02-03T12:00:00,1\n12:00:01,2\n", "expected a date in all clock times or in none"),
+        ("12:00:00Z,1\n12:00:01+02:00,2\n", "expected one time zone in all clock times, got 2; write them alike"),
         ("12:59:59.99,1\n1:00:00.00,2\n1:00:00.01,3\n", "back from 12 to 1 o'clock, as on a clock of 12 hours"),
         ("11:59:59 PM,1\n12:00:00 AM,2\n", "line 2: .*hours from 0 to 23; got '11:59:59 PM': write it without AM"),
         ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23; got '99:00:00'"),
