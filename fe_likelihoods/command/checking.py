@@ -110,7 +110,7 @@ def _say_simulation(problem: Problem, own: bool, say: Callable[[str], None]) -> 
         names = ", ".join(c.name for c, each in zip(measured.channels, opposite, strict=True) if each)
         say(
             f"CAUTION: response and measurements have opposite signs: {names}. Where the sensor counts the other way, "
-            "multiply its column in the file by -1"
+            "name it in `reversed` of [measurements]"
         )
     if own and np.where(opposite, rrmse(-response, measured.values), errors).max() > LARGE_ERROR:
         say(

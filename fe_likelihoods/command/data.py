@@ -132,6 +132,8 @@ def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) 
     else:
         path = job.path("measurements", "file", given["file"])
         measured = _within_messages(job, "measurements", lambda: _read_columns(path, given, channels))
+    if "reversed" in given:
+        measured = _within_messages(job, "measurements", lambda: _turned(measured, given["reversed"]), "reversed: ")
     if "channels" in given:
         measured = _within_messages(job, "measurements", lambda: measured.select(given["channels"]), "channels: ")
     if record is None or is_dataset(job, "measurements"):
@@ -161,6 +163,17 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
         description=f"measurements of {path.name}",
         **options,
     )
+
+
+def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
+    """Measurements with the channels `names` multiplied by -1; ValueError for an unknown channel."""
+    known = tuple(channel.name for channel in measured.channels)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"unknown channel {name!r}; {did_you_mean(name, known)}")
+    signs = np.where(np.isin(known, names), -1.0, 1.0)[:, None]
+    text = f"{measured.description}, reversed: {', '.join(names)}"
+    return Measurements(measured.channels, measured.dt, signs * measured.values, text, measured.start)
 
 
 def _within_messages(job: Job, section: str, read: Callable[[], Any], key: str = "") -> Any:

@@ -427,6 +427,15 @@ def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     (tmp_path / "synthetic_measured.csv").write_text("\n".join([comment, header, *turned]))
     output = call("check", "upright.toml")
     assert "opposite signs: displacement. Where" in output and "it must return SI units" not in output
+    text = (tmp_path / "upright.toml").read_text()
+    given = text.replace("[measurements]\n", '[measurements]\nreversed = ["displacement"]\n')
+    (tmp_path / "turned.toml").write_text(given)
+    output = call("check", "turned.toml")
+    assert "opposite" not in output and "reversed: displacement" in output
+    (tmp_path / "turned.toml").write_text(given.replace('["displacement"]', '["displacment"]'))
+    assert "[measurements] reversed: unknown channel 'displacment'; did you mean displ" in call(
+        "check", "turned.toml", code=1
+    )
 
 
 def test_debug_shows_where_an_error_was_raised(folder):
