@@ -38,6 +38,7 @@ from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 __all__ = ["Outcome", "default_folder", "report_run", "run_job"]
 
 SETTINGS, ORIGIN, CHAIN, CACHE = "settings.toml", "origin.json", "run.h5", "simulations.sqlite"
+WITHOUT_MODEL = "without-model"  # folder in the folder of a run
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
 DRAWS = 100  # of predictions
 
@@ -121,7 +122,7 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
         Folder of a run, or a file in it.
     runs_code : bool
         Whether a Python file or program that the settings name as the model may be run. Without it, a report of such a
-        run has no responses and no predictions.
+        run has no responses and no predictions, and is written to the folder `WITHOUT_MODEL` of the run.
 
     Returns
     -------
@@ -155,9 +156,19 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
         # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.tempered"):
             sampler.run_mcmc(None, 0, progress=False)
-    events = read_events(job, problem) if runs else ()
     file = Path(origin["file"])
+    if not runs:
+        beside = folder / WITHOUT_MODEL
+        beside.mkdir(exist_ok=True)
+        run = read_run(sampler, problem.posterior, discard=discarded(job))
+        return Outcome(beside, sampler, problem, *_write_samples_only(beside, run, _command(file, folder)))
+    events = read_events(job, problem)
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
+
+
+def _command(file: Path, folder: Path) -> str:
+    """The command that makes a run again."""
+    return shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
 
 
 def _damaged(path: Path, error: Exception | str) -> ValueError:
@@ -215,10 +226,7 @@ def _write(
 
     Predictions are made here; their responses are in the cache if they were made before.
     """
-    posterior, again = problem.posterior, shlex.join(["fe-likelihoods", "run", str(file), "--out", str(folder)])
-    run = read_run(sampler, posterior, discard=discarded(job))
-    if isinstance(posterior.likelihood.model, NotRun):
-        return _write_samples_only(folder, run, again)
+    run = read_run(sampler, problem.posterior, discard=discarded(job))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
@@ -227,7 +235,7 @@ def _write(
     pictures = write_events(folder, events, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     page, truth = folder / "report.html", problem.truth
-    report = write_report(page, run, prediction, again, truth, predicted, measured)
+    report = write_report(page, run, prediction, _command(file, folder), truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
     cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for each in described:
@@ -259,8 +267,9 @@ def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tup
     report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
     caution = (
         "the model is a Python file or program that the settings name, which was not run: the report has no "
-        "responses and no predictions, and evidence and verdict as they are stored. `fe-likelihoods report FOLDER "
-        "--run-code` runs it; do that only with code that you trust"
+        "responses and no predictions, and evidence and verdict as they are stored. The report of the run itself was "
+        "not changed. `fe-likelihoods report FOLDER --run-code` runs the model and makes that report again; do that "
+        "only with code that you trust"
     )
     return ("report.html", *write_tables(folder, run), samples), (caution,), not run.is_inconclusive
 

@@ -22,6 +22,7 @@ function = "strange_model.py:simulate"
 parameters = ["stiffness", "damping"]
 channels = {acceleration = "absolute acceleration [g]", displacement = "relative displacement [cm]"}""",
 )
+RESULTS = {".html", ".txt", ".csv", ".nc"}
 HOSTILE = "open('was_run', 'w').close()\n"
 
 
@@ -37,6 +38,8 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(folder, monkeypatch):  
     whole = (folder / "r" / "summary.txt").read_text()
     assert "RRMSE" in whole and (folder / "r" / "fit.csv").exists()
     before = (folder / "r" / "summary.csv").read_text().splitlines()
+    complete = {path.name: path.read_bytes() for path in (folder / "r").iterdir() if path.suffix in RESULTS}
+    beside = folder / "r" / "without-model"
     evidence = re.search(r"log-evidence -?(\S+) \+- ([\d.]+)", whole)
     sys.modules.pop("strange_model", None)
     source.write_text(HOSTILE + FUNCTION)
@@ -54,16 +57,17 @@ def test_a_report_of_a_folder_of_a_stranger_runs_no_code(folder, monkeypatch):  
             said = call("report", "r")
         assert "which was not run: the report has no responses and no predictions" in " ".join(said.split())
         assert not (folder / "was_run").exists() and "strange_model" not in sys.modules
-        summary = (folder / "r" / "summary.txt").read_text()
+        summary = (beside / "summary.txt").read_text()
         assert "stiffness" in summary and "the model was not run" in summary
         verdict = "Verdict of the sampler, as the run has stored it: "
-        for written in (summary, (folder / "r" / "report.html").read_text()):
+        for written in (summary, (beside / "report.html").read_text()):
             assert f"{evidence[1]} ± {evidence[2]}, as the run has stored it" in written and verdict in written
             assert "gives no evidence" not in written
-        rows = [(folder / "r" / name).read_text().splitlines() for name in ("summary.csv", "report.html")]
+        rows = [(beside / name).read_text().splitlines() for name in ("summary.csv", "report.html")]
         assert len(rows[0]) == 5 and len(rows[1]) > 10
         means = [float(row.split(",")[1]) for row in rows[0][1:]]
         assert means == pytest.approx([float(row.split(",")[1]) for row in before[1:]], rel=1e-6)  # of the same samples
+    assert complete == {name: (folder / "r" / name).read_bytes() for name in complete} and len(complete) > 4
     assert "contains another run" in call("report", "r", "--run-code", code=1)  # the code differs
     assert (folder / "was_run").exists()  # the test can fail
     (folder / "was_run").unlink()
