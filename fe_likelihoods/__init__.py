@@ -5,6 +5,8 @@ loaded on first use: importing the package takes about 0.01 s. The names are lis
 and type checkers read as well. Other modules are imported by their names, as in ``import fe_likelihoods.units``.
 """
 
+from importlib import import_module
+
 import lazy_loader
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
@@ -63,10 +65,15 @@ _IN_MODULES = {
 
 
 def __getattr__(name: str) -> object:
-    """A public name, loaded on first use; ImportError for one that has moved, since it is the error of an import."""
+    """A public name, loaded on first use; ImportError for one that is elsewhere, since it is the error of an import."""
     if name in _REPLACED:
         raise ImportError(f"fe_likelihoods.{name} is now {_REPLACED[name]}")
     for module, names in _IN_MODULES.items():
         if name in names.split():
             raise ImportError(f"{name} is imported from its module: from fe_likelihoods.{module} import {name}")
-    return _load(name)
+    try:
+        return _load(name)
+    except AttributeError:
+        if not name.startswith("_") and name in import_module("samplers").__all__:
+            raise ImportError(f"{name} is in the other package: from samplers import {name}") from None
+        raise

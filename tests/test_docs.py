@@ -57,11 +57,18 @@ def test_the_page_of_names_has_every_public_name_and_no_unknown_one():
     assert not public - set(named), "say in docs/names.rst, and on the page of its task, what they are for"
     exported = {
         name
-        for path in (DOCS.parent / "fe_likelihoods").rglob("*.py")
+        for package in (fe_likelihoods, samplers)
+        for path in Path(package.__file__).parent.rglob("*.py")
         for exports in re.findall(r"^__all__ = (\[[^\]]*\])", path.read_text(), re.MULTILINE)
         for name in ast.literal_eval(exports)
     }
     assert not set(named) - public - exported
+    text = (DOCS / "names.rst").read_text()
+    for package in (fe_likelihoods, samplers):
+        for module, names in package._IN_MODULES.items():
+            (row,) = re.findall(rf"^   `{package.__name__}\.{module}`, (.*)$", text, re.MULTILINE)
+            assert re.findall(r"``(\w+)``", row) == names.split()
+        assert {name for name in package._REPLACED if f"`{package.__name__}.{name}`" not in text} == set()
 
 
 def test_tutorials_have_the_form_of_the_gallery():

@@ -85,6 +85,10 @@ def test_names_that_have_moved_say_where_they_are(package):
             with pytest.raises(ImportError, match=f"from {package.__name__}.{module} import {name}"):
                 getattr(package, name)
             assert hasattr(importlib.import_module(f"{package.__name__}.{module}"), name)
+    other = samplers if package is fe_likelihoods else fe_likelihoods
+    for name in other.__all__:
+        with pytest.raises(ImportError, match=f"from {other.__name__} import {name}$"):
+            getattr(package, name)
 
 
 @pytest.mark.parametrize(
