@@ -273,7 +273,7 @@ def plot_pairs(most: int = 2000) -> Figure:
             ax.plot(places, gaussian_kde(x[:, j])(places), color="#1f5a8c", linewidth=1.4)
             ax.set_title(f"CV = {x[:, j].std() / x[:, j].mean():.2e}", fontsize="small", pad=3)
         elif i < j:
-            ax.plot(*pair, ".", color="#1f5a8c", markersize=2, alpha=0.35, markeredgewidth=0)
+            ax.plot(*pair, ".", color="#1f5a8c", markersize=2 if len(shown) > 500 else 5, alpha=0.4, markeredgewidth=0)
         else:
             density = gaussian_kde(pair)
             u, v = np.meshgrid(np.linspace(*limits[:, j], 60), np.linspace(*limits[:, i], 60))
@@ -288,10 +288,11 @@ def plot_pairs(most: int = 2000) -> Figure:
             ax.axvline(values[j], color=colour, linewidth=1.1)
             if i != j:
                 ax.axhline(values[i], color=colour, linewidth=1.1)
-            elif not limits[0, j] <= values[j] <= limits[1, j]:
-                side, x_text = ("left", 0.03) if values[j] < limits[0, j] else ("right", 0.97)
-                style = {"color": colour, "fontsize": 7, "ha": side, "va": "top"}
-                ax.text(x_text, 0.97 - 0.14 * row, f"{values[j]:.4g}", transform=ax.transAxes, **style)
+            elif values[j] < limits[0, j] or values[j] > limits[1, j]:  # not NaN, for a parameter without the value
+                below = values[j] < limits[0, j]
+                text = f"← {values[j]:.4g}" if below else f"{values[j]:.4g} →"
+                style = {"color": colour, "fontsize": 7, "ha": "left" if below else "right", "va": "top"}
+                ax.text(0.03 if below else 0.97, 0.97 - 0.14 * row, text, transform=ax.transAxes, **style)
         ax.set_xlim(limits[:, j])
         ax.tick_params(labelbottom=i == k - 1, labelleft=j == 0 and i > 0, labelsize=7)
         ax.tick_params(axis="x", labelrotation=35)

@@ -227,6 +227,7 @@ def main() -> None:
 
     labels = [f"{name} [x nominal]" for name in own_models.NAMES]
     structural = {name: x[:, :2] for name, x in draws.items()}
+    # the three posteriors are equal, so that the last one covers the others
     plot_corner(structural, labels=labels, truths=TRUTH).savefig(args.out / "corner.png", dpi=130)
     plot_loop(draws["function"].mean(axis=0)[:2], args.out / "loops.png")
     (args.out / "summary.json").write_text(json.dumps(results, indent=2) + "\n")

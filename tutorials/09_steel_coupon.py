@@ -167,7 +167,7 @@ for column, (label, part) in zip(axes.T, parts.items(), strict=True):
     for axis in column:
         axis.grid(alpha=0.25)
 axes[0, 0].legend(frameon=False, fontsize="small")
-axes[1, 0].legend(frameon=False, fontsize="small", loc="upper left")
+axes[1, 0].legend(frameon=False, fontsize="small", loc="lower left", ncols=2)
 figure.suptitle("Steel coupon, calibrated on the first half with AR(1) errors")
 figure.savefig(args.out / "loops.png", dpi=130)
 

@@ -192,14 +192,14 @@ print(agreement)
 
 responses = {name: np.abs(measured[name].values).max() / G for name in events}
 fig, axes = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
-for ax, k, label in zip(axes, (0, 1), ("Frequency [Hz]", "Damping ratio [-]"), strict=True):
+for ax, k, label in zip(axes, (0, 1), ("frequency [Hz]", "damping ratio [-]"), strict=True):
     for name, sampler in samplers.items():
         q05, median, q95 = np.quantile(sampler.get_chain(flat=True)[:, k], [0.05, 0.5, 0.95])
         ax.errorbar(responses[name], median, [[median - q05], [q95 - median]], fmt="o", color="C0", capsize=3)
     ax.set_ylabel(label)
     ax.set_xscale("log")
 axes[0].set_title("Each event calibrated alone: median and 90 % interval (synthetic data)")
-axes[1].set_xlabel("Measured peak of the deck [g]")
+axes[1].set_xlabel("measured peak of the deck [g]")
 fig.savefig(args.out / "events.png", dpi=150)
 
 # %%
@@ -230,9 +230,9 @@ print(f"\npropagate warned about {len(warned)} of {NEW} new events, such as:\n{n
 #
 # `Hierarchy` is the population of the parameters: medians and standard deviations between events. The ratios of
 # measured to fitted peaks are the error of the model where it fits best. `predict_new_event` draws both for the new
-# event, as if they were independent. `predict_from_median` has one ratio instead, of the measured peaks to those of the
-# median parameters of the population, which contains both with all that they have to do with each other. No event is
-# simulated again for the population.
+# event, as if they were independent. `predict_from_median` has one ratio instead: each measured peak to the peak at the
+# median parameters of the population. This ratio contains the error of the model, the spread of the parameters and
+# their correlation. No event is simulated again for the population.
 
 POPULATION = {  # priors of medians and of standard deviations of logarithms and logits: assumed, wide
     "frequency": Varying(LogNormal(5.0, 0.5), HalfNormal(0.3)),
@@ -372,7 +372,7 @@ for ax, (label, curve) in zip(axes, curves.items(), strict=True):
     ax.plot(GRID, curve.probability.reshape(-1, PER_LEVEL).mean(axis=1), color="0.4", label="mean of the motions")
     ax.plot(GRID, exceeded.reshape(-1, PER_LEVEL).mean(axis=1), "k--", label="share exceeded (synthetic truth)")
     ax.set_title(f"{label}: Brier score {brier:.3f}")
-    ax.set_xlabel("Peak acceleration of the base [g]")
+    ax.set_xlabel("peak acceleration of the base [g]")
 axes[0].set_ylabel(f"P(peak of the deck > {from_si(LIMIT, 'g'):.2g} g)")
 fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
 fig.savefig(args.out / "fragility.png", dpi=150)

@@ -153,6 +153,8 @@ def plot_corner(
     size = 7.0 if k > 6 else 8.0
     for i, text in enumerate(texts):
         _finish_diagonal(axes[i, i], drawn, i, size)
+        for axis in (*(each.xaxis for each in axes[i:, i]), *(each.yaxis for each in axes[i, :i])):
+            axis.set_ticks(_inner_ticks(drawn.limits[i]))
         axes[-1, i].set_xlabel(text, fontsize=size + 1.0)
         axes[-1, i].xaxis.set_label_coords(0.5, -0.5 / panel)
         _set_digits(axes[-1, i].xaxis, drawn.limits[i], size)
@@ -376,6 +378,16 @@ def _finish_diagonal(axes: "Axes", drawn: _Drawn, i: int, size: float) -> None:
     else:
         text = f"{mean:.4g} ± {deviation:.2g}"
     axes.set_title(text, fontsize=size, pad=3)
+
+
+def _inner_ticks(limits: np.ndarray) -> np.ndarray:
+    """Two or three round values away from the edges of a panel, so that no label meets one of the next panel."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = limits + 0.08 * np.array([1.0, -1.0]) * np.ptp(limits)
+    candidates = (MaxNLocator(n).tick_values(low, high) for n in (3, 4, 5, 6, 8))
+    found = [ticks[(ticks >= low) & (ticks <= high)] for ticks in candidates]
+    return next((ticks for ticks in found if len(ticks) > 1), found[-1])
 
 
 def _set_digits(axis: Any, limits: np.ndarray, size: float) -> None:
