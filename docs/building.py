@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+import re
 import types
 from pathlib import Path
 
@@ -50,6 +51,14 @@ def write_api_pages(app) -> None:
             path.write_text(text)
 
 
+def forget_moved_names() -> None:
+    """Let packages raise AttributeError for moved names, since sphinx-gallery looks for names of modules in them."""
+    for package in PACKAGES:
+        module = importlib.import_module(package)
+        module._REPLACED.clear()
+        module._IN_MODULES.clear()
+
+
 def show_kernels_as_functions(app, env, docnames) -> None:
     """Replace compiled kernels by the Python functions that they are written as, which autodoc can read.
 
@@ -62,6 +71,11 @@ def show_kernels_as_functions(app, env, docnames) -> None:
         for module in pkgutil.walk_packages(path, f"{package}."):
             namespace = vars(importlib.import_module(module.name))
             namespace.update({name: f.py_func for name, f in namespace.items() if isinstance(f, Dispatcher)})
+
+
+def keep_initials(app, what, name, obj, options, lines) -> None:
+    """Escape the initials of authors at the beginning of lines, which are no items of a list."""
+    lines[:] = [re.sub(r"^([A-Z]\. )", r"\\\1", line) for line in lines]
 
 
 def skip_fields(app, what, name, obj, skip, options):
