@@ -165,7 +165,7 @@ figure.savefig(args.out / "fig3_data.png", dpi=150)
 #
 # With a guide there is no annealing, and hundreds of simulations are enough instead of more than ten thousand. The
 # guide finds the posterior by Gauss-Newton steps on the responses, fits emulators of the responses there, and proposes
-# draws. Every draw is simulated by the model itself and weighted, so the result is that of the model. The verdict says
+# draws. Every draw is simulated by the model itself and weighted, so the result belongs to the model. The verdict says
 # what the result is worth.
 
 backend = emcee.backends.HDFBackend(args.out / "chain.h5")

@@ -220,10 +220,10 @@ def calibrate(
 # -----------
 #
 # At Meloland, channels that were not used are predicted: sensors half-way along the spans. There the motion of the deck
-# is between those of an end and of the middle. It depends on a shape parameter s that is not calibrated: **assumed**
-# uniform between 0.5 (the deck remains straight on each side) and 0.71 (half a sine). Their noise is **assumed** to
-# equal that of the middle. At Painter Street both ends are inputs and no other transverse sensor is left; there the
-# rest of the record is predicted.
+# is between the motions of an end and of the middle. It depends on a shape parameter s that is not calibrated:
+# **assumed** uniform between 0.5 (the deck remains straight on each side) and 0.71 (half a sine). Their noise is
+# **assumed** to equal the noise of the middle. At Painter Street both ends are inputs and no other transverse sensor is
+# left; there the rest of the record is predicted.
 #
 # For comparison, the tables give the RRMSE of the nearest end, used as a prediction of the channel without any model.
 

@@ -112,8 +112,9 @@ figure.savefig(args.out / "data.png", dpi=130)
 # There are seven parameters: the stiffness of each storey, the damping ratio of each mode, and the mass of the roof.
 # All priors are **assumed** and log-normal. The median of the stiffnesses is the nominal one (obtained from the free
 # vibration after the last shaking), with a logarithmic standard deviation of 0.5; the median of the damping ratios is
-# 1 %, with a factor of e; the median of the mass of the roof is that of the floors, with 0.3. The standard deviations
-# of the noise are half-normal with a scale of 3 m/s². The alternative model has a roof with the mass of the floors.
+# 1 %, with a factor of e; the mass of the roof has the mass of the floors as its median, with 0.3. The standard
+# deviations of the noise are half-normal with a scale of 3 m/s². The alternative model has a roof with the mass of the
+# floors.
 #
 # Without a measurement of the second floor, a heavy roof on stiff lower storeys and a light roof on a soft second
 # storey have nearly the same response: the posterior has two modes unless the noise is very small. Three times as many
@@ -212,10 +213,10 @@ if not FAST:
 # ------------------------------------------
 #
 # The same frame is shaken three times with the same motion: the three posteriors should agree within their standard
-# deviations. The measure is the root mean square, over the parameters and the three pairs of shakings, of the
-# difference of the means divided by the root of the sum of the variances. It is one if the posteriors have the right
-# width. (A frame that changes between the shakings, for instance with loose bolts, would increase it too.) The roof has
-# the mass of the floors here, so that there is one mode.
+# deviations. For each parameter and each of the three pairs of shakings, the difference of the means is divided by the
+# root of the summed variances. The measure is the root mean square of these numbers. It is one if the posteriors have
+# the right width. (A frame that changes between the shakings, for instance with loose bolts, would increase it too.)
+# The roof has the mass of the floors here, so that there is one mode.
 
 agreement = {}
 if not FAST:
@@ -236,8 +237,8 @@ if not FAST:
 # Predictions: the unused floor and the later shakings
 # ----------------------------------------------------
 #
-# The noise of the second floor is **assumed** to be the mean of that of the other two: `propagate` predicts a model of
-# all floors (``model=``) with the posterior of two, and its warning says so.
+# The noise of the second floor is **assumed** to be the mean of the other two: `propagate` predicts a model of all
+# floors (``model=``) with the posterior of two, and its warning says so.
 
 rows, shown = [], {}
 for noise, run in runs.items():

@@ -232,7 +232,7 @@ plot_data(args.out / "data.png")
 # ----------------
 #
 # All priors are **assumed**: normal distributions of the multiples of the nominal values, with mean one. Strengths and
-# moduli of steel are known to some per cent, those of concrete less well; cyclic hardening of steel and slip of bars
+# moduli of steel are known to some per cent, concrete is known less well; cyclic hardening of steel and slip of bars
 # are hardly known.
 
 prior = {
@@ -296,11 +296,11 @@ checks = save_residuals(fits, KIP, "kip", args.out)
 # Predictions
 # -----------
 #
-# Each posterior is propagated through the whole history of the first column, and through that of the second column with
-# the same multiples (**assumed**: the nominal values of both columns have the same relative errors). The bands are
-# those of the response alone (narrow) and those with noise (wide); only the second should contain 90 % of the data. The
-# score is the interval score of the band with noise in multiples of the root mean square: its width plus a penalty for
-# every sample outside of it.
+# Each posterior is propagated through the whole history of the first column, and of the second column with the same
+# multiples (**assumed**: the nominal values of both columns have the same relative errors). The narrow bands are the
+# response alone, the wide bands contain the noise; only the second should contain 90 % of the data. The score is the
+# interval score of the band with noise in multiples of the root mean square: its width plus a penalty for every sample
+# outside of it.
 
 results, rows, predictions = {}, [], {}
 for column in columns:
@@ -369,8 +369,8 @@ plot_loops(args.out / "loops_ar1.png", "AR(1)")
 # nothing about them. They are therefore predicted with their prior (**assumed**: ``Cf`` between 0.1 and 0.3, length by
 # diameter between 2 and 10), beside the values of the literature (0.26, and the spacing of the hoops) and those with
 # which the model fits the whole history of the first column best (0.15 and 8, found by trying pairs of a grid). The
-# other parameters have their nominal values, so that nothing else is fitted. The standard deviation of the noise is
-# that of the error in the first half.
+# other parameters have their nominal values, so that nothing else is fitted. The noise has the standard deviation of
+# the error in the first half.
 
 
 def failing(column: Specimen, cf: float, slenderness: float | None) -> RCColumn:

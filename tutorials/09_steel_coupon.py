@@ -136,8 +136,8 @@ checks = save_residuals(fits, MPA, "MPa", args.out)
 # Prediction of the second half
 # -----------------------------
 #
-# The bands are those of the response alone (narrow) and those with noise (wide). The score is the interval score of the
-# band with noise in multiples of the root mean square: its width plus a penalty for every sample outside of it.
+# The narrow bands are the response alone, the wide bands contain the noise. The score is the interval score of the band
+# with noise in multiples of the root mean square: its width plus a penalty for every sample outside of it.
 
 parts = {"first half (calibration)": slice(0, half), "second half (prediction)": slice(half, len(strain))}
 before = whole.simulate(np.ones(len(names)))[0]

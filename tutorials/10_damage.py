@@ -235,9 +235,9 @@ if not fast:
     plot_damage(damages["EQ1 and EQ2"]).savefig(args.out / "damage_updated.png", dpi=90)
 
 # %%
-# How often the 90 % bands of the measures hold the truth, the medians of their widths and interval scores as multiples
-# of the true values (a band that misses has a score much larger than its width), and the probabilities that were given
-# to states that were reached, and to those that were not:
+# The output says how often the 90 % bands of the measures hold the truth, and gives their median widths and interval
+# scores as multiples of the true values. A band that misses has a score much larger than its width. The last two
+# numbers are the mean probabilities of states that were reached, and of states that were not:
 
 scores = {}
 for name, found in damages.items():

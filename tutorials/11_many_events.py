@@ -93,7 +93,7 @@ if fast:
 # The motions are filtered white noise (Kanai 1957, Tajimi 1960) with an envelope, with peaks from 0.03 to 0.6 g. The
 # ends of the deck move a little differently from the base of its column. At the level of 5 mm the deck has 4.6 Hz and a
 # damping ratio of 0.10; its stiffness decreases and its damping grows with the level. Between events of the same level,
-# the logarithm of the frequency has a standard deviation of 0.03, that of the damping of 0.15 (season, age, bearings).
+# the logarithms of frequency and damping have standard deviations of 0.03 and 0.15 (season, age, bearings).
 
 DT, SENSOR, REFERENCE = 0.02, 0.002, 0.005  # s, m/s², m
 TRUTH = {"frequency": 4.6, "damping": 0.10, "share": 0.8, "softening": 0.2, "damping_growth": 0.35}
@@ -338,10 +338,10 @@ for name, column in zip(posterior.parameter_names, sampler.get_chain(flat=True).
 # The probability that the peak of the deck exceeds a limit, under several motions at each of some intensities: once
 # from the strongest event as usual, once with the spread between events and the ratio of peaks. The synthetic bridge
 # has one event under each motion, with parameters of its own: its peak exceeds the limit or not. The Brier score, the
-# mean square of (probability - outcome), judges the probabilities; 0 is best, 0.25 is that of a coin. In the full
-# setting it is 0.13 as usual, where 10 of 84 outcomes are given a probability below 1 %, and 0.05 with the
-# population, where none is. The mean over the motions is the fragility of the bridge. As usual it is too small at low
-# intensities, because the deck is stiffer and less damped there than in the strongest event.
+# mean square of (probability - outcome), judges the probabilities; 0 is best, a coin has 0.25. In the full setting it
+# is 0.13 as usual, where 10 of 84 outcomes are given a probability below 1 %, and 0.05 with the population, where none
+# is. The mean over the motions is the fragility of the bridge. As usual it is too small at low intensities, because the
+# deck is stiffer and less damped there than in the strongest event.
 
 LIMIT = 0.5 * G
 GRID = np.exp(np.linspace(np.log(0.12), np.log(0.5), 4 if fast else 7))
