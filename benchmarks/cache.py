@@ -47,7 +47,7 @@ def cache(repeats: int, stored: int = 100_000) -> list[Row]:
         misfit = rng.uniform(size=(stored, 2))
 
         def store(batch: np.ndarray) -> None:
-            likelihood.simulator.cache.store(key, thetas[batch], n_steps, misfit[batch], [""] * len(batch), 1.0)
+            likelihood.simulator.cache.store(key, thetas[batch], n_steps, misfit[batch], [""] * len(batch), 1.0, 1)
 
         for start in range(0, stored, 1000):
             store(np.arange(start, start + 1000))

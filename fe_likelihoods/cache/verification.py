@@ -141,18 +141,19 @@ class VerifiedCache:
             self.cache.store_responses(run.model, thetas, responses, *place)
         if misfit is not None:
             self.cache.store(fingerprint, thetas, run.n_steps, misfit, reasons, seconds, *place)
-        self.cache.store_failures(run.model, thetas, reasons, stored.generation)
+        if any(reasons):
+            self.cache.store_failures(run.model, thetas, reasons, stored.generation)
         self._trust.add_own(thetas, stored.generation, *{fingerprint, run.model.fingerprint})
 
     def _label_to_store(self, model: Model) -> StoredLabel | None:
         """The label under which new simulations are stored; None while the search for a generation pauses."""
         trust = self._trust
         with trust.lock:
-            if trust.find(self.cache.file, model) is None:
-                if time.monotonic() < trust.pause_ends and not trust.generations:
-                    return None
+            stored = trust.find(self.cache.file, model)
+            if stored is None and (trust.generations or time.monotonic() >= trust.pause_ends):
                 trust.begin(self.cache.file, model, set())
-            return trust.find(self.cache.file, model)
+                stored = trust.stored
+            return stored
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
         """Delete rows that were stored here."""

@@ -146,6 +146,19 @@ def test_a_batch_needs_three_queries_and_one_write(path, thetas):
     assert statements == []  # served by the cache in memory
 
 
+def test_a_stored_simulation_needs_the_fingerprint_of_its_model_twice(path, monkeypatch):
+    """It is a digest of the record: 0.1 ms for a record of 10 000 samples."""
+    digest, digests = LinearOscillator.fingerprint.fget, []
+    model = LinearOscillator(Record("sine", 0.02, SINE), 0.6, 0.05)
+    likelihood = likelihood_of(model, path)
+    likelihood.misfit([[1.0, 1.0]])
+    rows, run = likelihood.simulator._checked.rows, likelihood.simulator._run
+    monkeypatch.setattr(LinearOscillator, "fingerprint", property(lambda each: digests.append(1) or digest(each)))
+    rows.store(likelihood.simulator.simulation_key, np.array([[1.1, 1.0]]), np.ones((1, 2)), [""], None, 1.0, run)
+    assert len(digests) == 1 + 2  # and once for the key
+    assert rows.look_up(likelihood.simulator.simulation_key, np.array([[1.1, 1.0]]), run).known.all()
+
+
 def test_a_batch_of_several_queries(path, rng):
     thetas = np.column_stack([rng.normal(size=2345), np.full(2345, 0.5)])
     likelihood_of(Line(), path).misfit(thetas[::2])
