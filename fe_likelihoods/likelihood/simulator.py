@@ -453,10 +453,10 @@ class Simulator:
                     raise
                 for running, future in zip(new, futures, strict=True):
                     running.future = future
-        for running in wanted:
-            if arrived not in running.users:
-                running.users.add(arrived)
-                running.future.add_done_callback(partial(_arrive, arrived, running))
+            for running in wanted:  # with the lock: another thread that leaves must not cancel what is wanted here
+                if arrived not in running.users:
+                    running.users.add(arrived)
+                    running.future.add_done_callback(partial(_arrive, arrived, running))
         return wanted
 
     def wait(self, waiting: Collection[RunningSimulation], arrived: SimpleQueue) -> list[RunningSimulation]:

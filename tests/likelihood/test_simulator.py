@@ -2,6 +2,8 @@
 
 import pickle
 import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
 import numpy as np
@@ -426,6 +428,36 @@ def test_simulations_that_are_left_before_they_ran_cost_nothing(thetas):
     waiting = simulator.start([theta.tobytes() for theta in thetas], False, arrived)
     assert simulator.leave(waiting, arrived, running=True) == []
     assert model.runs == simulator.simulations == 0
+
+
+def test_a_thread_that_leaves_does_not_cancel_what_another_has_just_requested(thetas):
+    """Its simulation would have no result, and the other thread would wait for ever."""
+    mine, other, gate = SimpleQueue(), SimpleQueue(), threading.Event()
+
+    class Leaving:
+        """The lock, which is given to the thread that leaves as soon as the other one releases it."""
+
+        def __init__(self, lock):
+            self.lock = lock
+
+        def __enter__(self):
+            return self.lock.__enter__()
+
+        def __exit__(self, *exception):
+            self.lock.__exit__(*exception)
+            simulator._submitted.lock = self.lock
+            simulator.leave(started, mine, running=False)
+
+    with ThreadPoolExecutor(1) as pool:
+        simulator = likelihood_of(Line(), pool=pool).simulator
+        pool.submit(gate.wait)
+        keys = [thetas[0].tobytes()]
+        started = simulator.start(keys, False, mine)
+        simulator._submitted.lock = Leaving(simulator._submitted.lock)
+        (running,) = simulator.start(keys, False, other)
+        gate.set()
+        assert simulator.wait([running], other) == [running]
+    assert running.result is not None
 
 
 def test_one_point_that_is_cached_takes_the_short_way_with_the_same_value(thetas):
