@@ -23,6 +23,7 @@ __all__ = [
     "is_transient",
     "raise_if_it_ends_the_run",
     "reason_of",
+    "shortened",
 ]
 
 _FAULTS = (OSError, MemoryError, ImportError, BrokenExecutor, subprocess.TimeoutExpired)
@@ -120,8 +121,14 @@ def _is_raised(error: BaseException) -> bool:
 def reason_of(error: BaseException) -> str:
     """Reason of a simulation that raised an exception; a `TransientReason` for faults of the infrastructure."""
     if isinstance(error, FailedRun):
-        return error.reason
-    text = f"{type(error).__name__}: {error}"
-    if len(text) > _LONGEST_REASON:
-        text = f"{text[:_LONGEST_REASON]} ..."
+        return shortened(error.reason)
+    text = shortened(f"{type(error).__name__}: {error}")
     return TransientReason(text) if is_transient(error) else text
+
+
+def shortened(reason: str) -> str:
+    """The first 2000 characters of a reason, which may be the whole output of a program; its kind is kept."""
+    if len(reason) <= _LONGEST_REASON:
+        return reason
+    text = f"{reason[:_LONGEST_REASON]} ..."
+    return reason.with_text(text) if isinstance(reason, TransientReason) else type(reason)(text)

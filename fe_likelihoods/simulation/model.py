@@ -22,7 +22,7 @@ import numpy as np
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of
+from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of, shortened
 from .opened import Observed, note, unpack
 
 __all__ = [
@@ -388,7 +388,7 @@ def _checked_batch(model: Model, batch: tuple, shape: tuple[int, ...]) -> tuple[
     if np.iscomplexobj(values):
         raise ValueError("expected real numbers, got complex ones")
     values = np.array(values, dtype=float)
-    reasons = [reason if isinstance(reason, str) else str(reason) for reason in reasons]
+    reasons = [shortened(reason if isinstance(reason, str) else str(reason)) for reason in reasons]
     if values.shape != shape or len(reasons) != shape[0]:
         raise ValueError(
             f"expected values of shape {shape} and {shape[0]} reasons, got {values.shape} and {len(reasons)}"

@@ -9,7 +9,8 @@ import pytest
 
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import LocalPool
-from fe_likelihoods.simulation.model import simulate_batch
+from fe_likelihoods.simulation.faults import MisfitReason, TransientReason
+from fe_likelihoods.simulation.model import SimulationFailed, simulate_batch
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
 
@@ -123,3 +124,27 @@ def test_a_model_that_forks_returns_once_in_a_worker():
         for _ in range(3):
             batch = simulate_batch(Plain(forks), THETAS, pool)
             np.testing.assert_array_equal(batch.response, [line(theta) for theta in THETAS])
+
+
+class Talkative(Batched):
+    """Its batch method gives the reason itself."""
+
+    def simulate_batch(self, thetas):
+        return np.array([line(theta) for theta in thetas]), ["", LONG, ""]
+
+
+def fail(reason):
+    raise SimulationFailed(reason)
+
+
+LONG = "A line that a program has printed.\n" * 10_000
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [(Plain, str), (Plain, MisfitReason), (Plain, TransientReason), (of_function, str), (Talkative, str)],
+)
+def test_a_reason_that_is_the_output_of_a_program_is_cut(make, kind):
+    """A run keeps a thousand reasons in memory, and shows them in its report."""
+    _, reason, _ = simulate_batch(make(lambda: fail(kind(LONG))), THETAS).reasons
+    assert reason == f"{LONG[:2000]} ..." and type(reason) is kind
