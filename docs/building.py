@@ -75,7 +75,7 @@ def show_kernels_as_functions(app, env, docnames) -> None:
 
 def keep_initials(app, what, name, obj, options, lines) -> None:
     """Escape the initials of authors at the beginning of lines, which are no items of a list."""
-    lines[:] = [re.sub(r"^([A-Z]\. )", r"\\\1", line) for line in lines]
+    lines[:] = [re.sub(r"^(\.\. \[\S+\] )?([A-Z]\. )", r"\1\\\2", line) for line in lines]
 
 
 def skip_fields(app, what, name, obj, skip, options):

@@ -131,7 +131,7 @@ class Jacobians:
         sum_i |y_i - (J_0 + D) s_i|^2 / |s_i|^4 + |D|^2 / |z - z_0|^2 .
 
     A run at a distance s has an error of the second order, s^2, from curvature, whence the weights; and J_0 is as
-    uncertain as a difference with a step of |z - z_0|.
+    uncertain as a difference with a step of ``|z - z_0|``.
     """
 
     def __init__(self) -> None:
