@@ -451,7 +451,7 @@ def plot_predictions(bridge: Bridge, predictions: dict[str, tuple], out: Path, n
 # * **Evidence.** The model with two supports exceeds the model with the ends alone by factors of e^127 / e^99 / e^12 at
 #   Meloland and e^160 / e^123 / e^18 at Painter Street, and the model with the column alone by far more. Only the last
 #   factor of each triple is realistic, and only as far as n_eff is. All three noises give the same order of the models.
-# * **Too narrow?** The two parts of the record of Meloland give frequencies that differ by 8.7 / 6.3 / 2.8 standard
+# * **Too narrow?** The two parts of the record of Meloland give frequencies that differ by 8.4 / 6.3 / 2.7 standard
 #   deviations, the later one lower: the posteriors with white and AR(1) noise contradict themselves. AR(1) does not
 #   help here. Its residuals are slow drifts, but these residuals vibrate at the frequency of the bridge, where AR(1)
 #   noise with a correlation of 0.9 is as weak as white noise.
