@@ -27,11 +27,11 @@ class _WithOpenSees:
     def __init__(self, build_and_run: Callable[..., Any]) -> None:
         self.build_and_run = build_and_run
 
-    def __call__(self, theta: np.ndarray, *record: Record) -> Any:
+    def __call__(self, theta: np.ndarray, *record: Record, **n_steps: int) -> Any:
         import openseespy.opensees as ops
 
         ops.wipe()
-        return self.build_and_run(ops, theta, *record)
+        return self.build_and_run(ops, theta, *record, **n_steps)
 
 
 class OpenSeesModel(FunctionModel):
@@ -43,7 +43,7 @@ class OpenSeesModel(FunctionModel):
         Function of the wiped module ``openseespy.opensees``, of theta (n_parameters,), and of the record if one is
         given, that returns the response (n_channels, n_steps) in SI units. It must be defined at the top level of a
         module. It should raise an exception if ``ops.analyze`` does not return 0, because OpenSees only prints a
-        message.
+        message. With an argument ``n_steps`` the model can be shortened; see `FunctionModel`.
     parameter_names : sequence of str
         Names of the structural parameters, in the order of theta.
     channels : sequence of Channel
@@ -132,4 +132,8 @@ class OpenSeesModel(FunctionModel):
 
     def code_parts(self) -> dict[str, Any]:
         """User code and OpenSees version, for the label of stored simulations."""
-        return {"function": self.function.build_and_run, "openseespy": metadata.version("openseespy")}
+        return super().code_parts() | {"openseespy": metadata.version("openseespy")}
+
+    @property
+    def _user_function(self) -> Callable[..., Any]:
+        return self.function.build_and_run

@@ -20,6 +20,7 @@ __all__ = [
     "MisfitReason",
     "RunFailed",
     "TransientReason",
+    "UnusableModel",
     "is_transient",
     "raise_if_it_ends_the_run",
     "reason_of",
@@ -48,13 +49,17 @@ class RunFailed(FailedRun):
         self.seconds = seconds
 
 
-class ChangedModel(ValueError):
-    """A model has changed since its fingerprint was computed. The message says what to do.
+class UnusableModel(ValueError):
+    """A model whose responses cannot be used at any parameters. The message says what to do.
 
     Samplers stop (`ends_run`), since no point can be evaluated any more.
     """
 
     ends_run = True
+
+
+class ChangedModel(UnusableModel):
+    """A model has changed since its fingerprint was computed."""
 
 
 class TransientReason(str):
@@ -90,12 +95,12 @@ def is_transient(error: BaseException) -> bool:
 
 
 def raise_if_it_ends_the_run(error: BaseException) -> None:
-    """Raise exceptions that must not become a failed simulation: `ChangedModel`, and the user's Ctrl-C.
+    """Raise exceptions that must not become a failed simulation: `UnusableModel`, and the user's Ctrl-C.
 
     A model that calls ``sys.exit``, or raises KeyboardInterrupt by a ``raise`` statement, has failed. Ctrl-C interrupts
     code elsewhere; it is also found as the cause of another exception that the model raised.
     """
-    if isinstance(error, ChangedModel):
+    if isinstance(error, UnusableModel):
         raise error
     cause: BaseException | None = error
     seen: set[int] = set()

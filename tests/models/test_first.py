@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from fe_likelihoods import HalfNormal, Posterior, TruncatedNormal
+from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
@@ -15,6 +17,7 @@ from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.durations import growing_durations
 from fe_likelihoods.signals.records import DisplacementHistory, Record
+from fe_likelihoods.simulation.local_pool import LocalPool
 
 RECORD = bridge_column(every=2, duration=8.0).likelihood.model.loading
 TABLE = Record("table", 0.005, 3.0 * np.sin(np.arange(400) / 20.0))
@@ -133,3 +136,94 @@ def test_the_parts_of_the_record_of_the_column():
     durations = growing_durations(record.acceleration, record.dt)
     np.testing.assert_allclose(durations, [7.6, 14.2, 20.8, 33.0, 50.0], atol=0.1)
     assert durations[-1] == record.duration
+
+
+# functions that take the number of samples --------------------------------------------------------------------
+
+CHANNEL = [Channel("y", "displacement", "m")]
+
+
+def vibrates(theta, n_steps=300):
+    time = 0.02 * np.arange(n_steps)
+    return (np.exp(-0.1 * time) * np.cos(9.0 * np.sqrt(theta[0]) * time))[None]
+
+
+def slopes(theta, n_steps=300):
+    time, omega = 0.02 * np.arange(n_steps), 9.0 * np.sqrt(theta[0])
+    return (-np.exp(-0.1 * time) * np.sin(omega * time) * time * omega / (2.0 * theta[0]))[None, None]
+
+
+def required(theta, n_steps):
+    return vibrates(theta, n_steps)
+
+
+def ignores(theta, n_steps=7):
+    return vibrates(theta)
+
+
+def shaken(theta, record, n_steps):
+    return LinearOscillator(record).simulate([*theta, 1.0])[1:, :n_steps]
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+@pytest.mark.parametrize("function", [vibrates, required])
+def test_a_function_of_the_number_of_samples(function, isolated):
+    model = FunctionModel(function, ("a",), CHANNEL, 0.02, 300, jacobian=slopes, isolated=isolated)
+    part = model.first(1.999)
+    assert part.n_steps == 100 and model.n_steps == 300
+    np.testing.assert_array_equal(part.simulate([1.1]), model.simulate([1.1])[:, :100])
+    np.testing.assert_array_equal(part.jacobian([1.1]), model.jacobian([1.1])[:, :, :100])
+    assert part.fingerprint == model.first(1.98).fingerprint == model.first(4.0).first(1.98).fingerprint
+    assert len({part.fingerprint, model.fingerprint, model.first(2.0).fingerprint}) == 3
+    for wrong in (0.0, 7.0, np.nan):
+        with pytest.raises(ValueError, match=r"expected 0 <= start|fewer than 2 samples"):
+            model.first(wrong)
+
+
+def test_parts_are_cached_apart(tmp_path):
+    for _ in range(2):
+        model = FunctionModel(vibrates, ("a",), CHANNEL, 0.02, 300)
+        whole = FELikelihood(model, Measurements(CHANNEL, 0.02, vibrates([1.2])), cache=tmp_path / "cache.sqlite")
+        part = whole.first(3.0)
+        assert whole([1.1, 0.1]) != part([1.1, 0.1])
+    assert whole.simulator.cache.info().simulations == 2
+
+
+def test_a_function_that_does_not_return_the_first_samples_ends_the_run():
+    model = FunctionModel(ignores, ("a",), CHANNEL, 0.02, 300)
+    likelihood = FELikelihood(model, Measurements(CHANNEL, 0.02, vibrates([1.2])))
+    message = r"expected the function to return the first 101 samples of 1 channels with n_steps=101; got the shape"
+    assert model.simulate([1.0]).shape == (1, 300)  # whose n_steps is another thing
+    with pytest.raises(ValueError, match=message):
+        model.first(2.0).simulate([1.0])
+    with pytest.raises(ValueError, match=message):
+        likelihood.first(2.0).log_likelihood(np.array([[1.0, 0.1]]))
+    with LocalPool(1) as pool, pytest.raises(ValueError, match=message):
+        FELikelihood(model, likelihood.measurements, pool=pool).first(2.0).log_likelihood(np.array([[1.0, 0.1]]))
+
+
+def test_a_part_under_a_record():
+    model = FunctionModel(shaken, ("a",), CHANNEL, record=TABLE)
+    part = model.first(1.0)
+    assert part.n_steps == 201
+    np.testing.assert_array_equal(part.simulate([1.1]), model.simulate([1.1])[:, :201])
+    other = part.with_record(TABLE.scale(2.0))  # the whole response to another record
+    np.testing.assert_allclose(other.simulate([1.1]), 2.0 * model.simulate([1.1]), rtol=1e-12)
+
+
+def test_a_jacobian_needs_the_number_of_samples_as_well():
+    with pytest.raises(ValueError, match="expected jacobian with the argument n_steps, as function has it; got"):
+        FunctionModel(vibrates, ("a",), CHANNEL, 0.02, 300, jacobian=lambda theta: slopes(theta))
+
+
+def test_a_search_on_growing_parts_takes_fewer_simulations():
+    prior = {"a": TruncatedNormal(1.0, 0.3), "sigma_y": HalfNormal(0.2)}
+    values = vibrates([1.3]) + 0.05 * np.random.default_rng(1).standard_normal((1, 300))
+    found = []
+    for function in (vibrates, lambda theta: vibrates(theta)):
+        model = FunctionModel(function, ("a",), CHANNEL, 0.02, 300)
+        posterior = Posterior(FELikelihood(model, Measurements(CHANNEL, 0.02, values)), prior)
+        search = find_modes(posterior, seed=1)
+        assert search.modes[0].parameters[0] == pytest.approx(1.3, abs=0.01)
+        found.append(search.simulations)
+    assert found[0] < 0.6 * found[1]

@@ -92,6 +92,18 @@ def test_label_depends_on_the_function_and_its_data(model, record):
     assert [other == label for other in labels] == [True, False, False]
 
 
+def test_an_analysis_that_stops_after_a_number_of_samples(record):
+    def shaken(ops, theta, n_steps=N_STEPS):
+        return Oscillator(record.acceleration[:n_steps], DT, 5)(ops, theta)
+
+    model = OpenSeesModel(shaken, NAMES, CHANNELS, DT, N_STEPS)
+    part = model.first(1.0)
+    assert part.n_steps == 51 and part.fingerprint != model.fingerprint
+    # the path of this excitation ends with the part: round-off of the clock interpolates between other values
+    np.testing.assert_allclose(part.simulate([1.2, 0.8]), model.simulate([1.2, 0.8])[:, :51], rtol=0, atol=1e-9)
+    assert not hasattr(model_of(record, 5), "first")
+
+
 def test_wrong_arguments_are_rejected(record, monkeypatch):
     with pytest.raises(ValueError, match="expected a function of OpenSees"):
         OpenSeesModel(3, NAMES, CHANNELS, DT, N_STEPS)
