@@ -199,15 +199,16 @@ PROBLEMS = {
     ),
 }
 PROBLEMS |= {
-    f"shear{storeys}": Problem(
-        f"shear building, {storeys} stiffnesses, 4 accelerations",
-        partial(many_stiffnesses.shear_building, storeys),
+    f"shear{storeys}{suffix}": Problem(
+        f"shear building, {storeys} stiffnesses, 4 accelerations{', derivatives' if suffix else ''}",
+        partial(many_stiffnesses.shear_building, storeys, jacobian=bool(suffix)),
         lambda posterior: np.ones((1, posterior.ndim)),
         goal,
         reference_draws=40 * storeys**2,
         reference_rounds=6,
     )
     for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
+    for suffix in ("", "_jacobian")
 }
 PROBLEMS |= {
     name: Problem(

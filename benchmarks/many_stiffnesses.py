@@ -50,13 +50,23 @@ def _floors(storeys: int) -> np.ndarray:
     return np.unique(np.round(np.linspace(storeys / _SENSORS, storeys, _SENSORS)).astype(int) - 1)
 
 
-def _accelerations(storeys: int, theta: np.ndarray) -> np.ndarray:
-    """Absolute accelerations [m/s2] of the measured floors; each mode by its ramp-invariant filter."""
+def _nominal(storeys: int) -> np.ndarray:
+    """Stiffnesses of the storeys over the mass of a floor [1/s2]."""
     fundamental = 2.0 * np.pi / (0.1 * storeys) / (2.0 * np.sin(0.5 * np.pi / (2 * storeys + 1)))
-    stiffness = fundamental**2 * np.linspace(1.3, 0.7, storeys) * theta
+    return fundamental**2 * np.linspace(1.3, 0.7, storeys)
+
+
+def _modes(storeys: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Squared angular frequencies (n_modes,), and shapes (n_floors, n_modes) of length one."""
+    stiffness = _nominal(storeys) * theta
     diagonal = stiffness.copy()
     diagonal[:-1] += stiffness[1:]
-    squares, shapes = eigh_tridiagonal(diagonal, -stiffness[1:])
+    return eigh_tridiagonal(diagonal, -stiffness[1:])
+
+
+def _accelerations(storeys: int, theta: np.ndarray) -> np.ndarray:
+    """Absolute accelerations [m/s2] of the measured floors; each mode by its ramp-invariant filter."""
+    squares, shapes = _modes(storeys, theta)
     motion, floors = _ground_motion(), _floors(storeys)
     response, remaining = np.zeros((len(floors), _N_STEPS)), np.ones(len(floors))
     for omega, shape in zip(np.sqrt(squares), shapes.T, strict=True):
@@ -71,6 +81,40 @@ def _accelerations(storeys: int, theta: np.ndarray) -> np.ndarray:
     return response + np.outer(remaining, motion)
 
 
+def _derivatives(storeys: int, theta: np.ndarray) -> np.ndarray:
+    """Derivatives (n_storeys, n_floors, n_steps) of `_accelerations` by the factors of the stiffnesses."""
+    squares, shapes = _modes(storeys, theta)
+    motion, floors = _ground_motion(), _floors(storeys)
+    drifts = np.diff(shapes, axis=0, prepend=0.0)  # (storey, mode)
+    # K' of a storey couples modes m and n by the product of their drifts in it
+    coupled = _nominal(storeys)[:, None, None] * drifts[:, :, None] * drifts[:, None, :]
+    gaps = squares[None, :] - squares[:, None]
+    mixing = coupled / np.where(gaps == 0.0, np.inf, gaps)  # of shape m in the derivative of shape n
+    shape_slopes = np.einsum("fm,kmn->kfn", shapes, mixing)
+    total, result = shapes.sum(axis=0), np.zeros((storeys, len(floors), _N_STEPS))
+    undamped = np.sqrt(1.0 - _DAMPING**2)
+    for n, omega in enumerate(np.sqrt(squares)):
+        if omega > np.pi / _DT:
+            break
+        angle, decay = omega * undamped * _DT, np.exp(-_DAMPING * omega * _DT)
+        cosine, sine = decay * np.cos(angle), decay * np.sin(angle)
+        ratio = sine / angle
+        # derivatives by omega
+        shrink, turn = -_DAMPING * _DT, undamped * _DT
+        d_cosine, d_sine = shrink * cosine - turn * sine, shrink * sine + turn * cosine
+        d_ratio, d_square = (d_sine - ratio * turn) / angle, 2.0 * shrink * decay**2
+        poles = [1.0, -2.0 * cosine, decay**2]
+        motion_of_mode = lfilter([1.0 - ratio, 2.0 * (ratio - cosine), decay**2 - ratio], poles, motion)
+        by_omega = lfilter([-d_ratio, 2.0 * (d_ratio - d_cosine), d_square - d_ratio], poles, motion)
+        by_omega -= lfilter([0.0, -2.0 * d_cosine, d_square], poles, motion_of_mode)
+        amplitudes = shapes[floors, n] * total[n]
+        changes = shape_slopes[:, floors, n] * total[n] + shapes[floors, n] * shape_slopes[:, :, n].sum(axis=1)[:, None]
+        frequency_slopes = coupled[:, n, n] / (2.0 * omega)
+        result += changes[:, :, None] * (motion_of_mode - motion)
+        result += (frequency_slopes[:, None] * amplitudes)[:, :, None] * by_omega
+    return result
+
+
 def shear_truth(storeys: int, seed: int) -> np.ndarray:
     """True factors of the storeys' stiffnesses; one storey has lost 30 %."""
     truth = np.random.default_rng(100 + seed).normal(1.0, 0.1, storeys)
@@ -78,12 +122,17 @@ def shear_truth(storeys: int, seed: int) -> np.ndarray:
     return truth
 
 
-def shear_building(storeys: int, seed: int) -> Posterior:
-    """Stiffness factors of all storeys, with priors of mean 1 and standard deviation 0.2; noise of 5 %."""
+def shear_building(storeys: int, seed: int, jacobian: bool = False) -> Posterior:
+    """Stiffness factors of all storeys, with priors of mean 1 and standard deviation 0.2; noise of 5 %.
+
+    With `jacobian`, the model has derivatives in closed form.
+    """
     function = partial(_accelerations, storeys)
     channels = [Channel(f"floor_{k + 1}", "acceleration", "m/s2") for k in _floors(storeys)]
     names = [f"k_{k + 1}" for k in range(storeys)]
-    model = FunctionModel(function, names, channels, _DT, _N_STEPS, version=f"shear building, {storeys} storeys")
+    version = f"shear building, {storeys} storeys"
+    own = partial(_derivatives, storeys) if jacobian else None
+    model = FunctionModel(function, names, channels, _DT, _N_STEPS, version=version, jacobian=own)
     clean = function(shear_truth(storeys, seed))
     rms = np.sqrt(np.square(clean).mean(axis=1, keepdims=True))
     values = clean + _NOISE * rms * np.random.default_rng(seed).standard_normal(clean.shape)

@@ -6,6 +6,7 @@ import pytest
 from benchmarks import few_simulations
 from benchmarks.few_simulations_problems import PROBLEMS
 from benchmarks.importance_reference import by_importance, find_mode
+from benchmarks.many_stiffnesses import shear_building, shear_truth
 from tests.statistics.brute_force import reference
 from tests.statistics.hard_posteriors import CASES
 
@@ -40,3 +41,11 @@ def test_a_stored_reference_belongs_to_its_data():
     with pytest.raises(ValueError, match="was made with other data"):
         few_simulations.reference_of("oscillator", 2, PROBLEMS["oscillator"].posterior(3))
     assert few_simulations.reference_of("oscillator", 99, posterior) is None
+
+
+@pytest.mark.parametrize("storeys", [3, 20])
+def test_derivatives_of_the_shear_building(storeys):
+    model = shear_building(storeys, 1, jacobian=True).likelihood.model
+    theta, step = shear_truth(storeys, 1), 1e-5
+    expected = [(model.simulate(theta + e) - model.simulate(theta - e)) / (2.0 * step) for e in step * np.eye(storeys)]
+    np.testing.assert_allclose(model.jacobian(theta), expected, rtol=0, atol=1e-6 * np.abs(expected).max())

@@ -85,7 +85,8 @@ class ResponseGuide:
     emulators : tuple of ResponseEmulator
         Emulators in use, one per mode.
     simulations : float
-        Simulations run by the guide itself, parts of a record counted as fractions.
+        Simulations run by the guide itself, parts of a record counted as fractions; a call of the model's ``jacobian``
+        counts as one.
     log_density_error : float
         Standard error of the log normalising constant of `log_density`.
     """
@@ -127,7 +128,8 @@ class ResponseGuide:
     @property
     def fingerprint(self) -> str:
         """Identity of the guide: a sampler resumes a run only with an equal one."""
-        return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts})"
+        derivatives = ", derivatives" if self._target.differentiable else ""
+        return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts}{derivatives})"
 
     @property
     def concerns(self) -> tuple[str, ...]:

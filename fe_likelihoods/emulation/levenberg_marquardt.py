@@ -9,11 +9,11 @@ that fit best, its gradient and its Gauss-Newton Hessian are::
 where B_a is the bilinear form of S_a. A step solves (H + lambda diag H) dz = g. Three lambda are simulated at once, and
 the largest improvement is taken; after a step that gained what the quadratic promised, one is enough.
 
-J is found by differences at few points only, and from there by regression over all runs of all ascents
-(`Jacobians`). An ascent whose secants mislead makes differences of its own. It stops as soon as the derivatives at the
-end of another ascent predict its residuals, or a line without a valley leads there: then it is in the same mode. At the
-top of a mode, one step of a standard deviation is simulated along every axis of the Laplace approximation. These runs
-make the derivatives sure, show whether the top is a saddle, and train the emulator.
+J is found by differences, or by the model's own derivatives, at few points only, and from there by regression over all
+runs of all ascents (`Jacobians`). An ascent whose secants mislead makes differences of its own. It stops as soon as the
+derivatives at the end of another ascent predict its residuals, or a line without a valley leads there: then it is in
+the same mode. At the top of a mode, one step of a standard deviation is simulated along every axis of the Laplace
+approximation. These runs make the derivatives sure, show whether the top is a saddle, and train the emulator.
 
 References
 ----------
@@ -21,7 +21,7 @@ K. Levenberg (1944), Quarterly of Applied Mathematics 2, 164-168; D. W. Marquard
 Industrial and Applied Mathematics 11, 431-441; C. G. Broyden (1965), Mathematics of Computation 19, 577-593 (secants).
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,17 @@ import numpy as np
 from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
-__all__ = ["POINTS_PER_STEP", "TOLERANCE", "Ascent", "Batches", "Jacobians", "ascend", "axes_of", "distinct_ends"]
+__all__ = [
+    "POINTS_PER_STEP",
+    "TOLERANCE",
+    "Ascent",
+    "Batches",
+    "Derivatives",
+    "Jacobians",
+    "ascend",
+    "axes_of",
+    "distinct_ends",
+]
 
 _DAMPINGS = 10.0 ** np.array([-1.5, 0.0, 1.5])
 POINTS_PER_STEP = len(_DAMPINGS)
@@ -39,6 +49,8 @@ _LARGEST_STEP = 2.0  # prior standard deviations
 FIRST_DIFFERENCE = 3e-3  # prior standard deviations
 _DIFFERENCE_SHARE = 0.1  # of a posterior standard deviation
 _DIFFERENCE_LIMITS = 3e-4, 2e-2
+_CHECKED_CHANGES = 3e-3, 3e-4  # of the response by a step, relative, where the model's derivatives are first used
+_CHECKED_ERROR = 0.05
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 _NEAREST_RUNS = 3.0, 10.0  # runs that secants are fitted to: per dimension, and in addition
 _TOO_CLOSE = 1e-12  # squared distance of runs that tell nothing about derivatives
@@ -64,6 +76,15 @@ _FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1,
 _LONGEST = 4  # such directions along which steps are simulated
 _FAR = 2.0  # standard deviations that are simulated along such directions
 _DIP = 3.0  # depth of a valley in log-density that separates modes
+
+
+class Derivatives(NamedTuple):
+    """A request of an ascent for the model's own derivatives at coordinates (n_structural,), in place of points."""
+
+    coords: np.ndarray
+
+
+Request = np.ndarray | Derivatives
 
 
 class _Point(NamedTuple):
@@ -191,8 +212,9 @@ class _Climb:
         known: dict[int, Ascent],
         apart: float,
         number: int,
+        designed: bool = True,
     ) -> None:
-        self._number, self._shared = number, np.isinf(apart)
+        self._number, self._shared, self._designed = number, np.isinf(apart), designed
         self._target, self._jacobians, self._centre, self._known = target, jacobians, centre, known
         self._apart = apart
         self.here: _Point
@@ -202,10 +224,13 @@ class _Climb:
     def begin(self, start: np.ndarray, steps: np.ndarray | None) -> Generator[np.ndarray, Runs, int | None]:
         """Simulate the start, and points around it for derivatives, `steps` or small ones, where these are needed.
 
+        The model's own derivatives replace small steps; steps of a standard deviation also train the emulator.
         Returns the number of the ascent that the start leads to, -1 if its simulation fails, else None.
         """
         small = FIRST_DIFFERENCE * np.eye(len(start))
-        first = steps is None and self._jacobians.claim()  # with the start, so that the others find derivatives
+        own = self._target.differentiable and (steps is None or not self._designed)
+        # with the start, so that the others find derivatives
+        first = steps is None and not own and self._jacobians.claim()
         runs = yield np.concatenate([start[None], start + small]) if first else start[None]
         higher = self.highest(start[None], Runs(*(column[:1] for column in runs)), -np.inf)
         if higher is None:
@@ -219,7 +244,7 @@ class _Climb:
         joined = self._explained()
         if joined is None and steps is not None:
             joined = yield from self.connected()
-        if joined is None and (steps is not None or not self._jacobians):
+        if joined is None and not own and (steps is not None or not self._jacobians):
             yield from self.difference(small if steps is None else steps)
         return joined
 
@@ -253,6 +278,45 @@ class _Climb:
         slopes = np.linalg.solve(used, changes.reshape(len(used), -1)).reshape(changes.shape)
         self._jacobians.add(here.coords, slopes)
 
+    def derivatives(self) -> Generator[Any, Any, None]:
+        """The model's own derivatives at the present point; the first ones are compared with differences."""
+        here, target = self.here, self._target
+        slopes = yield Derivatives(here.coords)
+        if target.unchecked:
+            target.unchecked.clear()
+            yield from self._check(slopes)
+        self._jacobians.add(here.coords, slopes)
+
+    def _check(self, slopes: np.ndarray) -> Generator[np.ndarray, Runs, None]:
+        """ValueError if derivatives deny the residuals at a small step along all coordinates; a smaller one is tried.
+
+        Without a change along the step, or a simulation there, the next derivatives are compared.
+        """
+        here, target = self.here, self._target
+        scales = target.scales[:, None] * np.sqrt(slopes[0].size)
+        sizes = np.sqrt(np.square(slopes / scales).sum(axis=(1, 2)))
+        random = np.random.default_rng(0)  # a row in the place of another one shows, and so does a sign
+        shares = random.uniform(0.5, 1.0, len(sizes)) * random.choice([-1.0, 1.0], len(sizes))
+        worst = 0.0
+        for change in _CHECKED_CHANGES:
+            steps = shares * np.minimum(change / np.maximum(sizes, 1e-300), _DIFFERENCE_LIMITS[1])
+            runs = yield (here.coords + steps)[None]
+            changes = (runs.residuals[0] - here.residuals) / scales
+            predicted = np.tensordot(steps, slopes, axes=1) / scales
+            size = max(np.linalg.norm(changes), np.linalg.norm(predicted))
+            if runs.failed[0] or size == 0.0:
+                target.unchecked.append(True)
+                return
+            worst = float(np.linalg.norm(changes - predicted) / size)
+            if worst < _CHECKED_ERROR:
+                return
+        raise ValueError(
+            f"the derivatives of {type(target.model).__name__}.jacobian differ from a difference of two simulations by "
+            f"{100.0 * worst:.0f} % of the norm; expected at most {100.0 * _CHECKED_ERROR:.0f} %: return the "
+            "derivatives of the response, in the units of the response [SI], by "
+            f"{', '.join(target.model.parameter_names)}, or leave jacobian out"
+        )
+
     def quadratic(self) -> Ascent:
         """The log-density around the present point."""
         here = self.here
@@ -267,7 +331,10 @@ class _Climb:
     def climb(self, merging: bool, tolerance: float) -> Generator[np.ndarray, Runs, int | None]:
         """Steps to the top; returns the number of the ascent that this joins, -1 if it is given up, None at a top."""
         damping, good, failures, gain = _FIRST_DAMPING, False, 0, np.inf
+        own = self._target.differentiable
         for iteration in range(_MAX_ITERATIONS):
+            if own and not good and not self._jacobians.known_at(self.here.coords):
+                yield from self.derivatives()
             at = self.quadratic()
             if merging and (joined := self._explained()) is not None:
                 return joined
@@ -276,7 +343,7 @@ class _Climb:
                 return -1
             if at.gain_left < tolerance or failures > 3:
                 return None
-            dampings = damping * _DAMPINGS[: 1 if good else None]
+            dampings = damping * _DAMPINGS[: 1 if good or (own and not failures) else None]
             scale = np.diag(np.diag(at.hessian))
             moves = np.array([np.linalg.solve(at.hessian + each * scale, at.gradient) for each in dampings])
             moves *= np.minimum(1.0, _LARGEST_STEP / np.abs(moves).max(axis=1, keepdims=True))
@@ -292,7 +359,7 @@ class _Climb:
                 self.here = higher
             if gain > max(_STALLED[0], _STALLED[1] * at.gain_left):
                 failures = 0
-                if misled and not self._shared:
+                if misled and not self._shared and not own:
                     yield from self._own_differences(at, 1.0)
                 continue
             good, failures = False, failures + 1
@@ -305,7 +372,7 @@ class _Climb:
         return None
 
     def _own_differences(self, at: Ascent, factor: float) -> Generator[np.ndarray, Runs, None]:
-        """Differences with steps of a share of the standard deviations, times a factor."""
+        """Derivatives by differences with steps of a share of the standard deviations, times a factor."""
         spread = factor * _DIFFERENCE_SHARE * np.sqrt(np.diag(np.linalg.inv(at.hessian)))
         yield from self.difference(np.diag(np.clip(spread, *_DIFFERENCE_LIMITS)))
 
@@ -392,8 +459,8 @@ def ascend(
 
     Yields
     ------
-    (n, n_structural) float
-        Points to simulate; the generator is sent their `Runs`.
+    (n, n_structural) float, or Derivatives
+        Points to simulate, and the generator is sent their `Runs`; or a point, and it is sent the model's derivatives.
 
     Returns
     -------
@@ -401,7 +468,7 @@ def ascend(
         Number of the ascent that it joins, its own at an end of its own; -1 if the start fails, or if the ascent is
         slow and far below another one.
     """
-    climb = _Climb(target, jacobians, centre, known, apart, number)
+    climb = _Climb(target, jacobians, centre, known, apart, number, designed)
     joined = yield from climb.begin(start, steps)
     if joined is not None:
         return joined
@@ -492,12 +559,12 @@ class Batches:
         is kept by the target.
         """
         self.interrupted = False
-        waiting: dict[int, np.ndarray] = {}
+        waiting: dict[int, Request] = {}
         begun: set[int] = set()
 
-        def advance(index: int, runs: Runs | None) -> None:
+        def advance(index: int, answer: Runs | np.ndarray | None) -> None:
             try:
-                waiting[index] = ascents[index].send(runs)
+                waiting[index] = ascents[index].send(answer)
             except StopIteration as end:
                 finished(index, end.value)
 
@@ -505,7 +572,7 @@ class Batches:
             advance(index, None)
         try:
             while waiting:
-                wanted = self._target.new_points(np.concatenate([*waiting.values()]))
+                wanted = self._cost(waiting.values())
                 if not self.interrupted and not self._fits(wanted):
                     self.interrupted = True
                     for index in waiting.keys() - begun:
@@ -513,26 +580,45 @@ class Batches:
                     continue
                 begun.update(waiting)
                 ended = self._wait(waiting)
-                points = np.concatenate([waiting[index] for index in ended])
-                new = self._target.new_points(points)
-                runs = self._target.run(points, self._remember)
+                requests = [waiting.pop(index) for index in ended]
+                new = self._cost(requests)
+                answers = self._answers(requests)
                 yield new
-                place = 0
-                for index in ended:
-                    rows = slice(place, place + len(waiting.pop(index)))
-                    place = rows.stop
+                for index, answer in zip(ended, answers, strict=True):
                     begun.discard(index)
                     if not self.interrupted:
-                        advance(index, Runs(*(column[rows] for column in runs)))
+                        advance(index, answer)
         finally:
             if self._running is not None:
                 self._running.close()
 
-    def _wait(self, waiting: dict[int, np.ndarray]) -> list[int]:
-        """Numbers of the generators whose points are simulated: in lock-step all of them."""
+    def _cost(self, requests: Iterable[Request]) -> int:
+        """Simulations that requests need; derivatives at a point count as one."""
+        points = [each for each in requests if not isinstance(each, Derivatives)]
+        derivatives = sum(isinstance(each, Derivatives) for each in requests)
+        return derivatives + (self._target.new_points(np.concatenate(points)) if points else 0)
+
+    def _answers(self, requests: list[Request]) -> list[Any]:
+        """Runs at the points of each request, or the model's derivatives."""
+        wanted = [each.coords for each in requests if isinstance(each, Derivatives)]
+        points = [each for each in requests if not isinstance(each, Derivatives)]
+        slopes = iter(self._target.derivatives(np.array(wanted), self._remember) if wanted else ())
+        runs = self._target.run(np.concatenate(points), self._remember) if points else None
+        ends = iter(np.cumsum([len(each) for each in points]))
+
+        def rows(n: int) -> Runs:
+            end = next(ends)
+            return Runs(*(column[end - n : end] for column in runs))
+
+        return [next(slopes) if isinstance(each, Derivatives) else rows(len(each)) for each in requests]
+
+    def _wait(self, waiting: dict[int, Request]) -> list[int]:
+        """Numbers of the generators whose requests can be answered: in lock-step all of them."""
         running = self._running
         if running is None:
             return list(waiting)
+        if derivatives := [index for index, each in waiting.items() if isinstance(each, Derivatives)]:
+            return derivatives
 
         def wait() -> list[np.ndarray]:
             for index, coords in waiting.items():

@@ -82,7 +82,7 @@ class ModeSearch(NamedTuple):
     ends : tuple of int
         Mode in which each start ended, -1 where it ended in none (a start that failed, or a mode of no weight).
     simulations : float
-        Simulations run, parts of a record counted as fractions.
+        Simulations run, parts of a record counted as fractions; a call of the model's ``jacobian`` counts as one.
     finished : bool
         False if `max_simulations` ended the search.
     """

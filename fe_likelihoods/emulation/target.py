@@ -20,6 +20,7 @@ from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
+from ..simulation.model import derivatives_batch
 from .quadratic import check_quadratic
 from .stacked import TIME_SHIFTS, stack
 
@@ -33,6 +34,7 @@ _WIDTHS_AROUND_START = 1.0, 0.1
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
 _LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
+_MAP_STEP = 1e-5  # of coordinates, for the derivatives of the parameters
 _SMALL_STEP = 1e-4  # share of a step from which its direction in scaled parameters is found
 _LOG_LIMITS = -690.0, 690.0
 _SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
@@ -180,6 +182,12 @@ class ResponseTarget:
         Samples of every channel, or of each where some are missing.
     archive : Archive
         The simulations run through this object.
+    differentiable : bool
+        Whether the model has a method ``jacobian``.
+    unchecked : list
+        Not empty until the model's derivatives have been compared with a difference; shared with `shortened` targets.
+    scales : (n_channels,) float
+        Standard deviations of the measured channels [SI]; 1 for a constant channel.
 
     Raises
     ------
@@ -225,6 +233,10 @@ class ResponseTarget:
             self._logarithmic = [False] * self.n_structural
         self.archive = Archive()
         self._simulated: set[bytes] = set()
+        self.differentiable = getattr(self.model, "jacobian", None) is not None
+        self.unchecked = [True] if self.differentiable else []
+        self.scales = np.nanstd(self.measured, axis=1)
+        self.scales[self.scales == 0.0] = 1.0
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
@@ -251,7 +263,10 @@ class ResponseTarget:
             except ValueError:
                 if not isinstance(self.comparison, Comparison):
                     raise  # else a channel has no sample in this part
-        return [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
+        targets = [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
+        for target in targets:
+            target.unchecked = self.unchecked
+        return targets
 
     # ------------------------------------------------------------------ coordinates
 
@@ -404,6 +419,28 @@ class ResponseTarget:
         failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
         self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
         return Runs(residuals.astype(float), statistics, failed)
+
+    def derivatives(self, coords: np.ndarray, remember: Remember = run_at_once) -> np.ndarray:
+        """Derivatives (n, n_structural, n_channels, n_steps) of residuals by coordinates, at (n, n_structural) ones.
+
+        They are the model's own derivatives times those of the parameters by the coordinates; in single precision, as
+        residuals.
+        """
+        n, d = coords.shape
+        thetas = self.structural_parameters(coords)
+
+        def compute() -> list[np.ndarray]:
+            return [derivatives_batch(self.model, thetas, self._likelihood.simulator.pool).astype(np.float32)]
+
+        text = f"derivatives of {self.model.fingerprint}".encode()
+        found = remember(hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest(), compute)[0]
+        moved = coords[:, None] + _MAP_STEP * np.stack([np.eye(d), -np.eye(d)])[:, None]
+        ahead, behind = self.structural_parameters(moved.reshape(-1, d)).reshape(2, n, d, d)
+        by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))
+        if not isinstance(self.comparison, Comparison):
+            return -by_coords
+        at_samples = [[self.comparison.at_samples(each) for each in rows] for rows in by_coords]
+        return np.where(self.comparison.missing, 0.0, -np.array(at_samples))
 
     def running_requests(self) -> Any:
         """Requests for simulations that go on while others are waited for; `run` finds their responses in the cache."""

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel
 from ..signals.records import Record
-from ..signals.sdof import respond
+from ..signals.sdof import respond, response_slopes
 from ..simulation.model import SimulationFailed
 from .base import StructuralModel, digest
-from .validation import positive_float
+from .validation import check_theta, positive_float
 
 __all__ = ["LinearOscillator"]
 
@@ -100,13 +101,44 @@ class LinearOscillator(StructuralModel):
         """
         return self.with_record(self.record.trim(0.0, seconds))
 
+    def jacobian(self, theta: ArrayLike) -> np.ndarray:
+        """Exact derivatives of the response by the parameters.
+
+        Parameters
+        ----------
+        theta : (2,) float
+            Multiples of the nominal stiffness and damping ratio.
+
+        Returns
+        -------
+        (2, 2, n_steps) float
+            [SI] by parameter, channel and sample.
+
+        Raises
+        ------
+        SimulationFailed, ValueError
+            As `simulate`.
+        """
+        frequency, damping_ratio = self._frequency_and_damping(check_theta(theta, self.parameter_names))
+        by_frequency, by_damping = response_slopes(self.record.acceleration, self.dt, frequency, damping_ratio)
+        factors = 0.5 * frequency / float(np.asarray(theta)[0]), self.damping_ratio
+        return np.stack(
+            [
+                factor * np.stack([slopes.acceleration, slopes.displacement])
+                for factor, slopes in zip(factors, (by_frequency, by_damping), strict=True)
+            ]
+        )
+
     def _respond(self, theta: np.ndarray) -> np.ndarray:
+        response = respond(self.record.acceleration, self.dt, *self._frequency_and_damping(theta))
+        return np.stack([response.acceleration, response.displacement])
+
+    def _frequency_and_damping(self, theta: np.ndarray) -> tuple[float, float]:
+        """Angular frequency [rad/s] and damping ratio; `SimulationFailed` if there is no such oscillator."""
         stiffness, damping = theta.tolist()
         damping_ratio = damping * self.damping_ratio
         if not (stiffness > 0.0 and math.isfinite(stiffness)):
             raise SimulationFailed(f"the stiffness must be positive and finite; it is {stiffness} times nominal")
         if not 0.0 <= damping_ratio < 1.0:
             raise SimulationFailed(f"the damping ratio must be in [0, 1); it is {damping_ratio}")
-        angular_frequency = 2.0 * math.pi / self.period * math.sqrt(stiffness)
-        response = respond(self.record.acceleration, self.dt, angular_frequency, damping_ratio)
-        return np.stack([response.acceleration, response.displacement])
+        return 2.0 * math.pi / self.period * math.sqrt(stiffness), damping_ratio

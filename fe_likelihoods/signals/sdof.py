@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["OscillatorResponse", "hold_integrals", "respond"]
+__all__ = ["OscillatorResponse", "hold_integrals", "respond", "response_slopes"]
 
 
 class OscillatorResponse(NamedTuple):
@@ -119,3 +119,64 @@ def respond(
         relative_velocity,
         -2.0 * damping_ratio * angular_frequency * relative_velocity - angular_frequency**2 * relative_displacement,
     )
+
+
+def response_slopes(
+    base_acceleration: np.ndarray, dt: float, angular_frequency: float, damping_ratio: float
+) -> tuple[OscillatorResponse, OscillatorResponse]:
+    r"""Exact derivatives of the response from rest, by the angular frequency and by the damping ratio.
+
+    The derivative :math:`p = \partial q / \partial \lambda` satisfies :math:`\dot p = \lambda p + q`, which is
+    integrated as exactly as :math:`q`.
+
+    Parameters
+    ----------
+    base_acceleration, dt, angular_frequency, damping_ratio
+        As for `respond`.
+
+    Returns
+    -------
+    tuple of OscillatorResponse
+        Derivatives by the angular frequency [per rad/s], and by the damping ratio.
+    """
+    from scipy.signal import lfilter
+
+    root = math.sqrt(1.0 - damping_ratio**2)
+    eigenvalue = angular_frequency * complex(-damping_ratio, root)
+    z = eigenvalue * dt
+    decay = cmath.exp(z)
+    constant, slope = hold_integrals(z)
+    ramp = [-dt * slope, -dt * (constant - slope)]  # numerator of q, as in `respond`
+    # d/dz of both integrals; near zero by their series, because the differences cancel
+    if abs(z) >= 1.0:
+        constant_slope = (decay - constant) / z
+        slope_slope = (constant_slope - slope) / z
+    else:
+        constant_slope = sum(k * z ** (k - 1) / math.factorial(k + 1) for k in range(1, 20))
+        slope_slope = sum(k * z ** (k - 1) / math.factorial(k + 2) for k in range(1, 20))
+    start = base_acceleration[0]
+    state, _ = lfilter(ramp, [1.0, -decay], base_acceleration, zi=[-ramp[0] * start])
+    ramp_slope = [-(dt**2) * slope_slope, -(dt**2) * (constant_slope - slope_slope)]
+    held, _ = lfilter(ramp_slope, [1.0], base_acceleration, zi=[-ramp_slope[0] * start])
+    carried = np.concatenate([[0.0], state[:-1]]) * (dt * decay)
+    by_eigenvalue = lfilter([1.0], [1.0, -decay], held + carried)
+    by_frequency = _slope_along(state, by_eigenvalue, angular_frequency, damping_ratio, 1.0, 0.0)
+    by_damping = _slope_along(state, by_eigenvalue, angular_frequency, damping_ratio, 0.0, 1.0)
+    return by_frequency, by_damping
+
+
+def _slope_along(
+    q: np.ndarray, by_eigenvalue: np.ndarray, omega: float, zeta: float, d_omega: float, d_zeta: float
+) -> OscillatorResponse:
+    """Derivative of the response along a direction of frequency and damping ratio, from q and its derivative."""
+    root = math.sqrt(1.0 - zeta**2)
+    damped, eigenvalue = omega * root, omega * complex(-zeta, root)
+    d_damped = d_omega * root - d_zeta * omega * zeta / root
+    d_eigenvalue = complex(-d_omega * zeta - d_zeta * omega, d_damped)
+    d_q = by_eigenvalue * d_eigenvalue
+    u, v = q.imag / damped, (eigenvalue * q).imag / damped
+    d_u = (d_q.imag - u * d_damped) / damped
+    d_v = ((d_eigenvalue * q + eigenvalue * d_q).imag - v * d_damped) / damped
+    stiffness, d_stiffness = omega**2, 2.0 * omega * d_omega
+    viscous, d_viscous = 2.0 * zeta * omega, 2.0 * (d_zeta * omega + zeta * d_omega)
+    return OscillatorResponse(d_u, d_v, -d_viscous * v - viscous * d_v - d_stiffness * u - stiffness * d_u)

@@ -31,6 +31,7 @@ __all__ = [
     "Model",
     "SimulationBatch",
     "SimulationFailed",
+    "derivatives_batch",
     "first_part",
     "has_batch_method",
     "misfit_batch",
@@ -133,6 +134,10 @@ class Model(Protocol):
     model with ``with_record`` and a `Record` in the attribute ``record`` can be shortened without this method
     (`first_part`).
 
+    With ``jacobian(theta) -> (n_parameters, n_channels, n_steps)``, the derivatives of the response [SI] by the
+    structural parameters, a guide needs no differences. Each call counts as one simulation of the guide, whatever it
+    costs; it is not cached. A shortened model has its own.
+
     Tables and figures use ``nominal``, the nominal values [SI] by parameter name, where parameters are multiples of
     nominal values; ``nominal_units`` with their units; and ``parameter_units`` with the units of other parameters, in
     words (`fe_likelihoods.likelihood.parameters.describe_parameters`).
@@ -206,6 +211,50 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
         with _one_by_one_if_it_fails(model):
             return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
     return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
+
+
+def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.ndarray:
+    """Derivatives of the responses by the structural parameters, from the model's own ``jacobian``.
+
+    Parameters
+    ----------
+    model, thetas, pool
+        As for `simulate_batch`.
+
+    Returns
+    -------
+    (n, n_parameters, n_channels, n_steps) float
+
+    Raises
+    ------
+    ValueError
+        If ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
+    """
+    shape = (len(model.parameter_names), len(model.channels), model.n_steps)
+    values, reasons = _run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
+    for theta, reason in zip(thetas, reasons, strict=True):
+        if reason:
+            named = ", ".join(f"{name} = {x:.6g}" for name, x in zip(model.parameter_names, theta, strict=True))
+            raise ValueError(
+                f"expected {type(model).__name__}.jacobian to return finite derivatives of the response by the "
+                f"parameters, of shape (n_parameters, n_channels, n_steps) = {shape}; got {reason}, at {named}: "
+                "correct it, or leave it out"
+            )
+    return values
+
+
+def _derivatives(model: Any, theta: np.ndarray) -> np.ndarray:
+    """Derivatives (n_parameters, n_channels, n_steps) of one response; `SimulationFailed` if they cannot be used."""
+    values = np.asarray(model.jacobian(theta.copy()))
+    shape = (len(model.parameter_names), len(model.channels), model.n_steps)
+    if values.shape != shape:
+        raise SimulationFailed(f"the shape {values.shape}")
+    if values.dtype.kind not in "fiu":
+        raise SimulationFailed(f"values of the type {values.dtype}")
+    values = values.astype(float)
+    if bad := [name for name, rows in zip(model.parameter_names, values, strict=True) if not np.isfinite(rows).all()]:
+        raise SimulationFailed(f"values that are not finite for {', '.join(bad)}")
+    return values
 
 
 def misfit_batch(

@@ -149,3 +149,18 @@ def test_fingerprint_depends_on_record_and_nominal_values(record):
 def test_nominal_values_out_of_range_are_rejected(record, values):
     with pytest.raises(ValueError, match="LinearOscillator"):
         LinearOscillator(record, **values)
+
+
+@pytest.mark.parametrize("zeta", [0.005, 0.05, 0.5])
+@pytest.mark.parametrize("period", [5.0, 0.5, 0.08])  # the last one with an eigenvalue times step above one
+def test_derivatives_against_differences(record, period, zeta):
+    model, theta, step = LinearOscillator(record, period, zeta), np.array([1.2, 0.9]), 5e-5
+    found = model.jacobian(theta)
+    for slopes, change in zip(found, step * np.eye(2), strict=True):
+        far, near = (model.simulate(theta + k * change) - model.simulate(theta - k * change) for k in (2, 1))
+        expected = (8.0 * near - far) / (12.0 * step)
+        scale = np.abs(expected).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(slopes / scale, expected / scale, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(model.first(3.0).jacobian(theta), found[:, :, :151])
+    with pytest.raises(SimulationFailed, match="the stiffness must be positive"):
+        model.jacobian([-1.0, 1.0])
