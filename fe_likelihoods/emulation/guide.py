@@ -53,7 +53,7 @@ _NOT_A_MODE = (
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
 _REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
 _LONGEST = 4  # such directions at whose ends runs are made
-_MOST_EXTENSIONS, _GROWTH = 10, 0.05  # of an emulator along these, while the log-evidence changes by as much
+_MOST_EXTENSIONS, _GROWTH = 12, 0.05  # of an emulator along these, while the log-evidence grows by as much
 _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
@@ -112,6 +112,7 @@ class ResponseGuide:
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
         self._wide: StudentMixture | None = None
+        self._extensions = 0  # of the emulator along directions that the data leave to the prior
 
     def check(self, log_prob_fn: Callable) -> None:
         """Raise ValueError if a sampler evaluates another object: every draw would be simulated twice."""
@@ -266,23 +267,23 @@ class ResponseGuide:
 
     def _follow_ridges(self, session: Any) -> Iterator[None]:
         """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
-        settled = 0  # twice, because the first runs at the ends of a new stretch may add nothing
-        for _ in range(_MOST_EXTENSIONS):
+        largest, settled = -np.inf, 0  # twice, because the first runs at the ends of a new stretch may add nothing
+        while self._emulated is not None and self._extensions < _MOST_EXTENSIONS:
             free, _ = self._free_directions()
-            if not len(free):
+            grown = self._emulated.log_evidence > largest + _GROWTH
+            settled = 0 if grown else settled + 1
+            if settled == 2 or not len(free):
                 break
-            earlier = self._emulated
-            points = earlier.extremes(free[:_LONGEST])[:, : self._target.n_structural]
+            largest = max(largest, self._emulated.log_evidence)
+            points = self._emulated.extremes(free[:_LONGEST])[:, : self._target.n_structural]
             new = self._target.new_points(points)
             if not session.fits(new):
                 break
             self._target.run(points, session.remember)
             self.simulations += new
+            self._extensions += 1
             yield
             self._emulate(session.random)
-            settled = settled + 1 if abs(self._emulated.log_evidence - earlier.log_evidence) < _GROWTH else 0
-            if settled == 2:
-                break
         self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
         if np.any(self._free_directions()[1] < _REACHED):
             self._add_concern(_SHORT_OF_THE_RIDGE)

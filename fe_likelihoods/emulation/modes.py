@@ -37,7 +37,7 @@ _APART = 0.25  # prior standard deviations in one coordinate from which ends on 
 _APART_OF_ALL = 2.0  # the same, times the number of starts
 _FEW = 6  # parameters whose differences cost about as much as two steps
 UNSEEN = 0.05  # share of starts alone in a mode above which further starts follow
-_ROUNDS_OF_STARTS = 4  # of the search for modes, the first one included
+_MOST_STARTS = 4  # times the number of the first ones
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -170,7 +170,7 @@ def search_modes(
     overlap : bool
         Whether each ascent goes on as soon as its own simulations have ended (`Batches`), and all begin together.
     first : int, optional
-        Number of starts with which to begin, and of further ones at a time; by default all.
+        Number of starts with which to begin; half of it follow at a time. By default all are first.
     remaining : callable, optional
         Returns the number of simulations left in the budget.
 
@@ -188,10 +188,11 @@ def search_modes(
     def affordable() -> list[np.ndarray]:  # the search is worth nothing without draws after it
         return [np.array(remaining() > 2.0 * spent)]
 
-    for begin in range(0, len(starts), first):
+    begins = (0, *range(first, len(starts), _further(first)))
+    for begin, following in zip(begins, (*begins[1:], len(starts)), strict=True):
         if begin and (unseen_share(search) <= UNSEEN or not remember("starts", affordable)[0]):
             break
-        fresh = range(begin, min(begin + first, len(starts)))
+        fresh = range(begin, following)
         standing_for.extend(fresh)
         ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
         finished = True
@@ -212,11 +213,10 @@ def search_modes(
 def unseen_share(search: ModeSearch) -> float:
     """Share of further starts that are expected to lead to modes not seen yet: the share of starts alone in a mode.
 
-    Zero with one mode: where all other starts were given up, nothing speaks for several modes.
-    I. J. Good (1953), Biometrika 40, 237-264, eq. 9, with the modes as species.
+    I. J. Good (1953), Biometrika 40, 237-264, eq. 9, with modes as species; starts that are given up count.
     """
     alone = sum(search.ends.count(number) == 1 for number in range(len(search.modes)))
-    return alone / len(search.ends) if len(search.modes) > 1 else 0.0
+    return alone / len(search.ends) if len(search.ends) > 1 else 0.0
 
 
 def _ascend_from(
@@ -292,17 +292,22 @@ def _modes_of(part: _Part, standing_for: list[int], spent: float, finished: bool
     return ModeSearch(tuple(m._replace(starts=s) for m, s in zip(modes, led, strict=True)), ends, spent, finished)
 
 
+def _further(first: int) -> int:
+    """Number of starts that follow together."""
+    return max(first // 2, 1)
+
+
 def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n.
 
     These are the median of the prior, then a Latin hypercube: every parameter has one start in each of n - 1 intervals
-    of equal prior probability, in random order. Further Latin hypercubes of n starts follow; none for n = 1.
+    of equal prior probability, in random order. Further Latin hypercubes follow; none for n = 1.
     """
     from scipy.special import ndtri
 
-    d = target.n_structural
+    d, some = target.n_structural, _further(n)
     blocks = [np.zeros((1, d))]
-    for size in (n - 1, *[n] * (_ROUNDS_OF_STARTS - 1)) if n > 1 else ():
+    for size in (n - 1, *[some] * ((_MOST_STARTS - 1) * n // some)) if n > 1 else ():
         columns = [random.permutation(size) + random.uniform(size=size) for _ in range(d)]
         blocks.append(ndtri(np.column_stack(columns) / size))
     return np.concatenate(blocks)
