@@ -50,6 +50,8 @@ _NOT_A_MODE = (
     "draws found a much higher point near a supposed mode, so the search was misled and may have missed other modes: "
     "use more starts"
 )
+_LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
+_CLEARLY = 0.75  # ratio of such errors at which the emulators take logarithms of the parameters
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
 _REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
 _LONGEST = 4  # such directions at whose ends runs are made
@@ -254,6 +256,8 @@ class ResponseGuide:
 
     def _emulate(self, random: np.random.RandomState) -> None:
         """Fit emulators to all runs, and the emulated posterior; an implausible one is not used."""
+        if not self.emulators:
+            self._choose_scale()
         self._fit_emulators()
         ready = [region for region in self._regions if region.emulator is not None]
         if ready and len(ready) == len(self._regions):
@@ -264,6 +268,34 @@ class ResponseGuide:
             self._emulated = emulated
             self._regions = self._emulated.moments()
             self._wide = self._wide_mixture()
+
+    def _choose_scale(self) -> None:
+        """Take logarithms of the parameters if left-out runs are predicted clearly better with them.
+
+        A ridge of equal products is straight in logarithms; other responses are often closer to linear in parameters.
+        The scale is not changed later, because draws of the guide are weighted by densities that depend on it.
+        """
+        errors, regions = [], list(self._regions)
+        for taken in (True, False):
+            self._target.take_logarithms(taken)
+            self._fit_emulators()
+            errors.append(self._left_out_error())
+            self._regions = list(regions)
+        self._target.take_logarithms(errors[0] <= _CLEARLY * errors[1])
+
+    def _left_out_error(self) -> float:
+        """Mean error of the log-likelihood of runs that the emulators were not fitted to, each at most `_LARGE`."""
+        errors = []
+        for region, mode in zip(self._regions, self._modes, strict=True):
+            if region.emulator is not None:
+                predicted, true = (
+                    self._target.log_likelihood(
+                        each, np.repeat(mode.coords[None, self._target.n_structural :], len(each), 0)
+                    )
+                    for each in region.emulator.left_out_statistics()
+                )
+                errors.append(np.minimum(np.abs(predicted - true), _LARGE).mean())
+        return float(np.mean(errors)) if errors else np.inf
 
     def _follow_ridges(self, session: Any) -> Iterator[None]:
         """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""

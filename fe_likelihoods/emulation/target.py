@@ -220,9 +220,9 @@ class ResponseTarget:
             self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
         check_quadratic(self.statistic, self.measured)
         low, self._median, high = self._prior.from_normal(np.array([[-2.0], [0.0], [2.0]]) * np.ones(self.ndim))
-        factors = (low > 0.0) & (high < _LARGEST_FACTOR * low) | np.array(self._prior.logarithmic)
-        self._logarithmic = list(factors[: self.n_structural])
-        self._factors = [*self._logarithmic, *([False] * self.n_noise)]
+        logarithmic = np.array(self._prior.logarithmic)
+        # without and with logarithms of parameters that the prior keeps away from zero
+        self._scales = logarithmic, logarithmic | (low > 0.0) & (high < _LARGEST_FACTOR * low)
         self._noise_prior = self._prior_of_noise()
         # of the noise coordinates over the noise parameters, at the median
         self._median_volume = 0.0
@@ -230,7 +230,8 @@ class ResponseTarget:
             zero, at = np.zeros((1, self.n_noise)), self._median[None, self.n_structural :]
             self._median_volume = float(np.squeeze(self._noise_prior.logpdf(at)) - self.log_prior(zero)[0])
         elif self.n_noise:  # the volume of structural parameters alone is not known
-            self._logarithmic = [False] * self.n_structural
+            self._scales = (np.zeros(self.ndim, bool),) * 2
+        self.take_logarithms(True)
         self.archive = Archive()
         self._simulated: set[bytes] = set()
         self.differentiable = getattr(self.model, "jacobian", None) is not None
@@ -329,6 +330,14 @@ class ResponseTarget:
         full = np.repeat(self._median[None], len(thetas), axis=0)
         full[:, : self.n_structural] = thetas
         return _finite(self._prior.to_normal(full)[:, : self.n_structural])
+
+    def take_logarithms(self, taken: bool) -> None:
+        """Let scaled parameters be logarithms where the prior keeps parameters away from zero, or only where it is
+        lognormal."""
+        factors = self._scales[int(taken)].copy()
+        self._logarithmic = list(factors[: self.n_structural])
+        factors[self.n_structural :] = False
+        self._factors = list(factors)
 
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural), or their logarithms where the prior keeps them away from zero.
