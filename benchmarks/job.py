@@ -21,7 +21,7 @@ import numpy as np
 
 from .rows import Row
 
-__all__ = ["EVERY", "LIMIT", "compare_settings", "job", "evaluations_made", "memory"]
+__all__ = ["EVERY", "LIMIT", "compare_settings", "job", "evaluations_made", "memory", "peak_memory"]
 
 ROOT = Path(__file__).resolve().parents[1]
 EVERY, LIMIT = 16, 900.0
@@ -30,7 +30,7 @@ SEED = 1
 BATCH = 500
 
 
-def _peak() -> float:
+def peak_memory() -> float:
     """Peak resident memory of this process [MiB]."""
     status = Path("/proc/self/status")
     if status.exists():  # ru_maxrss includes the peak of the parent process
@@ -62,7 +62,7 @@ def _run(setting: str, every: int, path: str) -> dict:
         "stages": len(sampler.ladder),
         "seconds": time.perf_counter() - start,
         "cpu": time.process_time() - cpu,
-        "peak": _peak(),
+        "peak": peak_memory(),
         "mean": samples.mean(axis=0).tolist(),
         "sd": samples.std(axis=0, ddof=1).tolist(),
         "log_evidence": [float(sampler.log_evidence), float(sampler.log_evidence_error)],
@@ -71,17 +71,17 @@ def _run(setting: str, every: int, path: str) -> dict:
 
 def _memory() -> dict:
     """Peak memory [MiB] after each step of a run on the full record."""
-    peaks = {"interpreter and NumPy": _peak()}
+    peaks = {"interpreter and NumPy": peak_memory()}
     from fe_likelihoods.problems import bridge_column
     from samplers import SMCSampler  # noqa: F401
 
-    peaks["both packages imported"] = _peak()
+    peaks["both packages imported"] = peak_memory()
     posterior = bridge_column()
-    peaks["posterior made"] = _peak()
+    peaks["posterior made"] = peak_memory()
     posterior(posterior.sample_prior(1, 1))
-    peaks["first simulation"] = _peak()
+    peaks["first simulation"] = peak_memory()
     posterior(posterior.sample_prior(BATCH, 2))
-    peaks[f"batch of {BATCH} simulations"] = _peak()
+    peaks[f"batch of {BATCH} simulations"] = peak_memory()
     return peaks
 
 

@@ -24,11 +24,13 @@ import logging
 import os
 import shutil
 import struct
+import tempfile
 import weakref
 import zlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,6 +52,7 @@ logger = logging.getLogger(__name__)
 MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, checksums of the content and of both
 # a record in memory keeps only the latest points of a long chain, which a repeated step or the verdict needs
 KEPT_IN_MEMORY = 20_000
+_LARGE = 2**20  # bytes of arrays under a key from which they are in a file only
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
 
 
@@ -91,6 +94,13 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
     reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
     coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
     return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+
+class _Place(NamedTuple):
+    """Where the content of a block is in a file."""
+
+    start: int
+    length: int
 
 
 class RunStart(NamedTuple):
@@ -148,11 +158,13 @@ class Record:
         self._dropped = 0
         self._place: dict[bytes, int] = {}
         self._simulated: set[bytes] = set()
-        self._arrays: dict[str, list[list[np.ndarray]]] = {}
+        self._arrays: dict[str, list[list[np.ndarray] | _Place]] = {}
+        self._large: Any = None  # temporary file of the large arrays of a record in memory
         self._whole = 0  # bytes of the file that were read
 
     def __getstate__(self):
-        return {**self.__dict__, "_file": None}
+        arrays = {key: [self._stored(each) for each in known] for key, known in self._arrays.items()}
+        return {**self.__dict__, "_file": None, "_large": None, "_arrays": arrays}
 
     # ------------------------------------------------------------------ evaluations
 
@@ -235,10 +247,11 @@ class Record:
         if self.used[key] == len(known):
             arrays = [np.asarray(array) for array in compute()]
             with deferred_interrupts():
-                self._write(b"MEMO", [_text(key), *arrays])
-                known.append(arrays)
+                known.append(self._kept(arrays, self._write(b"MEMO", [_text(key), *arrays])))
+            self.used[key] += 1
+            return arrays
         self.used[key] += 1
-        return known[self.used[key] - 1]
+        return self._stored(known[self.used[key] - 1])
 
     def note(self, key: str, array: np.ndarray) -> None:
         """Store an array under a key; only the last array counts (`noted`)."""
@@ -248,7 +261,25 @@ class Record:
 
     def noted(self, key: str) -> np.ndarray | None:
         """The last array that was noted under a key since the annealing began; None without any."""
-        return self._arrays[key][-1][0] if key in self._arrays else None
+        return self._stored(self._arrays[key][-1])[0] if key in self._arrays else None
+
+    def _kept(self, arrays: list[np.ndarray], place: "_Place | None") -> "list[np.ndarray] | _Place":
+        """Arrays of a block, or where they are in the file of the record, or in a temporary one, if they are large."""
+        if sum(array.nbytes for array in arrays) < _LARGE:
+            return arrays
+        if place is None:
+            self._large = self._large or tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
+            start = self._large.seek(0, os.SEEK_END)
+            place = _Place(start, self._large.write(_content([_text(""), *arrays])))
+        return place
+
+    def _stored(self, kept: "list[np.ndarray] | _Place") -> list[np.ndarray]:
+        """The arrays that `_kept` was given."""
+        if isinstance(kept, list):
+            return kept
+        with nullcontext(self._large) if self.path is None else open(self.path, "rb") as file:
+            file.seek(kept.start)
+            return _arrays_of(file.read(kept.length))[1:]
 
     def rewind(self) -> None:
         """The run is repeated from its start: `remember` returns the stored arrays, beginning with the first."""
@@ -318,9 +349,9 @@ class Record:
         self._clear()
         return aside
 
-    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> None:
+    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> "_Place | None":
         if self.path is None:
-            return
+            return None
         self.open()
         data, start = memoryview(_block(kind, arrays)), self._whole
         try:
@@ -337,6 +368,7 @@ class Record:
                 str(self.path),
             ) from error
         self._whole = start + len(data)
+        return _Place(start + BLOCK.size, len(data) - BLOCK.size)
 
     def _read(self) -> None:
         data, place = self.path.read_bytes(), len(MAGIC)
@@ -348,7 +380,7 @@ class Record:
             content = data[place + BLOCK.size : end]
             if known and len(content) < length:
                 break  # the process was killed while it wrote this block
-            if not known or zlib.crc32(content) != checksum or not self._read_block(kind, content):
+            if not known or zlib.crc32(content) != checksum or not self._read_block(kind, content, place + BLOCK.size):
                 aside = free_name(self.path, "damaged")
                 shutil.copyfile(self.path, aside)
                 logger.warning(
@@ -364,7 +396,7 @@ class Record:
             place = end
         self._whole = place if len(data) >= len(MAGIC) else 0
 
-    def _read_block(self, kind: bytes, content: bytes) -> bool:
+    def _read_block(self, kind: bytes, content: bytes, start: int) -> bool:
         """Enter a block of the file; False if its content is of another form."""
         try:
             first, *arrays = _arrays_of(content)
@@ -376,7 +408,8 @@ class Record:
                 header, name, *rest = json.loads(first.tobytes())
                 self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))
             else:
-                self._arrays.setdefault(json.loads(first.tobytes()), []).append(arrays)
+                kept = self._kept(arrays, _Place(start, len(content)))
+                self._arrays.setdefault(json.loads(first.tobytes()), []).append(kept)
         except ValueError:
             return False
         return True
@@ -414,11 +447,15 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_close_in_child)
 
 
-def _block(kind: bytes, arrays: Sequence[np.ndarray]) -> bytes:
+def _content(arrays: Sequence[np.ndarray]) -> bytes:
     content = io.BytesIO()
     for array in arrays:
         np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
-    data = content.getvalue()
+    return content.getvalue()
+
+
+def _block(kind: bytes, arrays: Sequence[np.ndarray]) -> bytes:
+    data = _content(arrays)
     return BLOCK.pack(kind, len(data), zlib.crc32(data), _of_both(kind, len(data))) + data
 
 

@@ -35,6 +35,7 @@ Gaussian processes).
 """
 
 import hashlib
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,6 @@ import numpy as np
 from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch, SimulationFailed
 from .gaussian_process import GaussianProcess, fit_process, left_out_errors, predict
-from .quadratic import bilinear_form
 from .target import ResponseTarget
 
 __all__ = ["ResponseEmulator", "TrainingSet", "fit_emulator"]
@@ -65,12 +65,12 @@ class TrainingSet(NamedTuple):
     ----------
     coords : (m, d) float
         Structural coordinates.
-    residuals : (m, n_channels, n_steps) float32
-        Measured minus simulated response [SI].
+    numbers : (m,) int
+        Numbers of the runs in the archive of the target.
     """
 
     coords: np.ndarray
-    residuals: np.ndarray
+    numbers: np.ndarray
 
 
 class Whitening(NamedTuple):
@@ -131,23 +131,19 @@ class ResponseEmulator:
         target: ResponseTarget,
         whitening: Whitening,
         process: GaussianProcess,
-        mean: np.ndarray,
-        components: np.ndarray,
+        histories: np.ndarray,
         coefficients: np.ndarray,
         slopes: np.ndarray,
     ) -> None:
         self._target, self._whitening, self.process = target, whitening, process
-        self._mean, self._components = mean, components
+        self._histories = histories  # the mean residual and the components, as weights of runs
         self.reach = _REACH * float(np.square(process.inputs).sum(axis=1).max())
         self.left_out, variances = left_out_errors(process)
         largest = (np.square(self.left_out) / np.maximum(variances, _TINY)).max(axis=0)
         self._widening = np.clip(largest / (2.0 * np.log(len(variances))), 1.0, _WIDEST)
         self._coefficients = coefficients
-        self._forms = _Forms(
-            target.statistic(mean),
-            bilinear_form(target.statistic, components, mean[None])[:, 0],
-            bilinear_form(target.statistic, components),
-        )
+        forms = target.archive.forms(histories)
+        self._forms = _Forms(forms[0, 0], forms[1:, 0], forms[1:, 1:])
         self._gradient = 2.0 * self._forms.linear @ slopes
         self._hessian = 2.0 * self._forms.quadratic @ slopes
 
@@ -176,6 +172,11 @@ class ResponseEmulator:
         """Digest of the emulated model and of the runs that the emulator was fitted to."""
         inputs = self.process.inputs.tobytes() + self._coefficients.tobytes()
         return hashlib.blake2b(self._target.model.fingerprint.encode() + inputs, digest_size=16).hexdigest()
+
+    @cached_property
+    def _combined(self) -> np.ndarray:
+        """The mean residual and the components (1 + k, n_channels, n_steps) [SI]."""
+        return self._target.archive.combined(self._histories)
 
     def squared_distance(self, coords: np.ndarray) -> np.ndarray:
         """Squared distance (n,) of structural coordinates (n, d) from the centre, in whitened parameters."""
@@ -244,7 +245,8 @@ class ResponseEmulator:
         coords = self._target.structural_coordinates(np.asarray(thetas, dtype=float))
         inside = self.squared_distance(coords) <= self.reach
         mean, _ = predict(self.process, np.where(inside[:, None], self._inputs(coords), 0.0))
-        residuals = self._mean + np.einsum("nk,kct->nct", mean, self._components, optimize=True)
+        average, components = self._combined[0], self._combined[1:]
+        residuals = average + np.einsum("nk,kct->nct", mean, components, optimize=True)
         if isinstance(self._target.comparison, Comparison):
             raise ValueError(
                 "the emulator was fitted to measurements with missing samples, or with times of their own, and "
@@ -286,9 +288,9 @@ def fit_emulator(
     -------
     ResponseEmulator
     """
-    mean = training.residuals.mean(axis=0, dtype=float)
-    scaled = ((training.residuals - mean) / scales[:, None]).reshape(len(training.coords), -1)
-    values, vectors = np.linalg.eigh(scaled @ scaled.T)
+    centred = np.eye(len(training.coords)) - 1.0 / len(training.coords)
+    products = target.archive.products(training.numbers, 1.0 / np.square(scales))
+    values, vectors = np.linalg.eigh(centred @ products @ centred)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     if values[0] <= 0.0:
         raise np.linalg.LinAlgError("the responses of all runs are equal")
@@ -296,11 +298,13 @@ def fit_emulator(
     enough = 1 + int(np.argmax(left_out < _NEGLIGIBLE_VARIANCE * len(values)))
     k = max(1, min(enough, _MAX_COMPONENTS, int((values > _SMALLEST_SHARE * values[0]).sum()), len(values) - 1))
     lengths = np.sqrt(values[:k])
-    components = ((vectors[:, :k] / lengths).T @ scaled).reshape(k, *mean.shape) * scales[:, None]
+    histories = np.zeros((1 + k, len(target.archive)))
+    histories[0, training.numbers] = 1.0 / len(training.coords)
+    histories[1:, training.numbers] = (vectors[:, :k] / lengths).T @ centred
     coefficients = vectors[:, :k] * lengths
     whitening = fit_whitening(target, centre, covariance)
     inputs = whitened(target, whitening, training.coords)
     importance = np.minimum(1.0, values[:k] / values[0] * 1e3)
     log_scales = None if earlier is None else earlier.process.log_scales
     process = fit_process(inputs, coefficients, importance, log_scales)
-    return ResponseEmulator(target, whitening, process, mean, components, coefficients, slopes)
+    return ResponseEmulator(target, whitening, process, histories, coefficients, slopes)

@@ -198,10 +198,11 @@ class ResponseGuide:
         )
         self.search = yield from self._counted(search)
         self._add_modes(self.search.modes)
-        residuals = self._target.archive.residuals
-        if len(residuals) > 1 and all(np.array_equal(residuals[0], other) for other in residuals):
+        archive = self._target.archive
+        runs = archive.numbers
+        if len(runs) > 1 and all(np.array_equal(*map(archive.residuals, (runs[0], other))) for other in runs):
             raise ValueError(
-                f"expected responses that depend on the parameters; all {len(residuals)} simulations of the search "
+                f"expected responses that depend on the parameters; all {len(runs)} simulations of the search "
                 f"gave the same one. Check where the model reads {', '.join(self._target.model.parameter_names)}, "
                 "and whether an old file of results is read"
             )
@@ -478,9 +479,9 @@ class ResponseGuide:
             rows = rows[order[good][:_MOST_RUNS]]
             if len(rows) < _FEWEST_RUNS[0] * d + _FEWEST_RUNS[1]:
                 continue
-            residuals = archive.residuals[best].astype(float)
+            residuals = archive.residuals(archive.numbers[best]).astype(float)
             scales = np.sqrt(np.square(residuals).mean(axis=1)) + 1e-12 * np.abs(self._target.measured).max(axis=1)
-            training = TrainingSet(coords[rows], np.array([archive.residuals[row] for row in rows]))
+            training = TrainingSet(coords[rows], archive.numbers[rows])
             slopes = self._target.slopes(statistics[best], self._target.fit_noise(statistics[best], noise).coords)
             centre, covariance = region.centre[:d], region.covariance[:d, :d]
             try:

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .quadratic import bilinear_form
 from .target import NoiseFit, Remember, ResponseTarget, Runs
 
 __all__ = [
@@ -91,7 +90,7 @@ class _Point(NamedTuple):
     """A simulated point, with the noise parameters that fit best."""
 
     coords: np.ndarray
-    residuals: np.ndarray
+    run: int
     statistics: np.ndarray
     noise: NoiseFit
     value: float
@@ -104,16 +103,16 @@ class Ascent(NamedTuple):
     ----------
     coords : (n_structural,) float
         Structural coordinates.
-    residuals : (n_channels, n_steps) float
-        Residuals.
+    run : int
+        Its number in the archive of the target.
     statistics : (n_numbers,) float
-        Their statistics.
+        Statistics of the residuals.
     noise : NoiseFit
         The best noise parameters.
     value : float
         Log-density, in standard normal coordinates, at the best noise parameters.
-    slopes : (n_structural, n_channels, n_steps) float
-        Derivatives of the residuals by the coordinates.
+    slopes : (n_structural, n) float
+        Derivatives of the residuals by the coordinates, as weights of the first n histories in the archive.
     weights : (n_numbers,) float
         Derivatives of the log-likelihood by the statistics.
     gradient : (n_structural,) float
@@ -123,7 +122,7 @@ class Ascent(NamedTuple):
     """
 
     coords: np.ndarray
-    residuals: np.ndarray
+    run: int
     statistics: np.ndarray
     noise: NoiseFit
     value: float
@@ -152,20 +151,20 @@ class Jacobians:
         sum_i |y_i - (J_0 + D) s_i|^2 / |s_i|^4 + |D|^2 / |z - z_0|^2 .
 
     A run at a distance s has an error of the second order, s^2, from curvature, whence the weights; and J_0 is as
-    uncertain as a difference with a step of ``|z - z_0|``.
+    uncertain as a difference with a step of ``|z - z_0|``. Derivatives are weights of histories, as in `Ascent.slopes`.
     """
 
     def __init__(self) -> None:
         self._known: list[tuple[np.ndarray, np.ndarray]] = []
         self._coords: list[np.ndarray] = []
-        self._residuals: list[np.ndarray] = []
+        self._runs: list[int] = []
         self._claimed = False
 
     def note(self, points: np.ndarray, runs: Runs) -> None:
         """Enter runs at points (n, d)."""
         for k in np.flatnonzero(~runs.failed):
             self._coords.append(points[k])
-            self._residuals.append(runs.residuals[k])
+            self._runs.append(int(runs.numbers[k]))
 
     def claim(self) -> bool:
         """Whether the caller is the first, which makes the first differences."""
@@ -176,15 +175,15 @@ class Jacobians:
         return bool(self._known)
 
     def add(self, coords: np.ndarray, slopes: np.ndarray) -> None:
-        """Enter derivatives (d, n_channels, n_steps) that are known at coordinates (d,)."""
+        """Enter derivatives (d, n) that are known at coordinates (d,)."""
         self._known.append((coords, slopes))
 
     def known_at(self, coords: np.ndarray) -> bool:
         """Whether derivatives were entered for this very point."""
         return any(np.array_equal(coords, point) for point, _ in self._known)
 
-    def at(self, coords: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Derivatives (d, n_channels, n_steps) at coordinates (d,) with known residuals."""
+    def at(self, coords: np.ndarray, run: int) -> np.ndarray:
+        """Derivatives (d, n) at coordinates (d,), where a run was made."""
         origin, slopes = min(reversed(self._known), key=lambda each: float(np.square(each[0] - coords).sum()))
         far = float(np.square(origin - coords).sum())
         d = len(coords)
@@ -196,9 +195,10 @@ class Jacobians:
             return slopes
         steps, weighted = steps[rows], steps[rows] / np.square(squared[rows])[:, None]
         solved = np.linalg.solve(weighted.T @ steps + np.eye(d) / far, weighted.T)
-        changes = np.array([self._residuals[row] for row in rows]) - residuals
-        changes = changes.reshape(len(rows), -1) - steps @ slopes.reshape(d, -1)
-        return slopes + (solved @ changes).reshape(slopes.shape)
+        runs = np.array([self._runs[row] for row in rows])
+        slopes = np.pad(slopes, ((0, 0), (0, max(0, max(run, *runs) + 1 - slopes.shape[1]))))
+        changes = _differences(runs, run, slopes.shape[1]) - steps @ slopes
+        return slopes + solved @ changes
 
 
 class _Climb:
@@ -258,7 +258,7 @@ class _Climb:
             value = fit.log_density + float(self._target.log_prior(points[k] - self._centre))
             self.values.append(value)
             if value > (least if found is None else found.value):
-                found = _Point(points[k], runs.residuals[k], runs.statistics[k], fit, value)
+                found = _Point(points[k], int(runs.numbers[k]), runs.statistics[k], fit, value)
         return found
 
     def difference(self, steps: np.ndarray, runs: Runs | None = None) -> Generator[np.ndarray, Runs, None]:
@@ -267,47 +267,51 @@ class _Climb:
         if runs is None:
             runs = yield here.coords + steps
             self._jacobians.note(here.coords + steps, runs)
-        changes, used = runs.residuals - here.residuals, steps.copy()
+        ends, used = np.where(runs.failed, here.run, runs.numbers), steps.copy()
         for k in np.flatnonzero(runs.failed):
-            changes[k] = 0.0
             for factor in _RETRIES:
                 again = yield here.coords + factor * steps[None, k]
                 if not again.failed[0]:
-                    changes[k], used[k] = again.residuals[0] - here.residuals, factor * steps[k]
+                    ends[k], used[k] = again.numbers[0], factor * steps[k]
                     break
-        slopes = np.linalg.solve(used, changes.reshape(len(used), -1)).reshape(changes.shape)
-        self._jacobians.add(here.coords, slopes)
+        changes = _differences(ends, here.run, max(here.run, *ends) + 1)
+        self._jacobians.add(here.coords, np.linalg.solve(used, changes))
 
     def derivatives(self) -> Generator[Any, Any, None]:
         """The model's own derivatives at the present point; the first ones are compared with differences."""
         here, target = self.here, self._target
-        slopes = yield Derivatives(here.coords)
+        numbers = yield Derivatives(here.coords)
         if target.unchecked:
             target.unchecked.clear()
-            yield from self._check(slopes)
-        self._jacobians.add(here.coords, slopes)
+            yield from self._check(numbers)
+        self._jacobians.add(here.coords, target.archive.weights(numbers))
 
-    def _check(self, slopes: np.ndarray) -> Generator[np.ndarray, Runs, None]:
-        """ValueError if derivatives deny the residuals at a small step along all coordinates; a smaller one is tried.
+    def _check(self, numbers: np.ndarray) -> Generator[np.ndarray, Runs, None]:
+        """ValueError if derivatives, numbers (d,) in the archive, deny the residuals at a step along all coordinates.
 
-        Without a change along the step, or a simulation there, the next derivatives are compared.
+        A smaller step is tried. Without a change along it, or a simulation there, the next derivatives are compared.
         """
         here, target = self.here, self._target
-        scales = target.scales[:, None] * np.sqrt(slopes[0].size)
-        sizes = np.sqrt(np.square(slopes / scales).sum(axis=(1, 2)))
+        scales = 1.0 / np.square(target.scales) / target.measured.size
+        sizes = np.sqrt(np.diag(target.archive.products(numbers, scales)))
         random = np.random.default_rng(0)  # a row in the place of another one shows, and so does a sign
         shares = random.uniform(0.5, 1.0, len(sizes)) * random.choice([-1.0, 1.0], len(sizes))
         worst = 0.0
         for change in _CHECKED_CHANGES:
             steps = shares * np.minimum(change / np.maximum(sizes, 1e-300), _DIFFERENCE_LIMITS[1])
             runs = yield (here.coords + steps)[None]
-            changes = (runs.residuals[0] - here.residuals) / scales
-            predicted = np.tensordot(steps, slopes, axes=1) / scales
-            size = max(np.linalg.norm(changes), np.linalg.norm(predicted))
-            if runs.failed[0] or size == 0.0:
+            size = 0.0
+            if not runs.failed[0]:
+                products = target.archive.products(np.array([runs.numbers[0], here.run, *numbers]), scales)
+                changed, predicted = np.array([[1.0, -1.0, *np.zeros(len(steps))], [0.0, 0.0, *steps]])
+                norms = [
+                    np.sqrt(max(0.0, each @ products @ each)) for each in (changed, predicted, changed - predicted)
+                ]
+                size = max(norms[:2])
+            if size == 0.0:
                 target.unchecked.append(True)
                 return
-            worst = float(np.linalg.norm(changes - predicted) / size)
+            worst = float(norms[2] / size)
             if worst < _CHECKED_ERROR:
                 return
         raise ValueError(
@@ -320,11 +324,11 @@ class _Climb:
     def quadratic(self) -> Ascent:
         """The log-density around the present point."""
         here = self.here
-        slopes = self._jacobians.at(here.coords, here.residuals)
+        slopes = self._jacobians.at(here.coords, here.run)
         weights = self._target.slopes(here.statistics, here.noise.coords)
-        form = bilinear_form(self._target.statistic, slopes, here.residuals[None])[:, 0]
-        gradient = 2.0 * form @ weights - (here.coords - self._centre)
-        hessian = -2.0 * bilinear_form(self._target.statistic, slopes) @ weights + np.eye(len(slopes))
+        forms = self._target.archive.forms(self._target.archive.weights([*slopes, here.run]))
+        gradient = 2.0 * forms[:-1, -1] @ weights - (here.coords - self._centre)
+        hessian = -2.0 * forms[:-1, :-1] @ weights + np.eye(len(slopes))
         self._known[self._number] = Ascent(*here, slopes, weights, gradient, hessian)
         return self._known[self._number]
 
@@ -388,9 +392,9 @@ class _Climb:
         move = self.here.coords - other.coords
         if np.abs(move).max() >= self._apart or self.here.value >= other.value:
             return False
-        predicted = np.tensordot(move, other.slopes, axes=1)
-        error = self.here.residuals - other.residuals - predicted
-        lost, whole = (-float(self._target.statistic(each) @ other.weights) for each in (error, predicted))
+        ours, theirs, predicted = self._target.archive.weights([self.here.run, other.run, move @ other.slopes])
+        forms = self._target.archive.forms(np.stack([ours - theirs - predicted, predicted])) @ other.weights
+        lost, whole = -np.diag(forms)
         return lost < max(min(_EXPLAINED[0] * len(move), _EXPLAINED[1]) * whole, _EXPLAINED[2])
 
     def connected(self) -> Generator[np.ndarray, Runs, int | None]:
@@ -515,6 +519,11 @@ def axes_of(end: Ascent, free: float = 1.0) -> np.ndarray:
     values, vectors = np.linalg.eigh(end.hessian)
     lengths = np.where(values < _FREE, free, 1.0 / np.sqrt(np.maximum(values, 1.0)))
     return (vectors * ((-1.0) ** np.arange(len(values)) * lengths)).T
+
+
+def _differences(runs: np.ndarray, run: int, n: int) -> np.ndarray:
+    """Differences of the residuals of runs (m,) from a run, as weights (m, n) of the first n histories."""
+    return np.eye(n)[runs] - np.eye(n)[run]
 
 
 def _squared_distance(coords: np.ndarray, end: Ascent) -> float:

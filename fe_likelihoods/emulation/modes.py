@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Batches, Jacobians, ascend, axes_of, distinct_ends
-from .quadratic import bilinear_form
 from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = [
@@ -102,8 +101,8 @@ def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -
     statistics = end.statistics
     noise = max(end.noise, target.fit_noise(statistics), key=lambda fit: fit.log_density)
     d, at = target.n_structural, np.concatenate([end.coords, noise.coords])
-    along = 2.0 * bilinear_form(target.statistic, end.slopes, end.residuals[None])[:, 0]
-    curved = bilinear_form(target.statistic, end.slopes)
+    forms = target.archive.forms(target.archive.weights([*end.slopes, end.run]))
+    along, curved = 2.0 * forms[:-1, -1], forms[:-1, :-1]
 
     def log_density(coords: np.ndarray) -> np.ndarray:
         step = coords[:, :d] - end.coords
@@ -267,7 +266,9 @@ def _ascend_from(
                 del part.ends[k]
         best = max(end.value for end in part.ends.values())
         # a model that is not exact may fit a part of the record best where it does not fit the whole one
-        good = {k: e for k, e in part.ends.items() if k in fronts and e.value > best - _HOPELESS * e.residuals.size}
+        good = {
+            k: e for k, e in part.ends.items() if k in fronts and e.value > best - _HOPELESS * part.target.measured.size
+        }
         for k in fronts.keys() & part.ends.keys() - good.keys():
             standing_for[k] = -1
         ordered = sorted(good, key=lambda k: -part.ends[k].value)

@@ -18,13 +18,15 @@ import numpy as np
 
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
+from ..noise.tabulated import tabulated
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
-from ..simulation.model import derivatives_batch
+from ..simulation.model import derivatives_batch, most_responses
+from .archive import Archive
 from .quadratic import check_quadratic
 from .stacked import TIME_SHIFTS, stack
 
-__all__ = ["Archive", "NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
+__all__ = ["NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
 
 Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], Sequence[np.ndarray]]
 
@@ -42,6 +44,7 @@ _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not
 _NEWTON_STEPS = 12
 _NEWTON_GAIN = 1e-4
 _NEWTON_DIFFERENCE = 1e-3
+_MANY = 10_000  # runs of a pool whose size is not known
 _DAMPED = 0.0, 1.0, 10.0, 100.0
 
 
@@ -84,15 +87,15 @@ class Runs(NamedTuple):
 
     Attributes
     ----------
-    residuals : (n, n_channels, n_steps) float
-        Measured minus simulated response [SI]; zero where a sample is missing, NaN where the simulation failed.
+    numbers : (n,) int
+        Their numbers in the archive of the target; -1 where the simulation failed.
     statistics : (n, n_numbers) float
         Statistics of the residuals; NaN where the simulation failed.
     failed : (n,) bool
         Whether the simulation failed.
     """
 
-    residuals: np.ndarray
+    numbers: np.ndarray
     statistics: np.ndarray
     failed: np.ndarray
 
@@ -115,43 +118,6 @@ class NoiseFit(NamedTuple):
 def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
     """`Remember` that stores nothing."""
     return compute()
-
-
-class Archive:
-    """All successful simulations of the whole record.
-
-    Attributes
-    ----------
-    coords : (n, n_structural) float
-        Structural coordinates.
-    residuals : list of n (n_channels, n_steps) float32
-        Measured minus simulated response [SI]. Computed in double precision and then rounded, it keeps its digits where
-        a channel has an offset of a million times its noise; a rounded response would not.
-    statistics : (n, n_numbers) float
-        Statistics of the residuals.
-    """
-
-    def __init__(self) -> None:
-        self._coords: list[np.ndarray] = []
-        self._statistics: list[np.ndarray] = []
-        self.residuals: list[np.ndarray] = []
-
-    def __len__(self) -> int:
-        return len(self.residuals)
-
-    @property
-    def coords(self) -> np.ndarray:
-        return np.array(self._coords)
-
-    @property
-    def statistics(self) -> np.ndarray:
-        return np.array(self._statistics)
-
-    def add(self, coords: np.ndarray, residuals: np.ndarray, statistics: np.ndarray) -> None:
-        """Add runs."""
-        self._coords += list(coords)
-        self.residuals += list(residuals)
-        self._statistics += list(statistics)
 
 
 class _WithoutMissing(NamedTuple):
@@ -201,6 +167,7 @@ class ResponseTarget:
         self._likelihood: _Likelihood = stack(posterior.likelihood)
         self._prior = posterior.prior
         self.model, self.noise = self._likelihood.model, self._likelihood.noise
+        self._log_likelihood = tabulated(self.noise)
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
         self.comparison = self._likelihood.measured
@@ -232,12 +199,15 @@ class ResponseTarget:
         elif self.n_noise:  # the volume of structural parameters alone is not known
             self._scales = (np.zeros(self.ndim, bool),) * 2
         self.take_logarithms(True)
-        self.archive = Archive()
+        self.archive = Archive(self.statistic, self.measured.shape)
         self._simulated: set[bytes] = set()
         self.differentiable = getattr(self.model, "jacobian", None) is not None
         self.unchecked = [True] if self.differentiable else []
         self.scales = np.nanstd(self.measured, axis=1)
         self.scales[self.scales == 0.0] = 1.0
+        pools = [part.simulator.pool for part, _ in posterior.likelihood.parts()]
+        sizes = [1 if pool is None else getattr(pool, "n_workers", None) or _MANY for pool in pools]
+        self._together = max(most_responses(self.model), *sizes)  # runs whose responses are in memory at once
 
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
@@ -408,6 +378,14 @@ class ResponseTarget:
 
         Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
         """
+        size = self._together
+        parts = [
+            self._run_together(thetas[k : k + size], coords[k : k + size], remember)
+            for k in range(0, max(len(thetas), 1), size)
+        ]
+        return Runs(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def _run_together(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember) -> Runs:
         computed = []
 
         def compute() -> list[np.ndarray]:
@@ -426,15 +404,21 @@ class ResponseTarget:
         if not computed:
             self._likelihood.simulator.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
         failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
-        self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
-        return Runs(residuals.astype(float), statistics, failed)
+        numbers = np.full(len(failed), -1)
+        numbers[~failed] = self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
+        return Runs(numbers, statistics, failed)
 
     def derivatives(self, coords: np.ndarray, remember: Remember = run_at_once) -> np.ndarray:
-        """Derivatives (n, n_structural, n_channels, n_steps) of residuals by coordinates, at (n, n_structural) ones.
+        """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive.
 
         They are the model's own derivatives times those of the parameters by the coordinates; in single precision, as
         residuals.
         """
+        size = max(1, self._together // self.n_structural)
+        parts = (self._derivatives(coords[k : k + size], remember) for k in range(0, len(coords), size))
+        return np.array([self.archive.add_histories(each) for part in parts for each in part])
+
+    def _derivatives(self, coords: np.ndarray, remember: Remember) -> np.ndarray:
         n, d = coords.shape
         thetas = self.structural_parameters(coords)
 
@@ -470,7 +454,7 @@ class ResponseTarget:
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
         parameters = self._noise_parameters(coords) if self.n_noise else coords
-        return self.noise.log_likelihood(statistics, self.n_samples, parameters)
+        return self._log_likelihood(statistics, self.n_samples, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""

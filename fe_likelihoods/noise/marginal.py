@@ -14,7 +14,7 @@ page ``docs/theory/likelihood.rst``.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from .gaussian import GaussianNoise
 from .protocol import Noise, noise_title
 from .sample_counts import SampleCounts, samples_per_channel
 
-__all__ = ["MarginalNoise", "sampled_noise"]
+__all__ = ["MarginalNoise", "log_integral", "sampled_noise"]
 
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _FALL = 36.0  # decrease of the logarithm at which the integrand is negligible in double precision
@@ -100,7 +100,13 @@ class MarginalNoise:
         """No parameters."""
         return ()
 
-    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, parameters: Any = None) -> np.ndarray:
+    def log_likelihood(
+        self,
+        misfit: np.ndarray,
+        n_samples: int | SampleCounts,
+        parameters: Any = None,
+        integral: Callable[[np.ndarray, float, Any], np.ndarray] | None = None,
+    ) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
@@ -112,6 +118,8 @@ class MarginalNoise:
             Samples per channel; `SampleCounts` where samples are missing.
         parameters : optional
             Ignored; the noise has no parameters.
+        integral : callable, optional
+            A faster `log_integral`.
 
         Returns
         -------
@@ -124,7 +132,7 @@ class MarginalNoise:
         usable = np.isfinite(misfit).all(axis=1)
         if usable.any():
             squares, counts, constant = self._sums(misfit[usable], n_samples)
-            terms = [_integral(*one) for one in zip(squares.T, counts, self.priors, strict=True)]
+            terms = [(integral or log_integral)(*one) for one in zip(squares.T, counts, self.priors, strict=True)]
             total[usable] = constant + np.sum(terms, axis=0)
         return total
 
@@ -234,8 +242,8 @@ def _logarithms(prior: Any) -> tuple[float, float]:
     return math.log(max(least, tiny)) + 1e-14, math.log(min(most, 1.0 / tiny)) - 1e-14
 
 
-def _integral(squares: np.ndarray, count: float, prior: Any) -> np.ndarray:
-    """Logarithm of L(J), for sums of squares (n,)."""
+def log_integral(squares: np.ndarray, count: float, prior: Any) -> np.ndarray:
+    """Logarithm of L(J) (n,) for sums of squares (n,) of `count` samples, and the prior of sigma."""
     with np.errstate(divide="ignore"):
         fit = 0.5 * np.log(squares / count)[:, None]
     result = np.full(len(squares), np.inf)

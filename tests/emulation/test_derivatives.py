@@ -183,15 +183,23 @@ PRIORS = {
 }
 
 
+def histories(target, numbers):
+    return np.array([target.archive.residuals(k) for k in numbers.ravel()], float).reshape(
+        *numbers.shape, *target.measured.shape
+    )
+
+
 @pytest.mark.parametrize("values", [None, with_gaps])
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
 def test_derivatives_of_residuals_by_coordinates(prior, values):
     target = ResponseTarget(posterior_of(prior=prior, values=values))
     at, step = np.array([[0.3, -0.7], [1.2, 0.4]]), 2e-3
-    found = target.derivatives(at)
+    found = histories(target, target.derivatives(at))
     assert found.shape == (2, 2, 2, N_STEPS)
     for coords, each in zip(at, found, strict=True):
-        ahead, behind = (target.run(coords + sign * step * np.eye(2)).residuals for sign in (1.0, -1.0))
+        ahead, behind = (
+            histories(target, target.run(coords + sign * step * np.eye(2)).numbers) for sign in (1.0, -1.0)
+        )
         expected = (ahead - behind) / (2.0 * step)
         assert_close(each, expected)
         assert values is None or not each[:, 0, 20:50].any()
@@ -205,9 +213,9 @@ def test_derivatives_at_other_times_than_the_response():
     sigmas = {"sigma_top": HalfNormal(0.01), "sigma_base": HalfNormal(20.0)}
     target = ResponseTarget(Posterior(FELikelihood(model, measured).marginal(sigmas), prior))
     coords, step = np.array([0.3, -0.7]), 2e-3
-    ahead, behind = (target.run(coords + sign * step * np.eye(2)).residuals for sign in (1.0, -1.0))
+    ahead, behind = (histories(target, target.run(coords + sign * step * np.eye(2)).numbers) for sign in (1.0, -1.0))
     expected = (ahead - behind) / (2.0 * step)
-    found = target.derivatives(coords[None])[0]
+    found = histories(target, target.derivatives(coords[None])[0])
     assert found.shape == (2, 2, N_STEPS // 4)
     assert_close(found, expected)
 

@@ -20,7 +20,7 @@ def emulator_of(posterior, n=40, seed=1):
     centre = target.structural_coordinates(AT[None])[0]
     coords = centre + SCALE * np.random.default_rng(seed).standard_normal((n, 2))
     target.run(coords)
-    training = TrainingSet(target.archive.coords, np.array(target.archive.residuals))
+    training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
     statistics = target.archive.statistics
     slopes = target.slopes(statistics[0], target.fit_noise(statistics[0]).coords)
     return target, fit_emulator(target, training, centre, np.diag(SCALE**2), np.array([2e-3, 5.0]), slopes)
@@ -79,7 +79,7 @@ def test_near_a_bound_the_emulator_follows_the_response(prior):
     centre = target.structural_coordinates(np.array([[1.2, 0.05]]))[0]
     covariance = np.diag(np.square([0.01, 0.3]))
     target.run(centre + np.random.default_rng(4).standard_normal((40, 2)) @ np.sqrt(covariance))
-    training = TrainingSet(target.archive.coords, np.array(target.archive.residuals))
+    training = TrainingSet(target.archive.coords, np.arange(len(target.archive)))
     slopes = target.slopes(target.archive.statistics[0], np.zeros(0))
     emulator = fit_emulator(target, training, centre, covariance, np.array([2e-3, 5.0]), slopes)
     coords = target.structural_coordinates(np.array([[1.2, 1e-2], [1.2, 1e-3], [1.203, 1e-6], [1.198, 1e-9]]))

@@ -182,11 +182,11 @@ def test_an_ascent_does_not_join_an_end_of_another_height(value):
     target = ResponseTarget(vibration())
     start, *_ = find_modes(vibration(), starts=1, seed=1).modes
     coords, noise = start.coords[:2], target.fit_noise(np.ones(2))
-    zero, nothing = np.zeros(2), np.zeros((2, 2, 200))
-    known = {7: Ascent(coords + 0.1, nothing[0], zero, noise, 300.0, nothing, zero, zero, np.eye(2))}
+    zero = np.zeros(2)
+    known = {7: Ascent(coords + 0.1, 0, zero, noise, 300.0, zero[:, None], zero, zero, np.eye(2))}
     known[0] = known[7]._replace(value=value)
     climb = _Climb(target, Jacobians(), zero, known, np.inf, 0)
-    climb.here = _Point(coords, nothing[0], zero, noise, value)
+    climb.here = _Point(coords, 0, zero, noise, value)
     search = climb.connected()
     with pytest.raises(StopIteration) as end:
         next(search)

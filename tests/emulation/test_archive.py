@@ -1,0 +1,67 @@
+"""Residuals of runs in a file: forms of combinations, memory, copies."""
+
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.emulation.archive import Archive
+from fe_likelihoods.emulation.quadratic import bilinear_form
+from fe_likelihoods.noise.residuals import lag_one_sums
+from fe_likelihoods.noise.statistics import sums_of_squares
+from fe_likelihoods.priors.distributions import TruncatedNormal
+from samplers import SMCSampler
+from tests.statistics.case import HardPosterior
+
+
+@pytest.mark.parametrize("statistic", [sums_of_squares, lag_one_sums])
+def test_forms_are_those_of_the_combined_histories(statistic):
+    rng = np.random.default_rng(1)
+    archive, shape = Archive(statistic, (3, 40)), (3, 40)
+    residuals = rng.standard_normal((7, *shape)) * np.array([1.0, 1e-3, 1e4])[:, None]
+    first = archive.add(np.zeros((4, 2)), residuals[:4], np.zeros((4, 3)))
+    early = archive.weights([rng.standard_normal(4), 2])
+    assert archive.forms(early).shape[:2] == (2, 2)  # products of some runs are known before others arrive
+    numbers = [*first, *archive.add(np.zeros((3, 2)), residuals[4:], np.zeros((3, 3)))]
+    assert numbers == list(range(7)) and len(archive) == 7
+    weights = archive.weights([*early, rng.standard_normal(7), 6, rng.standard_normal(3)])
+    rounded = residuals.astype(np.float32).astype(float)
+    histories = np.tensordot(weights, rounded, axes=1)
+    np.testing.assert_allclose(archive.combined(weights), histories, rtol=1e-9, atol=1e-9)
+    expected = bilinear_form(statistic, histories)
+    scale = np.sqrt(np.einsum("kka,lla->kla", np.abs(expected), np.abs(expected)))
+    for copy in (archive, pickle.loads(pickle.dumps(archive))):
+        assert (np.abs(copy.forms(weights) - expected) <= 1e-9 * scale).all()
+        assert (np.abs(copy.forms(weights[:2], weights[2:]) - expected[:2, 2:]) <= 1e-9 * scale[:2, 2:]).all()
+        chosen = np.array([5, 0, 3])
+        direct = np.einsum("ict,jct,c->ij", rounded[chosen], rounded[chosen], [1.0, 1e6, 1e-8])
+        np.testing.assert_allclose(copy.products(chosen, np.array([1.0, 1e6, 1e-8])), direct, rtol=1e-9)
+
+
+def _linear(theta):
+    return theta
+
+
+def test_a_run_does_not_hold_its_responses_in_memory():
+    """All responses have 310 MiB; all copies of them had 840."""
+    n_channels, n_steps = 40, 5000
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("a", "b")}
+    size = {"n_steps": n_steps, "n_channels": n_channels}
+    shapes = HardPosterior("linear", prior, _linear, (1.1, 0.9), **size).shapes
+
+    def respond(theta):
+        return np.tensordot(theta, shapes, axes=1)
+
+    posterior = HardPosterior("linear", prior, respond=respond, truth=(1.1, 0.9), **size).posterior(1)
+    posterior.likelihood.simulator.response_memory.max_bytes = 2**24
+    guide, limit = posterior.guide(), 400
+    sampler = SMCSampler(100, 2, posterior, vectorize=True, guide=guide, max_simulations=limit, seed=1)
+    tracemalloc.start()
+    try:
+        sampler.run_mcmc(None, 0)
+        _, largest = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert sampler.verdict.simulations > 150
+    assert largest < 300 * 2**20  # three or four copies of the responses that are simulated together, 64 MiB each
