@@ -1,0 +1,33 @@
+"""Arrays under a key of a record: large ones are in a file only, and are returned as they were."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from samplers.record import Record
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_large_arrays_are_returned_as_they_were(tmp_path, in_file):
+    record = Record(tmp_path / "run.record" if in_file else None)
+    record.open()
+    random = np.random.default_rng(1)
+    given = [[random.standard_normal((n, 3)).astype(np.float32), np.arange(2)] for n in (200_000, 5, 150_000)]
+
+    def asked_from(some, compute):
+        return [some.remember("key", (lambda arrays=arrays: arrays) if compute else pytest.fail) for arrays in given]
+
+    asked_from(record, True)
+    kept = pickle.dumps(record)
+    record.rewind()
+    others = [record, pickle.loads(kept)]
+    others[1].rewind()
+    if in_file:
+        record.close()
+        others.append(Record(tmp_path / "run.record"))
+    for other in others:
+        for arrays, expected in zip(asked_from(other, False), given, strict=True):
+            assert len(arrays) == 2 and all(map(np.array_equal, arrays, expected))
+    held = sum(array.nbytes for each in record._arrays["key"] if isinstance(each, list) for array in each)
+    assert held < 2**10
