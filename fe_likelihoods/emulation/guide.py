@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
+from scipy.linalg import eigh
 
 from .density import EmulatedPosterior, KnownDensity, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
@@ -53,6 +54,8 @@ _NOT_A_MODE = (
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
 _CLEARLY = 0.75  # ratio of such errors at which the emulators take logarithms of the parameters
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
+_WIDER = 4.0  # variance of the draws over the variance at the mode, from which a direction may be a curved ridge
+_SETTLED = 3  # runs at the ends without growth after which a ridge is not followed further
 _REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
 _LONGEST = 4  # such directions at whose ends runs are made
 _MOST_EXTENSIONS, _GROWTH = 12, 0.05  # of an emulator along these, while the log-evidence grows by as much
@@ -60,11 +63,12 @@ _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
 )
-_LATE = 0.2  # growth of the emulated log-evidence after draws were made that is a reason for concern
+_LATE = 0.1  # growth of the emulated log-evidence after draws were made that is a reason for concern
 _GREW = (
-    "the draws of the first rounds did not reach along a direction that the data leave to the prior, so the evidence "
+    "the emulated posterior grew after draws were made, so these did not reach all of the posterior, and the evidence "
     "may be too small"
 )
+_FEW_ENDED = 0.5  # share of the starts below which their ends say little
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
@@ -249,7 +253,7 @@ class ResponseGuide:
         self._emulate(session.random)
         if earlier is None or self._emulated is None:
             return
-        if self._emulated.log_evidence > earlier.log_evidence + _LATE and len(self._free_directions()[0]):
+        if self._emulated.log_evidence > earlier.log_evidence + _LATE:
             self._add_concern(_GREW)
             yield from self._follow_ridges(session)
 
@@ -300,12 +304,12 @@ class ResponseGuide:
 
     def _follow_ridges(self, session: Any) -> Iterator[None]:
         """Simulate at the ends of directions that the data leave to the prior, while the emulated evidence grows."""
-        largest, settled = -np.inf, 0  # twice, because the first runs at the ends of a new stretch may add nothing
+        largest, settled = -np.inf, 0  # three times, because the first runs at the ends of a stretch may add nothing
         while self._emulated is not None and self._extensions < _MOST_EXTENSIONS:
             free, _ = self._free_directions()
             grown = self._emulated.log_evidence > largest + _GROWTH
             settled = 0 if grown else settled + 1
-            if settled == 2 or not len(free):
+            if settled == _SETTLED or not len(free):
                 break
             largest = max(largest, self._emulated.log_evidence)
             points = self._emulated.extremes(free[:_LONGEST])[:, : self._target.n_structural]
@@ -318,13 +322,21 @@ class ResponseGuide:
             yield
             self._emulate(session.random)
         self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
-        if np.any(self._free_directions()[1] < _REACHED):
+        reached = self._free_directions()[1]
+        if np.any(reached < _REACHED):
             self._add_concern(_SHORT_OF_THE_RIDGE)
+        ended = sum(end >= 0 for end in self.search.ends)
+        if len(reached) and ended < _FEW_ENDED * len(self.search.ends):
+            self._add_concern(
+                f"only {ended} of {len(self.search.ends)} starts led to a mode, the others were given up far below it, "
+                "and the data leave a direction to the prior, or the posterior is curved: parts of it may be missing"
+            )
 
     def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
         """Directions (n, ndim) that the data leave to the prior, the longest first, and how far the draws reach along.
 
-        The reach (n,) is the variance of the draws as a share of the variance at the mode.
+        The reach (n,) is the variance of the draws as a share of the variance at the mode. Along a curved ridge, the
+        Laplace approximation can be narrow; directions in which the draws are much wider count as well.
         """
         directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
         if self._emulated is not None:
@@ -335,6 +347,11 @@ class ResponseGuide:
                 free, allowed = vectors[:, values > _FREE].T[::-1], values[values > _FREE][::-1]
                 directions.append(free)
                 reached.append(((free @ spread) * free).sum(axis=1) / allowed)
+            for region, mode in zip(self._regions, self._modes, strict=True):
+                ratios, vectors = eigh(region.covariance, mode.covariance)
+                wider = vectors[:, ratios > _WIDER].T[::-1]
+                directions.append(wider / np.linalg.norm(wider, axis=1, keepdims=True))
+                reached.append(np.ones(len(wider)))
         return np.concatenate(directions), np.concatenate(reached)
 
     def _check_memory(self) -> None:

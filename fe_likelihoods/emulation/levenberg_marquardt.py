@@ -52,7 +52,7 @@ _CHECKED_CHANGES = 3e-3, 3e-4  # of the response by a step, relative, where the 
 _CHECKED_ERROR = 0.05
 _RETRIES = -1.0, 0.3, -0.3, 0.05  # steps tried where the simulation of a difference fails, as multiples
 _NEAREST_RUNS = 3.0, 10.0  # runs that secants are fitted to: per dimension, and in addition
-_TOO_CLOSE = 1e-12  # squared distance of runs that tell nothing about derivatives
+_TOO_CLOSE = 1e-8  # squared distance of runs that tell nothing about derivatives: residuals have seven digits
 TOLERANCE = 0.5  # log-density still to gain, according to the quadratic approximation
 _MAX_ITERATIONS = 40
 _PATIENCE = 4  # iterations after which an ascent that is far below a known end and slow is given up
@@ -328,7 +328,7 @@ class _Climb:
         weights = self._target.slopes(here.statistics, here.noise.coords)
         forms = self._target.archive.forms(self._target.archive.weights([*slopes, here.run]))
         gradient = 2.0 * forms[:-1, -1] @ weights - (here.coords - self._centre)
-        hessian = -2.0 * forms[:-1, :-1] @ weights + np.eye(len(slopes))
+        hessian = _at_least_one(-2.0 * forms[:-1, :-1] @ weights + np.eye(len(slopes)))
         self._known[self._number] = Ascent(*here, slopes, weights, gradient, hessian)
         return self._known[self._number]
 
@@ -524,6 +524,12 @@ def axes_of(end: Ascent, free: float = 1.0) -> np.ndarray:
 def _differences(runs: np.ndarray, run: int, n: int) -> np.ndarray:
     """Differences of the residuals of runs (m,) from a run, as weights (m, n) of the first n histories."""
     return np.eye(n)[runs] - np.eye(n)[run]
+
+
+def _at_least_one(hessian: np.ndarray) -> np.ndarray:
+    """A Hessian whose eigenvalues are not below those of the prior, which rounding can make them."""
+    values, vectors = np.linalg.eigh(hessian)
+    return hessian if values[0] >= 1.0 else (vectors * np.maximum(values, 1.0)) @ vectors.T
 
 
 def _squared_distance(coords: np.ndarray, end: Ascent) -> float:

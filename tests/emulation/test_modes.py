@@ -1,11 +1,13 @@
 """Modes: against a general optimiser, for every noise; two modes; failures; budgets; growing records."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, problems
-from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _Climb, _Point, _valley
+from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _at_least_one, _Climb, _Point, _valley
 from fe_likelihoods.emulation.modes import UNSEEN, find_modes, unseen_share
 from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning, SMCSampler
@@ -102,6 +104,33 @@ def test_a_result_with_many_modes_of_one_start_is_refused():
     assert sampler.verdict.status == "not usable"
     assert "8 starts led to" in str(sampler.verdict) and "were not found" in str(sampler.verdict)
     assert unseen_share(sampler.guide.search) > 0.3
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
+    """Only a^2 + b^2 is identified: the posterior is a ring, and the Laplace approximation at one point is short."""
+    time, channels = 0.02 * np.arange(200), [Channel("top", "displacement", "m")]
+
+    def respond(theta):
+        return np.cos(2.0 * np.pi * np.sqrt(1.0 + np.square(theta).sum()) * time)[None]
+
+    model = FunctionModel(respond, ("a", "b"), channels, 0.02, 200, version="ring")
+    noise = 0.02 * np.random.default_rng(5).standard_normal((1, 200))
+    measured = Measurements(channels, 0.02, model.simulate(np.array([0.8, 0.6])) + noise)
+    prior = {"a": Uniform(-2.0, 2.0), "b": Uniform(-2.0, 2.0), "sigma_top": Uniform(0.005, 0.5)}
+    posterior = Posterior(FELikelihood(model, measured), prior)
+    sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=seed, guide=posterior.guide(), max_simulations=600)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SamplingWarning)
+        sampler.run_mcmc(None, 1)
+    whole = np.allclose(sampler.get_chain(flat=True)[:, :2].std(axis=0), np.sqrt(0.5), rtol=0.2)
+    assert whole or sampler.verdict.status != "converged"
+
+
+def test_a_hessian_is_not_below_the_curvature_of_the_prior():
+    rounded = np.array([[2.0, 3.0], [3.0, 2.0]])  # eigenvalues -1 and 5
+    assert np.linalg.eigvalsh(_at_least_one(rounded)) == pytest.approx([1.0, 5.0])
+    assert _at_least_one(4.0 * np.eye(2)) == pytest.approx(4.0 * np.eye(2))
 
 
 def test_a_failing_start_leads_nowhere_and_failing_steps_are_shortened():
