@@ -54,6 +54,8 @@ _NOT_A_MODE = (
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
 _CLEARLY = 0.75  # ratio of such errors at which the emulators take logarithms of the parameters
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
+_SINGLE = 0.95  # share of one parameter in a direction from which it is not a combination
+_SMOOTH = 0.5  # mean error of the emulated log-likelihood, below which a response is smooth
 _WIDER = 4.0  # variance of the draws over the variance at the mode, from which a direction may be a curved ridge
 _SETTLED = 3  # runs at the ends without growth after which a ridge is not followed further
 _REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
@@ -253,7 +255,8 @@ class ResponseGuide:
         self._emulate(session.random)
         if earlier is None or self._emulated is None:
             return
-        if self._emulated.log_evidence > earlier.log_evidence + _LATE:
+        # the evidence of an emulator of a rough response changes by about its error from fit to fit
+        if self._emulated.log_evidence > earlier.log_evidence + _LATE + self._left_out_error():
             self._add_concern(_GREW)
             yield from self._follow_ridges(session)
 
@@ -333,26 +336,31 @@ class ResponseGuide:
             )
 
     def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions (n, ndim) that the data leave to the prior, the longest first, and how far the draws reach along.
+        """Combinations (n, ndim) of parameters that the data leave to the prior, and how far the draws reach along.
 
-        The reach (n,) is the variance of the draws as a share of the variance at the mode. Along a curved ridge, the
-        Laplace approximation can be narrow; directions in which the draws are much wider count as well.
+        The longest are first. The reach (n,) is the variance of the draws as a share of the variance at the mode. Along
+        a curved ridge, the Laplace approximation can be narrow; directions in which the draws are much wider count as
+        well. A single parameter that the data leave to the prior is no ridge: the design at the mode reaches along it.
         """
         directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
         if self._emulated is not None:
             spread = self._emulated.covariance()
-            # the draws themselves as well: differences of a rough response make a mode too narrow
+            # the draws themselves as well, because a mode can be too narrow
             for covariance in (spread, *(mode.covariance for mode in self._modes)):
                 values, vectors = np.linalg.eigh(covariance)
                 free, allowed = vectors[:, values > _FREE].T[::-1], values[values > _FREE][::-1]
                 directions.append(free)
                 reached.append(((free @ spread) * free).sum(axis=1) / allowed)
-            for region, mode in zip(self._regions, self._modes, strict=True):
+            # differences of a rough response make the mode too narrow, which is no curved ridge
+            smooth = self._left_out_error() < _SMOOTH
+            for region, mode in zip(self._regions, self._modes, strict=True) if smooth else ():
                 ratios, vectors = eigh(region.covariance, mode.covariance)
                 wider = vectors[:, ratios > _WIDER].T[::-1]
                 directions.append(wider / np.linalg.norm(wider, axis=1, keepdims=True))
                 reached.append(np.ones(len(wider)))
-        return np.concatenate(directions), np.concatenate(reached)
+        found, reach = np.concatenate(directions), np.concatenate(reached)
+        combined = np.square(found).max(axis=1, initial=0.0) < _SINGLE
+        return found[combined], reach[combined]
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
