@@ -92,6 +92,13 @@ def _normalised(log_weights: np.ndarray) -> np.ndarray:
     return weights / weights.sum()
 
 
+def _moments(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (d,) and covariance (d, d) of points (n, d) with normalised weights."""
+    mean = weights @ coords
+    apart = coords - mean
+    return mean, (apart * weights[:, None]).T @ apart
+
+
 def _log_mean(log_weights: np.ndarray) -> float:
     top = log_weights.max()
     return float(top + np.log(np.exp(log_weights - top).mean()))
@@ -180,10 +187,10 @@ class EmulatedPosterior:
         slopes = np.maximum((high - low) / (2.0 * sd), _SMALLEST_SLOPE)
         return region._replace(centre=at, covariance=region.covariance * np.outer(slopes, slopes))
 
+    @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (ndim, ndim) of the coordinates."""
-        apart = self._pool - self._weights @ self._pool
-        return (apart * self._weights[:, None]).T @ apart
+        return _moments(self._pool, self._weights)[1]
 
     def extremes(self, directions: np.ndarray) -> np.ndarray:
         """Points (2 n, ndim) of the pool at the 1 and 99 % quantiles along directions (n, ndim)."""
@@ -211,10 +218,7 @@ class EmulatedPosterior:
         """Weighted mean and covariance, or None with too few effective points."""
         if effective_sample_size(log_weights) < _ENOUGH_PER_DIMENSION * coords.shape[1]:
             return None
-        weights = _normalised(log_weights)
-        mean = weights @ coords
-        apart = coords - mean
-        covariance = (apart * weights[:, None]).T @ apart
+        mean, covariance = _moments(coords, _normalised(log_weights))
         return mean, covariance + _RIDGE * np.diag(np.diag(covariance))
 
     def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> StudentMixture:

@@ -344,7 +344,7 @@ class ResponseGuide:
         """
         directions, reached = [np.empty((0, self._target.ndim))], [np.empty(0)]
         if self._emulated is not None:
-            spread = self._emulated.covariance()
+            spread = self._emulated.covariance
             # the draws themselves as well, because a mode can be too narrow
             for covariance in (spread, *(mode.covariance for mode in self._modes)):
                 values, vectors = np.linalg.eigh(covariance)

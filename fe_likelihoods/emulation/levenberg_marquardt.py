@@ -407,8 +407,7 @@ class _Climb:
         for number, end in list(self._known.items()):
             if number == self._number:
                 continue
-            ahead = end.value - here.value
-            if not -_NEAR <= ahead <= _NEAR or np.abs(end.coords - here.coords).max() >= self._apart:
+            if abs(end.value - here.value) > _NEAR or np.abs(end.coords - here.coords).max() >= self._apart:
                 continue
             points = self._target.line(here.coords, end.coords, _ALONG)
             runs = yield points

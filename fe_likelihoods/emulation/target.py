@@ -304,10 +304,7 @@ class ResponseTarget:
     def take_logarithms(self, taken: bool) -> None:
         """Let scaled parameters be logarithms where the prior keeps parameters away from zero, or only where it is
         lognormal."""
-        factors = self._scales[int(taken)].copy()
-        self._logarithmic = list(factors[: self.n_structural])
-        factors[self.n_structural :] = False
-        self._factors = list(factors)
+        self._logarithmic = np.flatnonzero(self._scales[int(taken)][: self.n_structural])
 
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
         """Structural parameters (n, n_structural), or their logarithms where the prior keeps them away from zero.
@@ -323,9 +320,12 @@ class ResponseTarget:
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) at shares (n,) of the way from one point to another, in scaled parameters."""
         ends = self.scaled_parameters(np.stack([first, last]))
-        points = ends[0] + shares[:, None] * (ends[1] - ends[0])
-        points[:, self._logarithmic] = np.exp(points[:, self._logarithmic])
-        return self.structural_coordinates(points)
+        return self._from_scaled(ends[0] + shares[:, None] * (ends[1] - ends[0]))
+
+    def _from_scaled(self, scaled: np.ndarray) -> np.ndarray:
+        """Coordinates (n, n_structural) of scaled parameters (n, n_structural), which are overwritten."""
+        scaled[:, self._logarithmic] = np.exp(scaled[:, self._logarithmic])
+        return self.structural_coordinates(scaled)
 
     def moved(self, coords: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) after steps (n, n_structural) that are straight in scaled parameters.
@@ -334,9 +334,8 @@ class ResponseTarget:
         of its step than 0.3 to 3, as at a bound of the prior, the step is straight in the coordinates.
         """
         here = self.scaled_parameters(coords[None])
-        ends = here + (self.scaled_parameters(coords + _SMALL_STEP * steps) - here) / _SMALL_STEP
-        ends[:, self._logarithmic] = np.exp(ends[:, self._logarithmic])
-        reached = self.structural_coordinates(ends)
+        slopes = (self.scaled_parameters(coords + _SMALL_STEP * steps) - here) / _SMALL_STEP
+        reached = self._from_scaled(here + slopes)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = (reached - coords) / steps
         return np.where((ratio > 0.3) & (ratio < 3.0), reached, coords + steps)
@@ -353,10 +352,10 @@ class ResponseTarget:
         d = self.n_structural
         full = np.repeat(self._median[None], len(scaled), axis=0)
         full[:, :d] = scaled[:, :d]
-        full[:, self._factors] = np.exp(np.clip(full[:, self._factors], *_LOG_LIMITS))
+        full[:, self._logarithmic] = np.exp(np.clip(full[:, self._logarithmic], *_LOG_LIMITS))
         coords, log_volume = self._to_coordinates(full)
         coords[:, d:] = scaled[:, d:]
-        return coords, log_volume + np.log(full[:, self._factors]).sum(axis=1) - self._median_volume
+        return coords, log_volume + np.log(full[:, self._logarithmic]).sum(axis=1) - self._median_volume
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""
