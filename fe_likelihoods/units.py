@@ -52,6 +52,7 @@ _FACTORS = {
         "ft/s2": FOOT,
         "gal": 1e-2,
         "g": G0,
+        "mg": 1e-3 * G0,
     },
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "in/s": INCH, "ft/s": FOOT},
     "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": INCH, "ft": FOOT},
@@ -77,7 +78,7 @@ _FACTORS = {
     "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/km": 1e-3, "1/in": 1.0 / INCH, "1/ft": 1.0 / FOOT},
     "strain": {"1": 1.0, "%": 1e-2, "microstrain": 1e-6},
     "rotation": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
-    "time": {"s": 1.0, "ms": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
 }
 
 UNITS: dict[str, Unit] = {
@@ -98,10 +99,10 @@ _MICROSTRAIN = {"ue", *(f"{mu}{each}" for mu in _MICRO for each in ("\N{GREEK SM
 def find_unit(name: str, dimension: str | None = None) -> Unit:
     """Return the unit with a name.
 
-    The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
-    ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
-    ``microstrain``. Letter case is ignored, because file headers are often in capitals, except for the prefix of ``MN``
-    and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
+    The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are
+    all ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
+    ``microstrain``, ``mg`` a thousandth of g. Letter case is ignored, because file headers are often in capitals,
+    except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
 
     Parameters
     ----------
@@ -191,7 +192,8 @@ def _lookup(name: str) -> Unit | None:
     if text.lower() in _MICROSTRAIN:
         return UNITS["microstrain"]
     text = re.sub(r"(?<=[A-Za-z])[-*·.](?=[A-Za-z])", "", text)
-    text = re.sub(r"milli(?=sec)", "m", text, flags=re.IGNORECASE)
+    for prefix, letter in (("milli", "m"), ("micro", "u"), (f"[{_MICRO}]", "u")):
+        text = re.sub(rf"{prefix}(?=s(ec|$))", letter, text, flags=re.IGNORECASE)
     text = re.sub(r"sec(onds?|s)?(?![a-z])", "s", text, flags=re.IGNORECASE)
     text = text.replace("**", "").replace("^", "").replace("²", "2")
     product = _BY_LOWER_CASE.get(text.replace("_", "").lower())

@@ -27,11 +27,11 @@ BUNDLED = {
 _FORMATS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
     "at2": (read_at2, ("units",)),
     "v2": (read_v2, ("channel",)),
-    "smc": (read_smc, ()),
+    "smc": (read_smc, ("resample",)),
     "geonet": (read_geonet, ("column",)),
     "knet": (read_knet, ()),
     "esm": (read_esm, ()),
-    "csv": (read_csv, ("units", "dt", "column", "time_unit", "skip")),
+    "csv": (read_csv, ("units", "dt", "column", "time_unit", "skip", "resample")),
     "dataset": (read_dataset, ()),
 }
 _TABLE_KEYS = ("dt", "time_unit", "skip")
@@ -93,11 +93,13 @@ def _read_record(job: Job, path: Path) -> Record:
         name = "csv"
     if name is None:
         channel = given.get("channel", given.get("column"))
-        return read_record(path, channel, given.get("units"))
+        return read_record(path, channel, given.get("units"), resample=given.get("resample"))
     if name not in _FORMATS:
         raise ValueError(f"format: unknown format {name!r}; {did_you_mean(name, tuple(_FORMATS))}")
     reader, names = _FORMATS[name]
-    options = {key: given[key] for key in (*names, "channel", "column", "units", *_TABLE_KEYS) if key in given}
+    options = {
+        key: given[key] for key in (*names, "channel", "column", "units", "resample", *_TABLE_KEYS) if key in given
+    }
     if unused := sorted(set(options) - set(names)):
         raise ValueError(f"{unused[0]}: a file of format {name} has no such choice; leave it out")
     if name == "geonet" and "column" in options:
@@ -154,7 +156,7 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
             f"{', '.join(missing)}"
         )
-    options = {key: given[key] for key in ("dt", "time_unit", "skip", "zero", "missing") if key in given}
+    options = {key: given[key] for key in ("dt", "time_unit", "skip", "zero", "missing", "resample") if key in given}
     return read_columns(
         path,
         [by_name[name] for name in chosen],

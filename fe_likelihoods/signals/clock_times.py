@@ -1,4 +1,7 @@
-"""Clock times in tables, ``03:19:53.010``, ``2019-07-06T03:19:53.010Z`` or ``2019-07-06 03:19:53``, and dates."""
+"""Clock times in tables, ``03:19:53.010``, ``2019-07-06T03:19:53.010Z`` or ``06.07.2019 03:19:53``, and dates.
+
+The year is first, or last after points. Dates with slashes and the year last may begin with the day or the month.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,10 @@ from typing import NamedTuple
 
 __all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_midnight"]
 
-_DATE = r"(\d{4})-(\d{2})-(\d{2})"
+_DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\d{1,4})"
 _TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
 _CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?([AP]M|Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
-_DAY_ONLY = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}")
+_DAY_ONLY = re.compile(_DATE)
 _HOUR, _DAY = 3600, 86400
 
 
@@ -57,17 +60,28 @@ def parse_clock(cell: str, where: str) -> ClockTime:
         raise ValueError(
             f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}: write it without AM and PM"
         )
-    year, month, day, hour, minute, second, fraction, zone = found.groups()
+    *_, hour, minute, second, fraction, zone = found.groups()
     if int(hour) > 24:
         raise ValueError(f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}")
-    number = None
-    if year is not None:
-        try:
-            number = datetime.date(int(year), int(month), int(day)).toordinal()
-        except ValueError as error:
-            raise ValueError(f"{where}: expected a date, got {cell[:100]!r} ({error})") from None
+    number = None if found["first"] is None else _day_number(found, where)
     whole = 3600 * int(hour) + 60 * int(minute) + int(second)
     return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""), _minutes(zone))
+
+
+def _day_number(found: re.Match[str], where: str) -> int:
+    """Number of the day in a date with the year first, or last after points."""
+    year, day = found["first"], found["last"]
+    if len(year) != 4:
+        if found["mark"] != "." or len(day) != 4:
+            raise ValueError(
+                f"{where}: expected a date such as 2019-07-06 or 06.07.2019, got {found[0][:100]!r}, which may begin "
+                "with the day or the month; write the year first"
+            )
+        year, day = day, year
+    try:
+        return datetime.date(int(year), int(found["month"]), int(day)).toordinal()
+    except ValueError as error:
+        raise ValueError(f"{where}: expected a date, got {found[0][:100]!r} ({error})") from None
 
 
 def _minutes(zone: str | None) -> int | None:

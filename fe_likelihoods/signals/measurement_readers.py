@@ -1,7 +1,7 @@
 """Readers of measured responses in CSV files and Excel workbooks: histories, and tests with an imposed displacement.
 
 They convert to SI units. Units and time step come from the file or the arguments; ValueError is raised if neither
-states them or if they disagree (`fe_likelihoods.signals.tables`).
+states them or if they disagree (`fe_likelihoods.signals.table_times`).
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
-from . import tables
 from .channels import Channel, Measurements
 from .readers import named_format
 from .records import DisplacementHistory
+from .table_columns import column_values, value_column, warn_if_absent
+from .table_times import row_times, table_start, table_step
+from .tables import Table, read_table, stated_unit
 from .text_files import agree_on_unit
+from .uneven_times import uniform_times
 
 __all__ = ["ImposedTest", "read_columns", "read_imposed_test"]
 
@@ -48,6 +51,7 @@ def read_columns(
     skip: int | None = None,
     zero: float | str = 0.0,
     missing: Sequence[float] | None = None,
+    resample: float | None = None,
 ) -> Measurements:
     """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
 
@@ -81,6 +85,9 @@ def read_columns(
         If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless further numbers lie within 1 % of them; -999,
         99999, -99999, 32767 and -32768 unless a further number has half their size. ``()`` takes all numbers as
         measured.
+    resample : float, optional
+        Nominal step of uneven times [s], to which the samples are interpolated linearly, with NaN in gaps.
+        The description of the measurements says what was done.
 
     Returns
     -------
@@ -95,11 +102,16 @@ def read_columns(
         or a cell is not a finite number.
     """
     with named_format(path, "read_columns"):
-        table = tables.read_table(path, skip, time_unit)
+        table = read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units, missing)
-    tables.warn_if_absent(table, [tables.value_column(table, column) for column in columns], missing, stacklevel=2)
-    step = tables.table_step(table, dt)
-    return Measurements(tuple(channels), step, values, description, tables.table_start(table, step, zero))
+    warn_if_absent(table, [value_column(table, column) for column in columns], missing, stacklevel=2)
+    if resample is None:
+        step = table_step(table, dt)
+    else:
+        even, step = uniform_times(row_times(table, dt), resample, table.file), resample
+        values = np.array([even.interpolate(row) for row in values])
+        description = ", ".join(filter(None, (description, even.note)))
+    return Measurements(tuple(channels), step, values, description, table_start(table, step, zero))
 
 
 def read_imposed_test(
@@ -147,18 +159,18 @@ def read_imposed_test(
     ValueError
         As `read_columns`, except for times, which the test does not have.
     """
-    table = tables.read_table(path, skip)
+    table = read_table(path, skip)
     imposed = Channel(displacement, "displacement", displacement_unit or "m")
     (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
     values = _channel_values(table, channels, columns, units, missing)
-    places = [tables.value_column(table, column) for column in (displacement, *columns)]
-    tables.warn_if_absent(table, places, missing, stacklevel=2)
+    places = [value_column(table, column) for column in (displacement, *columns)]
+    warn_if_absent(table, places, missing, stacklevel=2)
     measurements = Measurements(tuple(channels), 1.0, values, description)
     return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
 
 
 def _channel_values(
-    table: tables.Table,
+    table: Table,
     channels: Sequence[Channel],
     columns: Sequence[str],
     units: str | Sequence[str] | None,
@@ -173,8 +185,8 @@ def _channel_values(
         )
     rows = []
     for channel, column, unit in zip(channels, columns, given, strict=True):
-        place = tables.value_column(table, column)
+        place = value_column(table, column)
         where = f"{table.file}, column {column!r}"
-        unit = agree_on_unit(tables.stated_unit(table, place, channel.dimension), unit, channel.dimension, where)
-        rows.append(to_si(tables.column_values(table, place, missing), unit))
+        unit = agree_on_unit(stated_unit(table, place, channel.dimension), unit, channel.dimension, where)
+        rows.append(to_si(column_values(table, place, missing), unit))
     return np.array(rows)

@@ -12,14 +12,19 @@ ValueError if neither states them or if they disagree. The formats themselves ar
 import contextlib
 import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..units import to_si
-from . import at2_v2_formats, smc_geonet_knet_esm_formats, tables
+from . import at2_v2_formats, smc_geonet_knet_esm_formats
 from .records import Record
+from .table_columns import csv_series
+from .tables import read_table
 from .text_files import Series, agree_on_unit, read_bytes, read_text
+from .uneven_times import uniform_times
 
 __all__ = [
     "named_format",
@@ -63,13 +68,15 @@ def read_at2(path: str | Path, units: str | None = None) -> Record:
     return _record(series, units, path, Path(path).stem)
 
 
-def read_smc(path: str | Path) -> Record:
-    """Read a ground motion from a USGS SMC file: uncorrected or corrected acceleration at a constant step.
+def read_smc(path: str | Path, resample: float | None = None) -> Record:
+    """Read a ground motion from a USGS SMC file: uncorrected or corrected acceleration.
 
     Parameters
     ----------
     path : str or path
         The file.
+    resample : float, optional
+        Nominal step of a file with uneven times, as in `read_csv`.
 
     Returns
     -------
@@ -84,7 +91,7 @@ def read_smc(path: str | Path) -> Record:
     """
     with named_format(path, "read_smc"):
         series = smc_geonet_knet_esm_formats.parse_smc(read_text(path), str(path))
-    return _record(series, None, path, Path(path).stem)
+    return _record(series, None, path, Path(path).stem, resample)
 
 
 def read_geonet(path: str | Path, component: str | None = None) -> Record:
@@ -173,6 +180,7 @@ def read_record(
     units: str | None = None,
     missing: Sequence[float] | None = None,
     member: str | None = None,
+    resample: float | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -188,6 +196,8 @@ def read_record(
         For a CSV file: numbers that stand for missing samples, as in `read_csv`.
     member : str, optional
         For a zip archive of V2 files: name of the file in the archive, if several have the channel.
+    resample : float, optional
+        For a CSV or SMC file with uneven times: their nominal step [s], as in `read_csv`.
 
     Returns
     -------
@@ -201,17 +211,30 @@ def read_record(
     """
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
-        return read_v2(path, channel, member)
+        return _uniform(read_v2(path, channel, member), path, resample)
     name, reader = smc_geonet_knet_esm_formats.recognise(content.decode("latin-1"))
     if name and reader is None:
         raise ValueError(f"{path}: {_looks_like(name, None)}")
-    if reader == "read_at2":
-        return read_at2(path, units)
-    if reader in ("read_v2", "read_geonet"):
-        return {"read_v2": read_v2, "read_geonet": read_geonet}[reader](path, channel)
+    if reader == "read_smc":
+        return read_smc(path, resample)
     if reader is not None:
-        return {"read_smc": read_smc, "read_knet": read_knet, "read_esm": read_esm}[reader](path)
-    return _read_csv(path, units, column=channel, missing=missing)
+        return _uniform(_READERS[reader](path, channel, units), path, resample)
+    return _read_csv(path, units, column=channel, missing=missing, resample=resample)
+
+
+_READERS: dict[str, Callable[..., Record]] = {
+    "read_at2": lambda path, channel, units: read_at2(path, units),
+    "read_v2": lambda path, channel, units: read_v2(path, channel),
+    "read_geonet": lambda path, channel, units: read_geonet(path, channel),
+    "read_knet": lambda path, channel, units: read_knet(path),
+    "read_esm": lambda path, channel, units: read_esm(path),
+}
+
+
+def _uniform(record: Record, path: str | Path, resample: float | None) -> Record:
+    if resample is not None:
+        raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
+    return record
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
@@ -265,6 +288,7 @@ def read_csv(
     time_unit: str | None = None,
     skip: int | None = None,
     missing: Sequence[float] | None = None,
+    resample: float | None = None,
 ) -> Record:
     """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``, or from an Excel workbook.
 
@@ -297,6 +321,9 @@ def read_csv(
         the numbers that the column does not have. If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless
         further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further number has half
         their size. ``()`` takes all numbers as measured.
+    resample : float, optional
+        Nominal step of uneven times [s], to which the samples are interpolated linearly. The source of the record says
+        what was done, and a warning names gaps, which are filled by straight lines.
 
     Returns
     -------
@@ -309,7 +336,7 @@ def read_csv(
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
         number or is empty, or a time step is irregular (the message names the first one).
     """
-    return _read_csv(path, units, dt, column, time_unit, skip, missing)
+    return _read_csv(path, units, dt, column, time_unit, skip, missing, resample)
 
 
 def _read_csv(
@@ -320,11 +347,12 @@ def _read_csv(
     time_unit: str | None = None,
     skip: int | None = None,
     missing: Sequence[float] | None = None,
+    resample: float | None = None,
 ) -> Record:
     """`read_csv`, at the call depth below a public reader that its warnings expect."""
     with named_format(path, "read_csv"):
-        series = tables.csv_series(tables.read_table(path, skip, time_unit), column, dt, missing)
-    return _record(series, units, path, Path(path).stem)
+        series = csv_series(read_table(path, skip, time_unit), column, dt, missing, resample is not None)
+    return _record(series, units, path, Path(path).stem, resample)
 
 
 @contextlib.contextmanager
@@ -348,8 +376,16 @@ def _looks_like(name: str, reader: str | None) -> str:
     return f"this looks like {article} {name} file{advice}"
 
 
-def _record(series: Series, units: str | None, file: str | Path, name: str) -> Record:
+def _record(series: Series, units: str | None, file: str | Path, name: str, resample: float | None = None) -> Record:
     unit = agree_on_unit(series.unit, units, "acceleration", file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
-    source = Path(file).name + (f": {series.title}" if series.title else "")
-    return Record(name, series.dt, to_si(series.values, unit, "acceleration"), source)
+    source, dt, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
+    if series.times is not None:
+        if resample is None:
+            step = float(np.median(np.diff(series.times)))
+            raise ValueError(f"{file}: the samples are at uneven times; give their nominal step, resample={step:.3g}")
+        even = uniform_times(series.times, resample, str(file))
+        source, dt, values = f"{source}; {even.note}", resample, even.straight(values, str(file), stacklevel=4)
+    elif resample is not None:
+        raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
+    return Record(name, dt, to_si(values, unit, "acceleration"), source)

@@ -6,8 +6,9 @@ so that a file with another layout is refused instead of misread.
 
 USGS SMC
     11 lines of text, 48 integers in columns of 10, 50 reals in columns of 15, comment lines with ``|``, samples in
-    columns of 10 [cm/s²]. Format description: U.S. Geological Survey, National Strong-Motion Program, "SMC-format data
-    files", ``smcfmt.html``.
+    columns of 10 [cm/s²]; times [s] alternate with samples where the number of samples per second is missing.
+    Format description: U.S. Geological Survey, National Strong-Motion Program, "SMC-format data files",
+    ``smcfmt.html``.
 GeoNet V1A, V2A
     Per component 16 lines of text, 40 integers and 60 reals in columns of 8, then accelerations [mm/s²], and in V2A
     velocities and displacements, in columns of 8. Format description: W. J. Cousins (2008), "GNS accelerogram data
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..units import from_si, to_si
 from .clock_times import is_clock
-from .text_files import NUMBER, Series, agree_on_unit, check_count, is_number, parse_count, parse_number
+from .text_files import NUMBER, Series, agree_on_unit, check_count, decimals_of, is_number, parse_count, parse_number
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
@@ -145,20 +146,23 @@ def parse_smc(text: str, file: str) -> Series:
     reals = _numbers(lines, first_real, *_SMC_REALS, file)
     comments, count = (_whole(integers[place], file, what) for place, what in ((15, "comment lines"), (16, "samples")))
     rate, highest, lowest = reals[1], reals[29], reals[31]
-    if not 0.0 < rate < _SMC_NULL:
+    uneven = rate >= _SMC_NULL  # pairs of time and acceleration
+    if not rate > 0.0 or (uneven and count % 2):
         raise ValueError(
-            f"{file}: expected the number of samples per second as the second real, got {rate:g}; a file with samples "
-            "at uneven times is not read"
+            f"{file}: expected a positive number of samples per second as the second real, or none for an even number "
+            f"of times and accelerations, got {rate:g} and {count} numbers"
         )
     start = first_real + _SMC_REALS[0] // _SMC_REALS[1] + comments
     if not all(line.startswith("|") for line in lines[start - comments : start]):
         raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
-    values = _samples(lines, start, count, _SMC_DATA, file)
+    values, times = _samples(lines, start, count, _SMC_DATA, file), None
+    if uneven:
+        times, values = values[::2], values[1::2]
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
             _check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
     station = next((line.strip() for line in lines[2:_SMC_TEXT] if line.startswith("station")), title)
-    return Series(re.sub(r"\s+", " ", station), 1.0 / rate, "cm/s2", values)
+    return Series(re.sub(r"\s+", " ", station), math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 
 
 def parse_geonet(text: str, file: str) -> list[GeonetComponent]:
@@ -199,9 +203,11 @@ def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetCo
             f"{where}: the step is {step[1]} s in the text but {dt:g} s in the header; the file is damaged"
         )
     unit = _GEONET_UNIT.search(head)
-    values = _samples(lines, first, counts[0], _GEONET_DATA, file) * (float(unit[1]) if unit else 1.0)
-    largest = float(values[np.argmax(np.abs(values))])
-    _check_peak(abs(largest), abs(float(peak[1])), 0.101, where)
+    scale = float(unit[1]) if unit else 1.0
+    values = scale * _samples(lines, first, counts[0], _GEONET_DATA, file)
+    # both numbers are rounded to the digits that are printed
+    rounding = scale * 10.0 ** -decimals_of(lines[first][: _GEONET_DATA[1]].strip()) + 10.0 ** -decimals_of(peak[1])
+    _check_peak(float(np.abs(values).max()), abs(float(peak[1])), 0.505 * rounding, where)
     end = first + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
     if end > len(lines):
         raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")

@@ -1,7 +1,8 @@
 """Rows of cells in CSV files, as loggers and spreadsheets write them, and in Excel workbooks.
 
 Cells are separated by semicolons, tabs, commas or blanks, whichever splits most of the last lines into numbers. Decimal
-commas are read if commas do not separate cells. Text before the header line is left out. A line with numbers and words
+commas are read if commas do not separate cells. Separators of thousands are removed if a number shows that they are
+such: ``1,234.5``, ``1.234,5``, ``1'234``. Text before the header line is left out. A line with numbers and words
 counts as such text only if a header line follows it.
 """
 
@@ -17,6 +18,7 @@ from typing import NamedTuple
 
 from ..units import find_unit
 from .clock_times import is_clock, is_date
+from .logger_formats import logger_table
 from .text_files import LARGEST_FILE, is_number, read_bytes
 
 __all__ = ["Rows", "decode_table", "read_rows"]
@@ -26,6 +28,10 @@ _LAST_LINES = 50  # lines that determine the separator
 _MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
+# Separators of thousands that cannot be decimal marks: another mark or a second group follows
+_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
+_SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
+_SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
 _HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
 _EXCEL = {".xlsx", ".xlsm"}
 _LARGEST_WORKBOOK, _MOST_CELLS = 256 * 2**20, 50_000_000  # bytes of the unpacked workbook; cells of the sheet
@@ -95,7 +101,8 @@ def read_rows(path: str | Path, skip: int | None = None) -> Rows:
             lines.append((number, line))
     separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
     cells = [(number, _split(line, separator, f"{path}, line {number}")) for number, line in lines]
-    return _arrange(cells, comments, str(path), separator)
+    cells, stated = logger_table(cells, str(path))
+    return _arrange(cells, comments + stated, str(path), separator)
 
 
 def _split(line: str, separator: str, where: str) -> list[str]:
@@ -105,7 +112,8 @@ def _split(line: str, separator: str, where: str) -> list[str]:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
     except csv.Error as error:
         raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
-    return [cell.strip() for cell in cells]
+    cells = [cell.strip() for cell in cells]
+    return [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells]
 
 
 def _find_separator(lines: Sequence[str]) -> str:
@@ -130,7 +138,11 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 def _known(cell: str) -> bool:
     return not _is_missing(cell) and (
-        is_number(cell) or bool(_DECIMAL_COMMA.match(cell)) or is_clock(cell) or is_date(cell)
+        is_number(cell)
+        or bool(_DECIMAL_COMMA.match(cell))
+        or bool(_GROUPED.match(cell))
+        or is_clock(cell)
+        or is_date(cell)
     )
 
 
@@ -160,6 +172,7 @@ def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str,
     for number, cells in rows:
         if len(cells) != width:
             raise ValueError(f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}")
+    rows = _ungrouped(rows, file)
     _check_thousands(rows, file, separator)
     return _without_empty_columns(names, units, _with_points(rows, file), comments)
 
@@ -182,6 +195,25 @@ def _check_short_header(lines: Sequence[tuple[int, list[str]]], width: int, file
             "decimal points, or semicolons between the cells, if commas separate cells and decimals; leave out the "
             "names of rows, in R with row.names = FALSE"
         )
+
+
+def _ungrouped(rows: list[tuple[int, list[str]]], file: str) -> list[tuple[int, list[str]]]:
+    """Rows without separators of thousands, if a number such as ``1,234.5`` or ``1.234.567`` shows which mark it is."""
+    found = next(((number, cell) for number, cells in rows for cell in cells if _GROUPED.match(cell)), None)
+    if found is None:
+        return rows
+    mark = next(letter for letter in found[1] if letter in ",.")
+    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:[.,]\d*)?$")
+    for number, cells in rows:
+        for k, cell in enumerate(cells):
+            if mark in cell and grouped.match(cell):
+                cells[k] = cell.replace(mark, "")
+            elif mark in cell and not (is_clock(cell) or is_date(cell)) and _known(cell):
+                raise ValueError(
+                    f"{file}: {mark!r} separates thousands in {found[1]!r}, line {found[0]}, but not in {cell!r}, line "
+                    f"{number}; write all numbers alike, without separators of thousands"
+                )
+    return rows
 
 
 def _check_thousands(rows: list[tuple[int, list[str]]], file: str, separator: str) -> None:

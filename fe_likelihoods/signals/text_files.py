@@ -1,6 +1,7 @@
 """Shared by the readers of text files: reading, numbers, units and series of samples."""
 
 import math
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ __all__ = [
     "Series",
     "agree_on_unit",
     "check_count",
+    "decimals_of",
     "is_number",
     "parse_count",
     "parse_number",
@@ -27,6 +29,9 @@ NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 
 LARGEST_FILE = 256 * 2**20
 """Largest size of a text file or an archive [bytes]; long records have some MiB."""
+
+
+_FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
 
 
 class Series(NamedTuple):
@@ -42,12 +47,15 @@ class Series(NamedTuple):
         Unit of the values as the file states it, None if it does not.
     values : ndarray, shape (n_steps,)
         The samples, in `unit`.
+    times : ndarray, shape (n_steps,), or None
+        Times of the samples [s], if they are uneven; `dt` is then NaN.
     """
 
     title: str
     dt: float
     unit: str | None
     values: NDArray[np.float64]
+    times: NDArray[np.float64] | None = None
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -121,6 +129,13 @@ def parse_number(field: str, where: str) -> float:
     return value
 
 
+def decimals_of(field: str) -> int:
+    """Return how many digits after the decimal point the number in a field has, less than zero for 1e3."""
+    mantissa, _, exponent = _FORTRAN_EXPONENT.sub("e", field).lower().partition("e")
+    power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
+    return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)
+
+
 def is_number(field: str) -> bool:
     """Return whether a field of a file is a number."""
     try:
@@ -138,7 +153,7 @@ def parse_count(digits: str, where: str) -> int:
 
 
 def _as_float(field: str) -> float:
-    """A number; ValueError also for digits grouped by underscores, which Python accepts."""
+    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
     if "_" in field:
         raise ValueError
-    return float(field)
+    return float(_FORTRAN_EXPONENT.sub("e", field))

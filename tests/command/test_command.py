@@ -383,6 +383,27 @@ def test_measurements_that_hardly_cover_the_record_are_told(folder):
     assert caution in (folder / "results-oscillator" / "report.html").read_text(encoding="utf-8")
 
 
+def test_uneven_times_are_told(folder):
+    """A clock with jitter: refused with advice, and what resample does is said."""
+    lines = (folder / "top.csv").read_text().splitlines()
+    rows = [
+        f"{float(line[:4]) + 0.004 * (k % 2):.3f}{line[4:]}" for k, line in enumerate(lines[1:]) if k not in (50, 51)
+    ]
+    (folder / "top.csv").write_text("\n".join([lines[0], *rows]))
+    assert "or give resample=0.02" in call("check", "oscillator.toml", code=1)
+    settings = (folder / "oscillator.toml").read_text()
+    (folder / "oscillator.toml").write_text(settings.replace("[priors]", 'resample = "20 ms"\n[priors]'))
+    output = call("check", "oscillator.toml")
+    assert (
+        "interpolated linearly to a step of 0.02 s from steps of 0.016 to 0.024 s, with 1 gap(s) of up to 0.06"
+        in output
+    )
+    (folder / "oscillator.toml").write_text(settings.replace("[measurements]", "resample = 0.04\n[measurements]"))
+    assert "[record] base.csv: expected the nominal step of the samples, about 0.02" in call(
+        "check", "oscillator.toml", code=1
+    )
+
+
 def test_files_and_folders_that_cannot_be_used_are_told(folder):
     text = OSCILLATOR.replace('"top.csv"', '"."')
     (folder / "oscillator.toml").write_text(text)

@@ -3,13 +3,14 @@
 import numpy as np
 
 
-def smc(values, rate, kind="2 CORRECTED ACCELEROGRAM", comments=2):
-    """Lines of a USGS SMC file, in cm/s²."""
+def smc(values, rate, kind="2 CORRECTED ACCELEROGRAM", comments=2, times=None):
+    """Lines of a USGS SMC file, in cm/s²; with `times` in pairs with the values."""
+    numbers = values if times is None else np.column_stack([times, values]).ravel()
     integers = [-32768] * 48
-    integers[15], integers[16] = comments, len(values)
+    integers[15], integers[16] = comments, len(numbers)
     reals = [1.7e38] * 50
     reals[1], reals[29], reals[31] = rate, max(values), min(values)
-    cells = [f"{value: .4E}".replace("E+0", "E+").replace("E-0", "E-") for value in values]
+    cells = [f"{value: .4E}".replace("E+0", "E+").replace("E-0", "E-") for value in numbers]
     return [
         kind,
         "*",

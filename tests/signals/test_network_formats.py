@@ -57,6 +57,18 @@ def test_velocity_of_geonet_is_the_integral_of_its_acceleration(shared):
     assert np.abs(integral - velocity).max() < 0.1 * np.abs(velocity).max()
 
 
+def uneven_smc():
+    """Lines of an SMC file with times: three digitised points less than in 62 with a step of 0.02 s."""
+    kept = np.delete(np.arange(VALUES.size), [5, 6, 40])
+    times = 0.02 * kept + 0.002 * np.sin(kept**2)  # 0 at the first
+    return smc(VALUES[kept], 1.7e38, times=times)
+
+
+def changed(lines, old, new):
+    assert any(old in line for line in lines)
+    return [line.replace(old, new) for line in lines]
+
+
 # synthetic files ------------------------------------------------------------------------------------------------------
 
 
@@ -83,9 +95,28 @@ def test_synthetic_files_are_read(tmp_path):
     np.testing.assert_allclose(read_esm(in_g).acceleration, found.acceleration, atol=1e-5)
 
 
-def changed(lines, old, new):
-    assert any(old in line for line in lines)
-    return [line.replace(old, new) for line in lines]
+def test_uneven_smc(tmp_path):
+    path = write(tmp_path / "a.smc", uneven_smc())
+    with pytest.warns(UserWarning, match="with 2 gap.s. of up to 0.0586.* the gaps are straight lines"):
+        record = read_record(path, resample=0.02)
+    assert record.dt == 0.02 and "interpolated linearly to a step of 0.02 s" in record.source
+    known = np.setdiff1d(np.arange(record.n_steps), [5, 6, 40])
+    # within a tenth of a step of the samples
+    np.testing.assert_allclose(record.acceleration[known], 1e-2 * VALUES[known], atol=0.12 * 0.3 * 1e-2 * 30)
+    with pytest.raises(ValueError, match="a uniform step; leave resample out"):
+        read_smc(write(tmp_path / "b.smc", smc(VALUES, 200.0)), resample=0.005)
+
+
+@pytest.mark.parametrize(("digits", "peak"), [(0, 23.4), (1, 23.4), (0, 23)])
+def test_the_peak_of_geonet_is_compared_within_the_printed_digits(tmp_path, digits, peak):
+    lines = geonet({"Up": VALUES * 23.4 / np.abs(VALUES).max()}, 0.02, corrected=False)
+    values = [f"{float(cell):8.{digits}f}" for line in lines[26:] for cell in line.split()]
+    lines = lines[:26] + ["".join(values[k : k + 10]) for k in range(0, len(values), 10)]
+    lines = changed(lines, "peak ", f"peak {peak} mm/s/s at 1.00 sec ")
+    assert read_geonet(write(tmp_path / "a.V1A", lines)).n_steps == VALUES.size
+    wrong = changed(lines, f"peak {peak}", f"peak {peak + 1.2}")
+    with pytest.raises(ValueError, match="the header states a peak of"):
+        read_geonet(write(tmp_path / "a.V1A", wrong))
 
 
 @pytest.mark.parametrize(
@@ -93,7 +124,9 @@ def changed(lines, old, new):
     [
         (read_smc, smc(VALUES, 200.0)[:-1], "expected 5 numbers of 10 columns after 56 of 61 samples, got 0"),
         (read_smc, smc(VALUES, 200.0, "3 VELOCITY"), "looks like a USGS SMC without acceleration file, which is not"),
-        (read_smc, smc(VALUES, 1.7e38), "samples at uneven times"),
+        (read_smc, smc(VALUES, 1.7e38), "expected .* an even number of times and accelerations, got 1.7e.38 and 61"),
+        (read_smc, uneven_smc(), "samples are at uneven times; give their nominal step, resample=0.02"),
+        (read_smc, changed(uneven_smc(), f"{min(VALUES):15.7E}", f"{2 * min(VALUES):15.7E}"), "states a peak of"),
         (read_smc, changed(smc(VALUES, 200.0), f"{max(VALUES):15.7E}", f"{2 * max(VALUES):15.7E}"), "states a peak of"),
         (read_smc, smc(VALUES, 200.0)[:20], "line 21: expected a number, got ''"),
         (read_geonet, geonet({"Up": VALUES}, 0.02)[:30], "the file is truncated"),

@@ -1,0 +1,84 @@
+"""Tables in the formats of two logger programs, as header line, line of units and rows for `table_rows`.
+
+Campbell Scientific TOA5
+    Four header lines: environment, names, units, processing (LoggerNet manual, appendix "Campbell Scientific File
+    Formats").
+LabVIEW measurement (.lvm)
+    Tags and values up to ``***End_of_Header***``, the same for each segment, a line of names that begins with
+    ``X_Value``, and rows (National Instruments, "Specification for the LabVIEW Measurement File").
+"""
+
+from __future__ import annotations
+
+__all__ = ["logger_table"]
+
+_END = "***End_of_Header***"
+_Line = tuple[int, list[str]]
+
+
+def logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
+    """Return the lines of a table with its header line and line of units, and what comments would state.
+
+    Parameters
+    ----------
+    lines : list of (int, list of str)
+        Numbers and cells of the lines that are not blank.
+    file : str
+        The file, for messages.
+
+    Returns
+    -------
+    lines : list of (int, list of str)
+        The lines given, unless they are in one of the two formats.
+    comments : list of str
+        The step of a file without times.
+
+    Raises
+    ------
+    ValueError
+        If a LabVIEW file has several segments, several columns of times, or another quantity than time on its axis.
+    """
+    first = lines[0][1][0] if lines and lines[0][1] else ""
+    if first == "TOA5" and len(lines) > 3:
+        units = ["" if unit in ("TS", "RN") else unit for unit in lines[2][1]]
+        return [lines[1], (lines[2][0], _bracketed(units)), *lines[4:]], []
+    if first.startswith("LabVIEW Measurement"):
+        return _labview(lines, file)
+    return lines, []
+
+
+def _bracketed(units: list[str]) -> list[str]:
+    return [f"[{unit}]" if unit else "" for unit in units]
+
+
+def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
+    ends = [place for place, (_, cells) in enumerate(lines) if cells[0] == _END]
+    if len(ends) != 2:
+        raise ValueError(
+            f"{file}: expected a LabVIEW file with one segment, found {max(len(ends) - 1, 0)}; write a file for each "
+            "segment (option 'Overwrite file' or 'One header only')"
+        )
+    tags = {cells[0]: cells[1:] for _, cells in lines[: ends[1]]}
+    names, rows = lines[ends[1] + 1 : ends[1] + 2], lines[ends[1] + 2 :]
+    columns, axis = (
+        next(iter(tags.get(tag, ())), usual) for tag, usual in (("X_Columns", "One"), ("X_Dimension", "Time"))
+    )
+    if not names or names[0][1].count("X_Value") != 1 or axis != "Time":
+        raise ValueError(
+            f"{file}: expected a LabVIEW file with one column X_Value of times, got X_Columns {columns!r} and "
+            f"X_Dimension {axis!r}; write it with one column of times"
+        )
+    number, header = names[0]
+    width = len(header) - (header[-1] == "Comment")
+    units = tags.get("Y_Unit_Label", [])[: width - 1]
+    table = [
+        (number, ["time [s]", *header[1:width]]),
+        (number, _bracketed(["s", *units, *[""] * (width - 1 - len(units))])),
+        *((number, cells[:width]) for number, cells in rows),
+    ]
+    if columns != "No":
+        return table, []
+    steps = sorted({cell for cell in tags.get("Delta_X", []) if cell})
+    if len(steps) != 1:
+        raise ValueError(f"{file}: expected one step Delta_X, got {', '.join(steps) or 'none'}; write it with times")
+    return [(number, cells[1:]) for number, cells in table], [f"dt = {steps[0].replace(',', '.')} s"]

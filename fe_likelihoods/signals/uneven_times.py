@@ -1,0 +1,133 @@
+"""Samples at uneven times, from a clock with jitter or a logger that loses packets, on times with a uniform step."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sampling import check_step
+
+__all__ = ["UniformTimes", "uniform_times"]
+
+_GAP = 1.5  # usual steps between two samples, from which on samples are missing
+_NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
+_LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
+
+
+class UniformTimes(NamedTuple):
+    """Times with a uniform step in the place of uneven ones.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n_samples,)
+        The uneven times [s].
+    uniform : ndarray, shape (n_steps,)
+        The uniform times, from the first uneven one on [s].
+    usual : float
+        Mean step without gaps [s].
+    gaps : ndarray, shape (n_gaps,)
+        Lengths of the gaps [s].
+    note : str
+        What is done, for the description of the data.
+    """
+
+    times: NDArray[np.float64]
+    uniform: NDArray[np.float64]
+    usual: float
+    gaps: NDArray[np.float64]
+    note: str
+
+    def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values at the uniform times, linear between known samples and NaN in gaps and beyond the last one.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n_samples,)
+            Samples at the uneven times, with NaN for missing ones.
+
+        Returns
+        -------
+        ndarray, shape (n_steps,)
+        """
+        known = np.flatnonzero(~np.isnan(values))
+        if known.size == 0:
+            return np.full(self.uniform.size, np.nan)
+        times = self.times[known]
+        after = np.searchsorted(times, self.uniform).clip(0, times.size - 1)
+        before = (after - 1).clip(0)
+        ahead, behind = times[after] - self.uniform, self.uniform - times[before]
+        nearest = np.where(np.abs(ahead) < np.abs(behind), after, before)
+        found = np.interp(self.uniform, times, values[known])
+        apart = (ahead + behind > _GAP * self.usual) | (ahead < 0.0) | (behind < 0.0)
+        near = np.minimum(np.abs(ahead), np.abs(behind)) <= _NEAR * self.usual
+        return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
+
+    def straight(self, values: NDArray[np.float64], where: str, stacklevel: int) -> NDArray[np.float64]:
+        """Return values at the uniform times, with straight lines over gaps and a warning about them.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n_samples,)
+            Samples at the uneven times, all known.
+        where : str
+            The file, for the warning.
+        stacklevel : int
+            As in `warnings.warn`, seen from the caller.
+
+        Returns
+        -------
+        ndarray, shape (n_steps,)
+        """
+        if self.gaps.size:
+            warnings.warn(
+                f"{where}: {self.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
+                "another record of the motion if a gap is in its strong part",
+                UserWarning,
+                stacklevel=stacklevel + 1,
+            )
+        return np.interp(self.uniform, self.times, values)
+
+
+def uniform_times(times: NDArray[np.float64], step: float, where: str) -> UniformTimes:
+    """Return times with the uniform `step` from the first to the last of the given times.
+
+    Parameters
+    ----------
+    times : ndarray, shape (n_samples,)
+        Times that increase [s].
+    step : float
+        Nominal step of the samples [s].
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    UniformTimes
+
+    Raises
+    ------
+    ValueError
+        If the times do not increase, or the step differs from their usual step by more than 5 %: another step would
+        need a filter (`Record.resample`, `Measurements.decimate`).
+    """
+    step = check_step(step, f"resample of {where}")
+    increments = np.diff(times)
+    if times.size < 2 or not np.all(increments > 0.0):
+        place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
+        raise ValueError(
+            f"{where}: expected times that increase, got {times[min(place + 1, times.size - 1)]:.15g} s after "
+            f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt="
+        )
+    usual = float(increments[increments <= _GAP * np.median(increments)].mean())
+    if abs(step - usual) > _LARGEST_DIFFERENCE * usual:
+        raise ValueError(
+            f"{where}: expected the nominal step of the samples, about {usual:.4g} s, got resample={step:g}; resample "
+            "the record or decimate the measurements afterwards"
+        )
+    gaps = increments[increments > _GAP * usual]
+    others = increments[increments <= _GAP * usual]
+    note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
+    note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
+    uniform = times[0] + step * np.arange(int((times[-1] - times[0]) / step + 1e-6) + 1)
+    return UniformTimes(times, uniform, usual, gaps, note)
