@@ -395,7 +395,7 @@ def test_uneven_times_are_told(folder):
     (folder / "oscillator.toml").write_text(settings.replace("[priors]", 'resample = "20 ms"\n[priors]'))
     output = call("check", "oscillator.toml")
     assert (
-        "interpolated linearly to a step of 0.02 s from steps of 0.016 to 0.024 s, with 1 gap(s) of up to 0.06"
+        "interpolated linearly to a step of 0.02 s from steps of 0.016 to 0.024 s, with 1 gap(s) of up to 0.056"
         in output
     )
     (folder / "oscillator.toml").write_text(settings.replace("[measurements]", "resample = 0.04\n[measurements]"))
