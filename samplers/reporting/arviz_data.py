@@ -70,7 +70,8 @@ def to_arviz(
     arviz.InferenceData
         A DataTree from arviz 1.0 on; ``to_netcdf(path)`` writes it to a file. It has the groups ``posterior``,
         ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``constant_data``,
-        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; ``docs/arviz`` describes them.
+        ``posterior_predictive``, ``log_likelihood`` and ``predictions``; ``docs/arviz`` describes them. A slash in the
+        name of a parameter or channel becomes ``_``.
     """
     import arviz
     import xarray
@@ -109,9 +110,26 @@ def to_arviz(
         groups |= _predictive_groups(posterior, chains, groups["observed_data"], draws, block, seed)
     if prediction is not None:
         groups["predictions"] = _prediction_group(prediction)
+    groups = {group: _without_slashes(dataset) for group, dataset in groups.items()}
     if arviz.__version__.startswith("0."):
         return arviz.InferenceData(**groups)
     return xarray.DataTree.from_dict(groups)
+
+
+def _without_slashes(dataset: "xarray.Dataset") -> "xarray.Dataset":
+    """Data with ``_`` for ``/`` in names, which would be a folder in netCDF; the attribute ``name`` has the name."""
+    taken, renamed = {*dataset.variables, *dataset.dims}, {}
+    for name in sorted(name for name in taken if "/" in name):
+        new = name.replace("/", "_")
+        while new in taken:
+            new += "_"
+        taken.add(new)
+        renamed[name] = new
+    dataset = dataset.rename(renamed)
+    for name, new in renamed.items():
+        if new in dataset.variables:
+            dataset[new].attrs["name"] = name
+    return dataset
 
 
 def _check_posterior(posterior: Any, run: Any) -> None:

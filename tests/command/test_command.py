@@ -383,6 +383,33 @@ def test_measurements_that_hardly_cover_the_record_are_told(folder):
     assert caution in (folder / "results-oscillator" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow  # a whole run of processes
+def test_slashes_in_names_of_channels(tmp_path, monkeypatch):
+    """The whole run: cache, samples in HDF5 and netCDF, tables, report and prediction of an event."""
+    arviz = pytest.importorskip("arviz")
+    shutil.copytree(ROOT / "data" / "templates", tmp_path, dirs_exist_ok=True)
+    text = (tmp_path / "function.toml").read_text()
+    for old, new in (
+        ("sigma_acceleration", '"sigma_acc/top"'),
+        ("sigma_displacement", '"sigma_disp/top"'),
+        ("acceleration = ", '"acc/top" = '),
+        ("displacement = ", '"disp/top" = '),
+        ("walkers = 100", "walkers = 20"),
+        ("draws = 50", "draws = 4\n[events.again]\nfile = 'synthetic_record.csv'\nmeasured = 'synthetic_measured.csv'"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "function.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    call("run", "function.toml", "--quiet")
+    assert "CAUTION" not in call("check", "function.toml")
+    assert "agree" in call("cache", "verify", "results-function/simulations.sqlite", "--settings", "function.toml")
+    assert "report.html" in call("report", "results-function", "--run-code")
+    assert "acc/top" in (tmp_path / "results-function" / "report.html").read_text(encoding="utf-8")
+    assert "sigma_disp/top" in (tmp_path / "results-function" / "summary.csv").read_text()
+    assert "acc_top" in arviz.from_netcdf(str(tmp_path / "results-function" / "posterior.nc"))["observed_data"]
+
+
 def test_uneven_times_are_told(folder):
     """A clock with jitter: refused with advice, and what resample does is said."""
     lines = (folder / "top.csv").read_text().splitlines()
