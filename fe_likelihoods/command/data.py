@@ -161,7 +161,7 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
         path,
         [by_name[name] for name in chosen],
         [columns[name] for name in chosen],
-        [units.get(name) for name in chosen],
+        [units.get(name) for name in chosen] if units else None,
         description=f"measurements of {path.name}",
         **options,
     )

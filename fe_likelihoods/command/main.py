@@ -165,6 +165,25 @@ def new(kind: str, folder: Path) -> None:
     click.echo(f"Next: fe-likelihoods check {folder / kind}.toml")
 
 
+@main.command()
+@click.argument("files", type=_FILE, nargs=-1, required=True)
+def data(files: tuple[Path, ...]) -> None:
+    """List what data FILES hold (columns, channels, units, steps, gaps), and the lines of a TOML file that read them.
+
+    A file is a table of a logger, a ground motion, a zip archive of V2 files, or a data set.
+    """
+    from .listing import describe_data
+
+    unread = []
+    for file in files:
+        try:
+            click.echo(f"{describe_data(file)}\n")
+        except ValueError as error:
+            unread.append(str(error))
+    if unread:
+        raise ValueError("\nError: ".join(unread))
+
+
 @main.group()
 def cache() -> None:
     """Look after a cache of simulations (simulations.sqlite in the folder of a run)."""

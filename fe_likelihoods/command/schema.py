@@ -199,7 +199,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
         Key("format", "text", "One of at2, v2, smc, geonet, knet, esm, csv and dataset; by default it is recognised"),
-        Key("column", "text", "Column of a CSV file or workbook, or component (GeoNet)"),
+        Key("column", "text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)"),
         Key("channel", "whole number", "Channel of a V2 file"),
         Key("units", "text", "Unit of the acceleration, if the file does not state it"),
         *_TABLE,
@@ -208,9 +208,9 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("every", "whole number >= 1", "Keep every n-th sample: a faster simulation with a longer step"),
     ),
     "measurements": (
-        Key("file", "text", "Measured response: CSV, Excel, or a data set (.h5)"),
+        Key("file", "text", "Measured response: CSV, Excel, V2 and other files as in [record], or a data set (.h5)"),
         Key("bundled", "text", "Bundled synthetic measurements, instead of a file"),
-        Key("columns", "table of texts", "Channel = name of its column in the file"),
+        Key("columns", "table of texts or numbers", "Channel = name of its column in the file, or number in a V2 file"),
         Key("units", "table of texts", "Channel = unit, if the file does not state it"),
         Key("reversed", "texts", "Channels whose sensor counts the other way round: they are multiplied by -1"),
         Key("channels", "texts", "Channels to use; by default all"),
@@ -316,6 +316,10 @@ _KINDS = {
     ),
     "whole numbers": (_all(_is_whole, list), "a list of whole numbers, such as [1, 2]"),
     "table of texts": (_all(_is_text, dict), 'texts by name, such as {top = "abc"}'),
+    "table of texts or numbers": (
+        _all(lambda value: _is_text(value) or _is_whole(value), dict),
+        'texts or whole numbers by name, such as {top = "abc"} or {top = 7}',
+    ),
     "table of quantities": (
         _all(lambda value: _is_number(value) or _is_text(value), dict),
         'numbers with units by name, such as {top = "0.01 g"}',

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..units import to_si
 from .channels import Channel, Measurements
-from .readers import named_format
+from .readers import read_record, recognise_reader
 from .records import DisplacementHistory
 from .table_columns import column_values, value_column, warn_if_absent
 from .table_times import row_times, table_start, table_step
@@ -42,7 +42,7 @@ class ImposedTest(NamedTuple):
 def read_columns(
     path: str | Path,
     channels: Sequence[Channel],
-    columns: Sequence[str],
+    columns: Sequence[str | int],
     units: str | Sequence[str] | None = None,
     dt: float | None = None,
     description: str = "",
@@ -55,6 +55,9 @@ def read_columns(
 ) -> Measurements:
     """Read measured responses from the columns of a CSV file or workbook with a header line (see `read_csv`).
 
+    Accelerations are also read from the files of strong-motion networks that `read_record` reads, with the numbers or
+    names of their channels as `columns`, such as those of a structure in a zip archive of V2 files.
+
     An empty cell, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--`` is a missing sample.
 
     Parameters
@@ -63,8 +66,8 @@ def read_columns(
         The file.
     channels : sequence of Channel
         The measured channels.
-    columns : sequence of str
-        Names of the columns in the header line, one per channel.
+    columns : sequence of str or int
+        Names of the columns in the header line, one per channel; for other files as `channel` of `read_record`.
     units : str or sequence of str, optional
         Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
         unit (``disp_in``). If both are given, they must agree.
@@ -101,8 +104,13 @@ def read_columns(
         If a column is missing, a unit is missing or has another dimension than its channel, the times are not uniform,
         or a cell is not a finite number.
     """
-    with named_format(path, "read_columns"):
-        table = read_table(path, skip, time_unit)
+    if (reader := recognise_reader(path)) is not None:
+        if not all(option is None for option in (units, dt, time_unit, skip, missing)):
+            raise ValueError(
+                f"{path}: a file for {reader} states units and times; leave units, dt, time_unit, skip and missing out"
+            )
+        return _recorded(path, channels, columns, description, zero, resample)
+    table = read_table(path, skip, time_unit)
     values = _channel_values(table, channels, columns, units, missing)
     warn_if_absent(table, [value_column(table, column) for column in columns], missing, stacklevel=2)
     if resample is None:
@@ -112,6 +120,33 @@ def read_columns(
         values = np.array([even.interpolate(row) for row in values])
         description = ", ".join(filter(None, (description, even.note)))
     return Measurements(tuple(channels), step, values, description, table_start(table, step, zero))
+
+
+def _recorded(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str | int],
+    description: str,
+    zero: float | str,
+    resample: float | None,
+) -> Measurements:
+    """Measured accelerations in a file of a strong-motion network or a zip archive of such files."""
+    if isinstance(columns, str) or len(channels) != len(columns):
+        raise ValueError(f"expected one channel of {path} for each of {len(channels)} channels, got {columns!r}")
+    if isinstance(zero, str):
+        raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
+    records = []
+    for channel, column in zip(channels, columns, strict=True):
+        if channel.dimension != "acceleration":
+            raise ValueError(
+                f"{path}: accelerations are read from files of this format, and the channel {channel.name!r} is a "
+                f"{channel.dimension}; leave it out, or write its samples to a CSV file"
+            )
+        records.append(read_record(path, column, resample=resample))
+    labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]
+    text = ", ".join(filter(None, (description, *labels)))
+    steps, rows = [record.dt for record in records], [record.acceleration for record in records]
+    return Measurements(tuple(channels), steps, rows, text, 0.0 - zero)
 
 
 def read_imposed_test(

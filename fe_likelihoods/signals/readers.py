@@ -36,6 +36,7 @@ __all__ = [
     "read_record",
     "read_smc",
     "read_v2",
+    "recognise_reader",
 ]
 
 
@@ -189,7 +190,8 @@ def read_record(
     path : str or path
         A file, or a zip archive of CSMIP and COSMOS V2 files.
     channel : int or str, optional
-        Channel number (V2), component (GeoNet) or column (CSV), if the file has more than one.
+        Channel number or name of a file in the archive (V2), component (GeoNet) or column (CSV), if the file has more
+        than one.
     units : str, optional
         Unit of the acceleration, if an AT2 or CSV file does not state it.
     missing : sequence of float, optional
@@ -209,32 +211,47 @@ def read_record(
     ValueError
         As the reader of the format; for a known format without a reader, the message has its name.
     """
-    content = read_bytes(path)
-    if zipfile.is_zipfile(io.BytesIO(content)) and Path(path).suffix.lower() not in (".xlsx", ".xlsm"):
-        return _uniform(read_v2(path, channel, member), path, resample)
-    name, reader = smc_geonet_knet_esm_formats.recognise(content.decode("latin-1"))
-    if name and reader is None:
-        raise ValueError(f"{path}: {_looks_like(name, None)}")
+    reader = recognise_reader(path)
     if reader == "read_smc":
         return read_smc(path, resample)
     if reader is not None:
-        return _uniform(_READERS[reader](path, channel, units), path, resample)
+        if resample is not None:
+            raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
+        return _READERS[reader](path, channel, units, member)
     return _read_csv(path, units, column=channel, missing=missing, resample=resample)
 
 
 _READERS: dict[str, Callable[..., Record]] = {
-    "read_at2": lambda path, channel, units: read_at2(path, units),
-    "read_v2": lambda path, channel, units: read_v2(path, channel),
-    "read_geonet": lambda path, channel, units: read_geonet(path, channel),
-    "read_knet": lambda path, channel, units: read_knet(path),
-    "read_esm": lambda path, channel, units: read_esm(path),
+    "read_at2": lambda path, channel, units, member: read_at2(path, units),
+    "read_v2": lambda path, channel, units, member: _read_v2(path, channel, member),
+    "read_geonet": lambda path, channel, units, member: read_geonet(path, channel),
+    "read_knet": lambda path, channel, units, member: read_knet(path),
+    "read_esm": lambda path, channel, units, member: read_esm(path),
 }
 
 
-def _uniform(record: Record, path: str | Path, resample: float | None) -> Record:
-    if resample is not None:
-        raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
-    return record
+def recognise_reader(path: str | Path) -> str | None:
+    """Return the name of the function that reads a file or zip archive; None for a table (CSV, Excel).
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, or has a known format without a reader.
+    """
+    content = read_bytes(path)
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        return None if Path(path).suffix.lower() in (".xlsx", ".xlsm") else "read_v2"
+    name, reader = smc_geonet_knet_esm_formats.recognise(content.decode("latin-1"))
+    if name and reader is None:
+        raise ValueError(f"{path}: {_looks_like(name, None)}")
+    return reader
+
+
+def _read_v2(path: str | Path, channel: int | str | None, member: str | None) -> Record:
+    """`read_v2`, with a channel that may be a text: a number, or the name of a file in the archive."""
+    if isinstance(channel, str):
+        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
+    return read_v2(path, channel, member)
 
 
 def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:

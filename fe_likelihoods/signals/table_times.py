@@ -11,7 +11,7 @@ from .clock_times import parse_clock
 from .tables import Table, stated_unit
 from .text_files import NUMBER, agree_on_unit
 
-__all__ = ["row_times", "table_start", "table_step", "time_column"]
+__all__ = ["nominal_step", "row_times", "table_start", "table_step", "time_column"]
 
 _TIME = re.compile(
     r"(elapsed |relative )?(t|(time|timestamp|unix|epoch|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE
@@ -168,7 +168,7 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
             f"{table.file}, line {table.lines[index + 1]}: expected a uniform time step of about {usual:g} s, got "
             f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; insert rows with "
             "empty cells where the logger has missed samples, print the times with more digits, or give "
-            f"resample={_nominal(usual):g} to interpolate to a uniform step"
+            f"resample={nominal_step(usual):g} to interpolate to a uniform step"
         )
     tolerance /= increments.size
     rate = round(1 / step) if 1 / step < 1e15 else 0
@@ -196,8 +196,8 @@ def _times(table: Table, place: int) -> NDArray[np.float64]:
     return times
 
 
-def _nominal(step: float) -> float:
-    """The step of a whole number of samples per second, if it differs by less than 5 %."""
+def nominal_step(step: float) -> float:
+    """Return the step [s] of a whole number of samples per second, if it differs from `step` by less than 5 %."""
     whole = 1.0 / max(round(1.0 / step), 1) if step > 1e-9 else step
     return whole if abs(whole - step) <= 0.05 * step else step
 

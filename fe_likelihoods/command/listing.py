@@ -1,0 +1,251 @@
+"""What a file of data holds, as text, and the lines of a TOML file that read it."""
+
+import datetime
+import json
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..signals.at2_v2_formats import find_v2_channels, parse_v2
+from ..signals.datasets import read_dataset
+from ..signals.readers import read_record, recognise_reader
+from ..signals.records import Record
+from ..signals.smc_geonet_knet_esm_formats import parse_geonet
+from ..signals.table_columns import column_values
+from ..signals.table_times import nominal_step, row_times, table_step, time_column
+from ..signals.tables import Table, read_table, stated_unit
+from ..signals.text_files import read_text
+from ..signals.uneven_times import uniform_times
+from ..text_tables import number, text_table
+from ..units import find_unit, from_si, to_si
+
+__all__ = ["describe_data"]
+
+_HEAD = ("samples", "step [s]", "duration [s]", "peak [g]")
+
+
+class _Lines(NamedTuple):
+    """Text about a file, and the lines of the sections ``[record]`` and ``[measurements]``."""
+
+    text: list[str]
+    record: list[str] | None = None
+    measured: list[str] | None = None
+
+
+def describe_data(path: Path) -> str:
+    """Return what a file of data holds, and the lines of a TOML file that read it.
+
+    Parameters
+    ----------
+    path : Path
+        A table, a ground motion in a supported format, a zip archive of V2 files, or a data set (.h5).
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read.
+    """
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        found = _dataset(path)
+    else:
+        reader = recognise_reader(path)
+        describe = {None: _table, "read_v2": _v2, "read_geonet": _geonet}.get(reader, _single)
+        found = describe(path)
+    lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
+    for section, given in (("record", found.record), ("measurements", found.measured)):
+        if given is not None:
+            lines += [f"[{section}]", f"file = {_quoted(str(path))}", *given]
+    return "\n".join(lines)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _cells(values: np.ndarray, step: float) -> tuple[str, ...]:
+    """Cells below `_HEAD`, of accelerations [m/s²]."""
+    return (
+        str(values.size),
+        f"{step:g}",
+        number((values.size - 1) * step, 4),
+        number(from_si(np.abs(values).max(), "g")),
+    )
+
+
+def _name_of_channel(text: str, taken: set[str]) -> str:
+    """A name for a channel, from the name of its column without the unit."""
+    base = re.sub(r"[^A-Za-z0-9_]+", "_", re.sub(r"[\[(].*$", "", text)).strip("_").lower() or "channel"
+    name, count = base, 1
+    while name in taken:
+        count += 1
+        name = f"{base}_{count}"
+    taken.add(name)
+    return name
+
+
+def _inline(pairs: list[tuple[str, str | int]]) -> str:
+    """An inline table of TOML."""
+    return "{" + ", ".join(f"{name} = {_quoted(v) if isinstance(v, str) else v}" for name, v in pairs) + "}"
+
+
+def _v2(path: Path) -> _Lines:
+    channels = find_v2_channels(path)
+    numbers = [channel.channel for channel in channels]
+    rows, columns, refused = [("channel", *_HEAD, "label", "file")], [], []
+    for channel in channels:
+        file = channel.file.removeprefix(f"{path}/") if channel.file != str(path) else path.name
+        alone = channel.channel is not None and numbers.count(channel.channel) == 1
+        column = channel.channel if alone else file
+        try:
+            series = parse_v2(channel)
+            values = to_si(series.values, series.unit, "acceleration")
+        except ValueError as error:
+            refused.append(str(error))
+            continue
+        rows.append((str(channel.channel or "-"), *_cells(values, series.dt), channel.label, file))
+        columns.append((f"ch{channel.channel}" if alone else _name_of_channel(file, set()), column))
+    text = [f"{len(columns)} channels of acceleration", text_table(rows), *(f"not read: {each}" for each in refused)]
+    if len({row[1:3] for row in rows[1:]}) > 1:
+        text.append(
+            "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
+        )
+    if not columns:
+        return _Lines(text)
+    first = columns[0][1]
+    line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
+    measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
+    return _Lines(text, [f"{line}    # the channel of the base motion"], measured)
+
+
+def _geonet(path: Path) -> _Lines:
+    components = parse_geonet(read_text(path), str(path))
+    rows = [("component", *_HEAD)]
+    for each in components:
+        rows.append((each.component, *_cells(to_si(each.series.values, each.series.unit), each.series.dt)))
+    names = [(_name_of_channel(each.component, set()), each.component) for each in components]
+    return _Lines(
+        [f"{len(components)} components of acceleration", text_table(rows)],
+        [f"column = {_quoted(components[0].component)}"],
+        [f"columns = {_inline(names)}    # channel of the model = component"],
+    )
+
+
+def _record_text(record: Record) -> list[str]:
+    return [text_table([("record", *_HEAD), (record.name, *_cells(record.acceleration, record.dt))]), record.source]
+
+
+def _single(path: Path) -> _Lines:
+    """A ground motion in a file of its own."""
+    given, lines = {}, []
+    try:
+        record = read_record(path)
+    except ValueError as error:
+        if found := re.search(r"resample=(\S+)$", str(error)):
+            given, lines = {"resample": float(found[1])}, [f"resample = {found[1]}"]
+        elif "does not state the unit" in str(error):
+            given, lines = {"units": "g"}, ['units = "?"    # write it: the file does not state it']
+        else:
+            raise
+        record = read_record(path, **given)
+    note = ["The unit is not stated: the peak is that of samples in g."] if "units" in given else []
+    return _Lines(["a ground motion", *_record_text(record), *note], lines)
+
+
+def _dataset(path: Path) -> _Lines:
+    found = read_dataset(path)
+    measured = found.measurements
+    rows = [("channel", "quantity", "samples", "step [s]", "missing")]
+    for channel, step, values in zip(measured.channels, measured.steps, measured.values, strict=True):
+        rows.append((channel.name, channel.quantity, str(values.size), f"{step:g}", str(int(np.isnan(values).sum()))))
+    return _Lines(["a data set", *_record_text(found.record), text_table(rows), measured.description], [], [])
+
+
+def _table(path: Path) -> _Lines:
+    table = read_table(path)
+    if not table.names:
+        raise ValueError(f"{path}: the table has {table.values.shape[1]} columns without names; write a header line")
+    place = time_column(table)
+    options, remarks = _sampling(table, place)
+    rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
+    columns, unstated, marks = [], [], set()
+    taken: set[str] = set()
+    for k, name in enumerate(table.names):
+        if k in table.dates or k in table.clocks or k == place:
+            continue
+        values = table.values[:, k]
+        try:
+            column_values(table, k)
+        except ValueError as error:
+            remarks.append(str(error))
+            marks |= {float(found) for found in re.findall(r"got (\S+) in \d+ rows", str(error))}
+        known = values[~np.isnan(values)]
+        ends = (number(known.min(), 4), number(known.max(), 4)) if known.size else ("-", "-")
+        unit = stated_unit(table, k)
+        rows.append((name, unit or "not stated", str(known.size), str(values.size - known.size), *ends))
+        if table.names.count(name) > 1:
+            remarks.append(f"the name {name!r} is that of several columns: rename them")
+            continue
+        channel = _name_of_channel(name, taken)
+        columns.append((channel, name))
+        if unit is None or not _is_unit(unit):
+            unstated.append((channel, "?"))
+    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks]
+    if marks:
+        options.append(f"missing = [{', '.join(f'{mark:g}' for mark in sorted(marks))}]")
+    measured = [f"columns = {_inline(columns)}    # channel of the model = column", *options]
+    if unstated:
+        measured.append(f"units = {_inline(unstated)}    # write them: the file does not state them")
+    if table.clock is not None:
+        measured.append(f'zero = "{_clock_text(table)}"    # or when the base motion begins, if it is in another file')
+    if not columns:
+        return _Lines(text)
+    base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
+    if unstated and columns[0][0] == unstated[0][0]:
+        base.append('units = "?"    # write it: the file does not state it')
+    return _Lines(text, [*base, *(each for each in options if not each.startswith("missing"))], measured)
+
+
+def _is_unit(name: str) -> bool:
+    try:
+        find_unit(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _clock_text(table: Table) -> str:
+    """The first clock time of a table, as `zero` takes it."""
+    clock = table.clock
+    seconds = datetime.timedelta(seconds=clock.seconds)
+    text = str((datetime.datetime.min + seconds).time())
+    return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
+
+
+def _sampling(table: Table, place: int | None) -> tuple[list[str], list[str]]:
+    """Keys that the times need, and what is said about them."""
+    try:
+        step = table_step(table)
+    except ValueError as error:
+        if place is None:
+            return ['dt = "? s"    # write it: the file has no times'], ["no column of times"]
+        try:
+            times = row_times(table)
+            usual = np.diff(times)
+            nominal = nominal_step(float(np.median(usual)))
+            even = uniform_times(times, nominal, table.file)
+        except ValueError:
+            return [], [f"times: {error}"]
+        return [f"resample = {nominal:.6g}"], [
+            f"times: uneven, steps of {usual.min():.4g} to {usual.max():.4g} s"
+            + (f", {even.gaps.size} gap(s) of up to {even.gaps.max():.4g} s" if even.gaps.size else "")
+        ]
+    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {table.names[place]!r}"
+    if table.clock is not None:
+        start += f", first clock time {_clock_text(table)}"
+    return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"]

@@ -1,0 +1,142 @@
+"""The command ``data``: what files hold, and lines of a TOML file that read them as they are."""
+
+import tomllib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
+from fe_likelihoods.command.main import main
+from fe_likelihoods.signals.datasets import write_dataset
+from tests.signals.logger_styles import READ
+from tests.signals.network_files import esm, geonet, smc
+from tests.signals.test_readers import cosmos, csmip, write_at2
+
+VALUES = np.sin(np.arange(23.0))
+TOP = Channel("top", "acceleration", "g")
+DESCRIPTOR = "  .020 sec, in cm/sec2. (8f10.6)"
+
+
+def listed(path, code=0):
+    """Output of the command, and its lines for a TOML file."""
+    result = CliRunner().invoke(main, ["data", str(path)])
+    assert result.exit_code == code, result.output
+    return result.output, tomllib.loads(result.output.partition("# lines for the TOML file")[2])
+
+
+def read_as_listed(lines):
+    """The record and the measured accelerations that the lines name."""
+    base, measured = lines["record"], lines.get("measurements")
+    record = read_record(base["file"], base.get("channel", base.get("column")), resample=base.get("resample"))
+    if measured is None:
+        return record, None
+    options = {key: measured[key] for key in ("zero", "resample", "missing") if key in measured}
+    channels = [Channel(name, "acceleration", "g") for name in measured["columns"]]
+    return record, read_columns(measured["file"], channels, list(measured["columns"].values()), **options)
+
+
+def test_a_logger_file(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(READ["day first, decimal comma"].replace("1,9854", ""))
+    output, lines = listed(path)
+    assert "a table of 8 rows" in output and "acc_g      g        7        1    -2.872    2.686" in output
+    assert "times: step 0.02 s (50 per second)" in output and "first clock time 2024-05-14 10:32:07" in output
+    assert lines["measurements"]["zero"] == "2024-05-14 10:32:07"
+    path.write_text(READ["day first, decimal comma"])
+    record, measured = read_as_listed(listed(path)[1])
+    np.testing.assert_array_equal(record.acceleration, measured.values[0])
+    assert measured.start == 0.0
+
+
+def test_what_a_file_does_not_state_must_be_written(tmp_path):
+    path = tmp_path / "a.csv"
+    times = ("0.00", "0.01", "0.03", "0.04", "0.05", "0.0601")
+    path.write_text(
+        "time_s,base,top,top [1]\n" + "".join(f"{t},{k},3,{k - 9999 * (k == 0)}\n" for k, t in enumerate(times))
+    )
+    output, lines = listed(path)
+    assert "times: uneven, steps of 0.01 to 0.02 s, 1 gap(s) of up to 0.02 s" in output
+    assert "which usually stands for a missing sample" in output
+    assert lines["record"]["units"] == "?" and lines["record"]["resample"] == lines["measurements"]["resample"] == 0.01
+    assert lines["measurements"]["units"] == {"base": "?", "top": "?"}
+    assert lines["measurements"]["columns"]["top_2"] == "top [1]" and lines["measurements"]["missing"] == [-9999]
+    path.write_text("base [g]\n1\n2\n")
+    assert listed(path)[1]["record"]["dt"] == "? s"
+
+
+def written(path, lines):
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "count"),
+    [
+        ("a.v2", csmip(3, VALUES, 0.02, DESCRIPTOR) + csmip(7, VALUES, 0.02, DESCRIPTOR), 2),
+        ("a.v2c", cosmos(1, VALUES, 0.005), 1),
+        ("a.V2A", geonet({"N10E": VALUES, "Up": VALUES}, 0.02), 2),
+        ("a.smc", smc(VALUES, 200.0), 0),
+        ("a.smc", smc(VALUES, 1.7e38, times=0.02 * np.arange(23)), 0),
+        ("a.asc", esm(VALUES, 0.005), 0),
+    ],
+)
+def test_files_of_networks(tmp_path, name, lines, count):
+    output, lines = listed(written(tmp_path / name, lines))
+    record, measured = read_as_listed(lines)
+    assert " 23 " in output and record.n_steps == 23
+    assert (measured is None) == (count == 0)
+    assert measured is None or len(measured.channels) == count
+
+
+def test_a_unit_that_a_file_does_not_state(tmp_path):
+    path = write_at2(tmp_path / "a.AT2", VALUES, "NPTS=     23, DT=   .0050 SEC")
+    path.write_text(path.read_text().replace("UNITS OF G", "AS RECORDED"))
+    output, lines = listed(path)
+    assert lines["record"]["units"] == "?" and "The unit is not stated" in output
+
+
+def test_a_data_set_and_a_file_that_cannot_be_read(tmp_path):
+    top = Channel("top", "displacement", "mm")
+    write_dataset(tmp_path / "a.h5", Record("a", 0.01, VALUES), Measurements((top,), 0.01, VALUES[None]))
+    output, lines = listed(tmp_path / "a.h5")
+    assert "displacement" in output and lines["measurements"] == {"file": str(tmp_path / "a.h5")}
+    (tmp_path / "b.csv").write_text("nothing\n")
+    result = CliRunner().invoke(main, ["data", str(tmp_path / "b.csv"), str(tmp_path / "a.h5")])
+    assert result.exit_code == 1 and "expected rows of numbers, found none" in result.output
+    assert "a data set" in result.output
+
+
+def test_channels_of_a_real_structure_in_a_zip_archive(shared):
+    folder = shared / "measured/painter_street_bridge"
+    output, lines = listed(folder / "petrolia_25apr1992_ce89324p.zip")
+    assert (
+        "23 channels" in output
+        and "CHAN 7: 360 DEG (STA CHN: 7) LOCATION: UNDERSIDE OF GIRDER AT CENTER BENT" in output
+    )
+    record, measured = read_as_listed(lines)
+    channels = [Channel(f"ch{k}", "acceleration", "g") for k in (1, 7)]
+    known = read_columns(folder / "petrolia_1992_mainshock/acc_cm_s2_dt0.02.csv", channels, ["ch1", "ch7"], "cm/s2")
+    found = measured.select(["ch1", "ch7"])
+    np.testing.assert_allclose(found.values, known.values, atol=1e-4)
+    np.testing.assert_array_equal(record.acceleration, found.values[0])
+    assert "ch7 is CHAN 7: 360 DEG" in measured.description
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"channels": [Channel("top", "displacement", "mm")]}, "accelerations are read from files of this format, and"),
+        ({"zero": "10:32:07"}, "has no clock times; give zero in seconds"),
+        ({"dt": 0.01}, "a file for read_v2 states units and times; leave units, dt"),
+        ({"columns": [8]}, "expected one channel with channel = 8, .*found 0; choose with channel= and member= among"),
+        ({"columns": [3, 7]}, "expected one channel of .* for each of 1 channels"),
+        ({"resample": 0.01}, "a uniform step; leave resample out"),
+    ],
+)
+def test_channels_that_cannot_be_read(tmp_path, given, message):
+    path = written(tmp_path / "a.v2", csmip(3, VALUES, 0.02, DESCRIPTOR))
+    options = {"channels": [TOP], "columns": [3]} | given
+    with pytest.raises(ValueError, match=message):
+        read_columns(path, **options)
+    assert read_columns(path, [TOP], ["3"], zero=0.1).start == -0.1
