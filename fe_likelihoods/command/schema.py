@@ -140,7 +140,7 @@ _OWN = {
         *documented_keys(ExecutableModel, "command", required="command"),
         Key("templates", "table of texts", "Input files: name in the folder of the run = template", True),
         Key("output", "text", "Name of the file with the response", True),
-        *documented_keys(ExecutableModel, "columns"),
+        *documented_keys(ExecutableModel, "columns output_units record_file", output_units="table of texts"),
         Key("files", "table of texts", "Further files: name in the folder of the run = file"),
         *(key._replace(required=True) if key.name == "time_limit" else key for key in USER),
     ),

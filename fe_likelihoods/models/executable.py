@@ -25,6 +25,7 @@ from ..simulation.faults import RunFailed, TransientReason, reason_of
 from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
+from ..units import find_unit
 from .dependencies import content_digest
 from .user_model import UserModel
 from .validation import positive_float
@@ -70,12 +71,14 @@ class ExecutableModel(UserModel):
     columns : sequence of int, optional
         Columns of the output file that are the channels, counted from 0. By default the file has one column per channel
         and no others.
+    output_units : mapping of str to str, optional
+        Units of channels in the output file, by name of the channel. Default: SI units.
     record : Record, optional
         Excitation. Its samples [m/s²] are written into the file `record_file` in the run folder, one per line, and
         ``$record_dt`` [s] and ``$record_n_steps`` may stand in templates and arguments. The model can then be simulated
         under other records (`with_record`, ``propagate(..., record=)``, `fragility`).
     record_file : str
-        Name of this file.
+        Name of the file with the base motion in the run folder [m/s²]. Default: record.txt.
     path_dependent : bool
         Whether the response to an excitation depends on earlier ones. False for a linear structure: predictions under
         another record then need no `from_state`.
@@ -132,6 +135,7 @@ class ExecutableModel(UserModel):
         record_file: str = "record.txt",
         path_dependent: bool = True,
         columns: Sequence[int] | None = None,
+        output_units: Mapping[str, str] | None = None,
         files: Mapping[str, Path] | None = None,
         keep_failures: str | Path | None = None,
         max_kept: int = 20,
@@ -171,6 +175,8 @@ class ExecutableModel(UserModel):
                 f"ExecutableModel: expected one column, 0 or more, for each of the {len(self.channels)} channels; "
                 f"got {columns}"
             )
+        self.output_units = dict(output_units or {})
+        self._factors = self._check_units()
         self.env = None if env is None else _environment(env)
         self.keep_failures = None if keep_failures is None else Path(keep_failures).resolve()
         self.version = version
@@ -189,7 +195,21 @@ class ExecutableModel(UserModel):
         stated = [] if self.env is None else [sorted(self.env.items())]
         if self.record is not None:
             stated.append(["record", self.record_file, self.record.fingerprint])
+        if self.output_units:
+            stated.append(["output units", sorted(self.output_units.items())])
         self.fingerprint = self._digest(output, self.columns, self.version, *stated)
+
+    def _check_units(self) -> np.ndarray:
+        """SI values of the units in the output file, shape (n_channels, 1)."""
+        if callable(self.output) and self.output_units:
+            raise ValueError("ExecutableModel: output_units are those of a file; let the function return SI units")
+        names = [channel.name for channel in self.channels]
+        if unknown := [name for name in self.output_units if name not in names]:
+            raise ValueError(
+                f"ExecutableModel: output_units names {', '.join(unknown)}; the channels are {', '.join(names)}"
+            )
+        units = [self.output_units.get(channel.name, channel.si_unit) for channel in self.channels]
+        return np.array([[find_unit(u, c.dimension).factor] for u, c in zip(units, self.channels, strict=True)])
 
     def code_parts(self) -> dict[str, Any]:
         """Program, input files and user code as they are now, for the label of stored simulations."""
@@ -322,7 +342,7 @@ class ExecutableModel(UserModel):
                 else f"columns {', '.join(map(str, self.columns))}"
             )
             raise SimulationFailed(f"{self.output} has {table.shape[1]} columns, expected {wanted}")
-        return table[:, self.columns].T
+        return self._factors * table[:, self.columns].T
 
     def _keep(self, place: Path, values: dict[str, str], reason: str, seconds: float) -> None:
         """Move the folder of a failed run to `keep_failures`."""

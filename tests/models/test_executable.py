@@ -58,6 +58,22 @@ def test_parameters_and_responses_are_exact(options):
     np.testing.assert_array_equal(model_of(**options).simulate(theta), line(theta))
 
 
+def test_units_of_the_output_file():
+    usual, kilo = (
+        model_of(),
+        model_of(output_units={CHANNELS[0].name: {"m": "mm", "m/s2": "mm/s2"}[CHANNELS[0].si_unit]}),
+    )
+    np.testing.assert_allclose(kilo.simulate(THETA), 1e-3 * usual.simulate(THETA), rtol=1e-15)
+    assert kilo.fingerprint != usual.fingerprint == model_of(output_units={}).fingerprint
+    for given, message in (
+        ({"output_units": {"deck": "mm"}}, "output_units names deck; the channels are"),
+        ({"output_units": {CHANNELS[0].name: "kN"}}, "expected a unit of"),
+        ({"output_units": {CHANNELS[0].name: "mm"}, "output": lambda folder: None}, "let the function return SI units"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model_of(**given)
+
+
 def test_parameters_in_the_command_copied_files_and_an_output_function(tmp_path):
     data = tmp_path / "record.txt"
     data.write_text("17 $5\n")
