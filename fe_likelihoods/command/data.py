@@ -9,7 +9,17 @@ import numpy as np
 from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
 from ..signals.measurement_readers import read_columns
-from ..signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_record, read_smc, read_v2
+from ..signals.readers import (
+    read_at2,
+    read_csv,
+    read_esm,
+    read_geonet,
+    read_knet,
+    read_obspy,
+    read_record,
+    read_smc,
+    read_v2,
+)
 from ..signals.records import Record
 from .job import Job
 from .schema import did_you_mean
@@ -26,11 +36,12 @@ BUNDLED = {
 
 _FORMATS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
     "at2": (read_at2, ("units",)),
-    "v2": (read_v2, ("channel",)),
+    "v2": (read_v2, ("channel", "resample")),
     "smc": (read_smc, ("resample",)),
     "geonet": (read_geonet, ("column",)),
     "knet": (read_knet, ()),
     "esm": (read_esm, ()),
+    "obspy": (read_obspy, ("units", "column")),
     "csv": (read_csv, ("units", "dt", "column", "time_unit", "skip", "resample")),
     "dataset": (read_dataset, ()),
 }
@@ -102,8 +113,8 @@ def _read_record(job: Job, path: Path) -> Record:
     }
     if unused := sorted(set(options) - set(names)):
         raise ValueError(f"{unused[0]}: a file of format {name} has no such choice; leave it out")
-    if name == "geonet" and "column" in options:
-        options["component"] = options.pop("column")
+    if name in ("geonet", "obspy") and "column" in options:
+        options["component" if name == "geonet" else "channel"] = options.pop("column")
     found = reader(path, **options)
     return found.record if isinstance(found, Dataset) else found
 

@@ -106,11 +106,14 @@ def _v2(path: Path) -> _Lines:
             series = parse_v2(channel)
             values = to_si(series.values, series.unit, "acceleration")
         except ValueError as error:
-            refused.append(str(error))
+            refused.append(f"not read: {error}")
             continue
-        rows.append((str(channel.channel or "-"), *_cells(values, series.dt), channel.label, file))
+        step = series.dt if series.times is None else float(np.median(np.diff(series.times)))
+        rows.append((str(channel.channel or "-"), *_cells(values, step), channel.label, file))
+        if series.times is not None:
+            refused.append(f"uneven times in channel {column}: give resample = {nominal_step(step):.4g}")
         columns.append((f"ch{channel.channel}" if alone else _name_of_channel(file, set()), column))
-    text = [f"{len(columns)} channels of acceleration", text_table(rows), *(f"not read: {each}" for each in refused)]
+    text = [f"{len(columns)} channels of acceleration", text_table(rows), *refused]
     if len({row[1:3] for row in rows[1:]}) > 1:
         text.append(
             "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."

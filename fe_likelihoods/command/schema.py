@@ -195,10 +195,15 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key(
             "file",
             "text",
-            "Acceleration of the base: AT2, V2, SMC, GeoNet, K-NET, ESM, CSV, Excel, or a data set (.h5)",
+            "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, or a data set "
+            "(.h5)",
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
-        Key("format", "text", "One of at2, v2, smc, geonet, knet, esm, csv and dataset; by default it is recognised"),
+        Key(
+            "format",
+            "text",
+            "One of at2, v2, smc, geonet, knet, esm, obspy, csv and dataset; by default it is recognised",
+        ),
         Key("column", "text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)"),
         Key("channel", "whole number", "Channel of a V2 file"),
         Key("units", "text", "Unit of the acceleration, if the file does not state it"),

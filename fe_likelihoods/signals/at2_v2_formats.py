@@ -1,4 +1,4 @@
-"""File formats of ground motions: PEER AT2, and the V2 formats of CSMIP and COSMOS.
+"""File formats of ground motions: PEER AT2, and the formats V1 (uncorrected) and V2 of CSMIP and COSMOS.
 
 Each format has one function that returns plain numbers with the unit, the step and the title that the file states. The
 functions convert nothing. What a file does not state is None. A contradiction in a file raises ValueError with the file
@@ -10,11 +10,16 @@ CSMIP V2
     Per channel 25 lines of text, an integer header, a real header (100 numbers in columns of 10), and blocks of
     acceleration, velocity and displacement. Each block starts with a line such as
     ``3000 POINTS OF ACCEL DATA EQUALLY SPACED AT  .020 SEC.  (UNITS: CM/SEC/SEC)``, each channel ends with ``/&``.
-COSMOS V2 (format 1.20)
+CSMIP V1
+    Per channel 13 lines of text, an integer header (100 numbers in columns of 5), and a real header (50 numbers in
+    columns of 10; the third is the length [s], the seventh the peak [g]). Then follow ``13200 Accelerogram points at
+    200 pts/sec in units of g.  Format: (8f9.6)`` and samples, or pairs of a time [s] and a sample in columns of 7, with
+    the unit in the text.
+COSMOS V1 and V2 (format 1.20)
     Headers that state their length and Fortran format, then
     ``42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)``.
 
-Both V2 formats are Fortran columns without separators. They are split by width, never at blanks.
+These formats are Fortran columns without separators. They are split by width, never at blanks.
 """
 
 import io
@@ -31,7 +36,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .text_files import NUMBER, Series, check_count, is_number, parse_count, parse_number, read_bytes
+from .text_files import (
+    NUMBER,
+    Series,
+    check_count,
+    check_peak,
+    decimals_of,
+    is_number,
+    parse_count,
+    parse_number,
+    read_bytes,
+)
 
 __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
@@ -48,6 +63,14 @@ _COSMOS_DATA = re.compile(r"^\s*(\d+)\s+acceleration\s+pts\b.*?units\s*=\s*([^\s
 _COSMOS_REALS = re.compile(r"^\s*(\d+)\s+real-header\s+values\s+follow\s+on\s+(\d+)\s+lines", re.IGNORECASE)
 _COSMOS_END = re.compile(r"^\s*end-of-data", re.IGNORECASE)
 _FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
+_V1_FIRST = re.compile(r"\s*uncorrected accelerogram", re.IGNORECASE)
+_V1_DATA = re.compile(
+    rf"^\s*(\d+)\s+accelerogram\s+points\s+at\s*({NUMBER})\s*pts/sec\s+in\s+units\s+of\s+(\S+?)\s*\.", re.IGNORECASE
+)
+_V1_UNITS = re.compile(r"units\s+of\s+uncor\s+\w+\s+are\s+sec\s+and\s+(g/10|g)\b", re.IGNORECASE)
+_V1_TEXT, _V1_INTEGERS, _V1_REALS = 13, (100, 16, 5), (50, 8, 10)  # lines; numbers, per line, columns
+_V1_COUNT, _V1_LENGTH, _V1_PEAK, _V1_PAIRS = 28, 3, 7, (10, 7)  # positions in the headers, from 1
+_V1_HEADER = _V1_TEXT + math.ceil(100 / 16) + math.ceil(50 / 8)
 _CSMIP_FORMAT = (8, 10)  # numbers per line, columns per number
 _CSMIP_REALS, _CSMIP_DT = (
     100,
@@ -131,29 +154,41 @@ def _at2_header(line: str) -> tuple[str, str, str] | None:
 
 
 def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Channel]:
-    """Return the channels with corrected acceleration in a V2 file or zip archive (see `read_v2`)."""
+    """Return the channels with acceleration in a V1 or V2 file, or in the V2, else V1 files of an archive."""
     content = read_bytes(path)
     files = list(_unzip(content, str(path))) if zipfile.is_zipfile(io.BytesIO(content)) else [(str(path), content)]
     if member is not None:
         files = [(name, data) for name, data in files if name.lower().endswith(member.lower())]
-    elif len(files) > 1:
-        files = [(name, data) for name, data in files if name.lower().endswith((".v2", ".v2c"))]
+    elif len(files) > 1:  # corrected acceleration, if there is any
+        for ends in ((".v2", ".v2c"), (".v1", ".v1c")):
+            found = [(name, data) for name, data in files if name.lower().endswith(ends)]
+            if found:
+                break
+        files = found
     channels = [channel for name, data in files for channel in _split_v2(data.decode("latin-1"), name)]
     if not channels:
         raise ValueError(
-            f"{path}: expected a CSMIP or COSMOS V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT ...' or "
-            f"'N acceleration pts ...', found none in {len(files)} file(s)" + (f" named {member!r}" if member else "")
+            f"{path}: expected a CSMIP or COSMOS V1 or V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT "
+            f"...', 'N acceleration pts ...' or 'Uncorrected accelerogram', found none in {len(files)} file(s)"
+            + (f" named {member!r}" if member else "")
         )
     return sorted(channels, key=lambda each: (each.channel is None, each.channel or 0))
 
 
 def parse_v2(channel: V2Channel) -> Series:
-    """Return the corrected acceleration of one channel."""
+    """Return the acceleration of one channel."""
     where, lines = channel.file, channel.lines
+    if _is_v1(lines):
+        return _parse_v1(channel)
     index = next(i for i, line in enumerate(lines) if _CSMIP_DATA.match(line) or _COSMOS_DATA.match(line))
     line = lines[index]
-    if re.match(r"\s*(raw|uncorrected)", lines[0], re.IGNORECASE):
-        raise ValueError(f"{where}: expected corrected acceleration (V2), got {lines[0].strip()!r}")
+    if re.match(r"\s*raw", lines[0], re.IGNORECASE):
+        raise ValueError(
+            f"{where}: expected acceleration, got {lines[0].strip()!r}, counts of a recorder; take V1 or V2"
+        )
+    if _V1_FIRST.match(lines[0]):
+        raise ValueError(f"{where}: expected corrected acceleration in this form, got {lines[0].strip()!r}")
+    uncorrected = ", uncorrected" if re.match(r"\s*uncorrected", lines[0], re.IGNORECASE) else ""
     stated = _column_format(line, where)
     per_line, width = stated or _CSMIP_FORMAT
     if match := _CSMIP_DATA.match(line):
@@ -183,7 +218,52 @@ def parse_v2(channel: V2Channel) -> Series:
         )
     count = parse_count(match[1], f"{where}, line {channel.first + index}")
     values = _fixed_width(channel, index + 1, count, (per_line, width))
-    return Series(channel.label, dt, unit, values)
+    return Series(channel.label + uncorrected, dt, unit, values)
+
+
+def _is_v1(lines: list[str]) -> bool:
+    """Whether the lines of a channel are in the CSMIP format V1."""
+    first = bool(lines and _V1_FIRST.match(lines[0])) and len(lines) > _V1_HEADER
+    return first and not any(map(_CSMIP_DATA.match, lines))
+
+
+def _parse_v1(channel: V2Channel) -> Series:
+    """Return the uncorrected acceleration of one channel: at a constant rate, or with times."""
+    where, line = channel.file, channel.lines[_V1_HEADER]
+    reals = _V1_TEXT + math.ceil(_V1_INTEGERS[0] / _V1_INTEGERS[1])
+    length = _header_field(channel, reals, _V1_REALS[1:], _V1_LENGTH)
+    peak = _header_field(channel, reals, _V1_REALS[1:], _V1_PEAK)
+    times, dt = None, math.nan
+    if match := _V1_DATA.match(line):
+        dt, unit, form = 1.0 / float(match[2]), match[3], _column_format(line, where)
+        if form is None or not 0.0 < dt < math.inf:
+            raise ValueError(f"{where}, line {channel.first + _V1_HEADER}: expected a rate and a Format in {line!r}")
+        count = parse_count(match[1], where)
+        values = _fixed_width(channel, _V1_HEADER + 1, count, form)
+        if abs(count * dt - float(length)) > 2.0 * dt:
+            raise ValueError(
+                f"{where}: {count} samples at {1 / dt:g} per second are not {length} s; the file is damaged"
+            )
+        first = channel.lines[_V1_HEADER + 1][: form[1]]
+    else:
+        found = _V1_UNITS.search("\n".join(channel.lines[:_V1_TEXT]))
+        if found is None:
+            raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
+        unit = found[1]
+        count = parse_count(_header_field(channel, _V1_TEXT, _V1_INTEGERS[1:], _V1_COUNT), where)
+        pairs = _fixed_width(channel, _V1_HEADER, 2 * count, _V1_PAIRS)
+        times, values, first = pairs[::2], pairs[1::2], line[_V1_PAIRS[1] : 2 * _V1_PAIRS[1]]
+        step = float(np.diff(times).mean()) if count > 1 else math.nan
+        if np.all(
+            np.abs(times - times[0] - step * np.arange(count)) <= 10.0 ** -decimals_of(line[: _V1_PAIRS[1]].strip())
+        ):
+            times, dt = None, 1.0 / round(1.0 / step) if abs(1.0 / step - round(1.0 / step)) < 1e-3 / step else step
+    scale = 0.1 if unit.lower() == "g/10" else 1.0
+    rounding = 0.505 * (scale * 10.0 ** -decimals_of(first.strip()) + 10.0 ** -decimals_of(peak))
+    largest = scale * float(np.abs(values).max())
+    if unit.lower() in ("g", "g/10"):
+        check_peak(largest, abs(float(peak)), rounding, where)
+    return Series(f"{channel.label}, uncorrected", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times)
 
 
 class _Allowance:
@@ -236,7 +316,7 @@ def _split_v2(text: str, file: str) -> list[V2Channel]:
         if not end and index < len(lines) - 1:
             continue
         block = lines[first : index + (not end)]
-        if any(_CSMIP_DATA.match(each) or _COSMOS_DATA.match(each) for each in block):
+        if _is_v1(block) or any(_CSMIP_DATA.match(each) or _COSMOS_DATA.match(each) for each in block):
             head = "\n".join(block[:25])
             number = re.search(r"STA CHN:\s*(\d+)", head, re.IGNORECASE)
             label = re.search(r"^\s*(?:STA )?CHAN\s*(\d+|\?)\s*:[^\n]*", head, re.IGNORECASE | re.MULTILINE)
@@ -260,14 +340,24 @@ def _column_format(line: str, where: str) -> tuple[int, int] | None:
 
 
 def _header_number(channel: V2Channel, start: int, form: tuple[int, int], place: int) -> float:
-    """Return the number at a position (from 1) of a fixed-width header that starts at line `start` of the channel."""
-    row, column = divmod(place - 1, form[0])
-    where = f"{channel.file}, line {channel.first + start + row}: number {place} of the real header"
-    line = channel.lines[start + row] if 0 <= start + row < len(channel.lines) else ""
-    value = parse_number(line[column * form[1] : (column + 1) * form[1]].strip(), where)
+    """Return the time step at a position (from 1) of a fixed-width header that starts at a line of the channel."""
+    value = float(_header_field(channel, start, form, place))
     if not value > 0:
-        raise ValueError(f"{where} must be the time step [s], got {value}")
+        raise ValueError(
+            f"{channel.file}, line {channel.first + start}: number {place} of the real header must be the time step "
+            f"[s], got {value}"
+        )
     return value
+
+
+def _header_field(channel: V2Channel, start: int, form: tuple[int, int], place: int) -> str:
+    """Return the text of the number at a position (from 1) of a fixed-width header."""
+    row, column = divmod(place - 1, form[0])
+    where = f"{channel.file}, line {channel.first + start + row}: number {place} of the header"
+    line = channel.lines[start + row] if 0 <= start + row < len(channel.lines) else ""
+    field = line[column * form[1] : (column + 1) * form[1]].strip()
+    parse_number(field, where)
+    return field
 
 
 def _fixed_width(channel: V2Channel, start: int, count: int, form: tuple[int, int]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ..units import to_si
-from . import at2_v2_formats, smc_geonet_knet_esm_formats
+from . import at2_v2_formats, obspy_formats, smc_geonet_knet_esm_formats
 from .records import Record
 from .table_columns import csv_series
 from .tables import read_table
@@ -33,6 +33,7 @@ __all__ = [
     "read_esm",
     "read_geonet",
     "read_knet",
+    "read_obspy",
     "read_record",
     "read_smc",
     "read_v2",
@@ -190,16 +191,16 @@ def read_record(
     path : str or path
         A file, or a zip archive of CSMIP and COSMOS V2 files.
     channel : int or str, optional
-        Channel number or name of a file in the archive (V2), component (GeoNet) or column (CSV), if the file has more
-        than one.
+        Channel number or name of a file in the archive (V2), component (GeoNet), trace (miniSEED) or column (CSV), if
+        the file has more than one.
     units : str, optional
-        Unit of the acceleration, if an AT2 or CSV file does not state it.
+        Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it.
     missing : sequence of float, optional
         For a CSV file: numbers that stand for missing samples, as in `read_csv`.
     member : str, optional
         For a zip archive of V2 files: name of the file in the archive, if several have the channel.
     resample : float, optional
-        For a CSV or SMC file with uneven times: their nominal step [s], as in `read_csv`.
+        For a CSV, SMC or V1 file with uneven times: their nominal step [s], as in `read_csv`.
 
     Returns
     -------
@@ -214,19 +215,21 @@ def read_record(
     reader = recognise_reader(path)
     if reader == "read_smc":
         return read_smc(path, resample)
+    if reader == "read_v2":
+        return _read_v2(path, channel, member, resample)
     if reader is not None:
         if resample is not None:
             raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
-        return _READERS[reader](path, channel, units, member)
+        return _READERS[reader](path, channel, units)
     return _read_csv(path, units, column=channel, missing=missing, resample=resample)
 
 
 _READERS: dict[str, Callable[..., Record]] = {
-    "read_at2": lambda path, channel, units, member: read_at2(path, units),
-    "read_v2": lambda path, channel, units, member: _read_v2(path, channel, member),
-    "read_geonet": lambda path, channel, units, member: read_geonet(path, channel),
-    "read_knet": lambda path, channel, units, member: read_knet(path),
-    "read_esm": lambda path, channel, units, member: read_esm(path),
+    "read_at2": lambda path, channel, units: read_at2(path, units),
+    "read_geonet": lambda path, channel, units: read_geonet(path, channel),
+    "read_knet": lambda path, channel, units: read_knet(path),
+    "read_esm": lambda path, channel, units: read_esm(path),
+    "read_obspy": lambda path, channel, units: read_obspy(path, units, channel),
 }
 
 
@@ -247,18 +250,21 @@ def recognise_reader(path: str | Path) -> str | None:
     return reader
 
 
-def _read_v2(path: str | Path, channel: int | str | None, member: str | None) -> Record:
+def _read_v2(path: str | Path, channel: int | str | None, member: str | None, resample: float | None) -> Record:
     """`read_v2`, with a channel that may be a text: a number, or the name of a file in the archive."""
     if isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
-    return read_v2(path, channel, member)
+    return read_v2(path, channel, member, resample)
 
 
-def read_v2(path: str | Path, channel: int | None = None, member: str | None = None) -> Record:
-    """Read the corrected acceleration of one channel from a CSMIP or COSMOS V2 file, or from a zip archive of V2 files.
+def read_v2(
+    path: str | Path, channel: int | None = None, member: str | None = None, resample: float | None = None
+) -> Record:
+    """Read the acceleration of one channel from a CSMIP or COSMOS file V2 or V1, or from a zip archive of such files.
 
-    Archives may contain archives, as downloads of whole stations do. The unit is taken from the file, which must state
-    it.
+    Archives may contain archives, as downloads of whole stations do; V1 files in them are read if there are no V2
+    files. The unit is taken from the file, which must state it. V1 files are uncorrected, as the name of the record
+    says: their baseline may drift.
 
     Parameters
     ----------
@@ -270,6 +276,8 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
     member : str, optional
         End of the file name in the archive, such as ``"CHAN12.V2"`` or ``"Free Field.zip/CHAN012.V2"``. Needed if the
         archive contains a channel more than once.
+    resample : float, optional
+        Nominal step of a V1 file with uneven times, as in `read_csv`.
 
     Returns
     -------
@@ -292,8 +300,36 @@ def read_v2(path: str | Path, channel: int | None = None, member: str | None = N
             f"with channel= and member= among\n  {listing}"
         )
     series = at2_v2_formats.parse_v2(chosen[0])
-    record = _record(series, None, chosen[0].file, series.title)
+    record = _record(series, None, chosen[0].file, series.title, resample)
     return replace(record, source=chosen[0].file.removeprefix(f"{Path(path).parent}/"))
+
+
+def read_obspy(path: str | Path, units: str | None = None, channel: str | None = None) -> Record:
+    """Read a ground motion in miniSEED, SAC or GSE2 with the package obspy (``pip install obspy``).
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    units : str
+        Unit of the samples, which these formats do not state reliably.
+    channel : str, optional
+        End of the identifier of the trace, such as ``"HNZ"`` or ``"NZ.WEL.20.HNZ"``. Needed if there is more than one.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the trace.
+
+    Raises
+    ------
+    ValueError
+        If obspy is missing or cannot read the file, several traces match (the message lists them), the trace has gaps,
+        or its samples are counts of a recorder.
+    """
+    with named_format(path, "read_obspy"):
+        series = obspy_formats.parse_obspy(path, channel)
+    return _record(series, units, path, series.title)
 
 
 def read_csv(

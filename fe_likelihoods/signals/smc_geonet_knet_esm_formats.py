@@ -30,7 +30,17 @@ from numpy.typing import NDArray
 
 from ..units import from_si, to_si
 from .clock_times import is_clock
-from .text_files import NUMBER, Series, agree_on_unit, check_count, decimals_of, is_number, parse_count, parse_number
+from .text_files import (
+    NUMBER,
+    Series,
+    agree_on_unit,
+    check_count,
+    check_peak,
+    decimals_of,
+    is_number,
+    parse_count,
+    parse_number,
+)
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
@@ -48,11 +58,15 @@ _MOST_COMPONENTS = 100
 _LOOK = 40  # lines in which a format is recognised
 _READERS = {
     "PEER AT2": "read_at2",
+    "CSMIP or COSMOS V1": "read_v2",
     "CSMIP or COSMOS V2": "read_v2",
     "USGS SMC": "read_smc",
     "GeoNet": "read_geonet",
     "K-NET or KiK-net": "read_knet",
     "ESM or ITACA": "read_esm",
+    "miniSEED": "read_obspy",
+    "GSE2": "read_obspy",
+    "SAC": "read_obspy",
 }
 
 
@@ -87,7 +101,7 @@ def recognise(text: str) -> tuple[str, str | None]:
         Name of the function; None for a format that is not read.
     """
     lines = text[:8000].splitlines()
-    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text[:8])
+    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text[:8000])
     return name, _READERS.get(name)
 
 
@@ -104,11 +118,19 @@ def _is_table(lines: list[str]) -> bool:
     return False
 
 
-def _name_of(lines: list[str], start: str) -> str:
+def _is_sac(text: str) -> bool:
+    """Whether a file has the header of a binary SAC file: 632 bytes, with the version in the 77th word."""
+    version = text[304:308].encode("latin-1")
+    return (
+        len(text) > 632 and (version[1:] == b"\0\0\0" or version[:3] == b"\0\0\0") and 6 in version[:1] + version[-1:]
+    )
+
+
+def _name_of(lines: list[str], text: str) -> str:
     first = next((line.strip() for line in lines), "")
     head = "\n".join(lines)
     rules = (
-        ("HDF5", start.startswith("\x89HDF")),
+        ("HDF5", text.startswith("\x89HDF")),
         ("K-NET or KiK-net", first.startswith("Origin Time") and "Scale Factor" in head),
         ("ESM or ITACA", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
         ("USGS SMC", bool(re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first))),
@@ -119,12 +141,18 @@ def _name_of(lines: list[str], start: str) -> str:
             and any(line.startswith("Site ") for line in lines[1:2]),
         ),
         ("COSMOS V0 (raw acceleration)", bool(re.match(r"raw acc", first, re.IGNORECASE)) and "Format v0" in first),
-        (
-            "COSMOS V1 (uncorrected acceleration)",
-            bool(re.match(r"uncorrected acceleration\b", first, re.IGNORECASE)) and "Format v0" in first,
-        ),
-        ("CSMIP V1 (uncorrected)", bool(re.match(r"uncorrected accelerogram", first, re.IGNORECASE))),
+        ("CSMIP or COSMOS V1", bool(re.match(r"uncorrected acceler(ation\b|ogram)", first, re.IGNORECASE))),
         ("CSMIP or COSMOS V2", bool(re.match(r"corrected acc", first, re.IGNORECASE))),
+        ("CSMIP V3 (spectra)", bool(re.match(r"response and fourier", first, re.IGNORECASE))),
+        ("BHRC V1", first.startswith("* VOL1DS FILE")),
+        ("LabVIEW TDMS", text.startswith("TDSm")),
+        ("MATLAB", text.startswith("MATLAB 5.0 MAT-file")),
+        ("gzip", text.startswith("\x1f\x8b")),
+        ("PDF", text.startswith("%PDF")),
+        ("web page (HTML)", bool(re.match(r"<(!doctype )?html\b", first, re.IGNORECASE))),
+        ("miniSEED", bool(re.match(r"\d{6}[DRQM][ \0]|MS\x03", text))),
+        ("GSE2", text.startswith("WID2 ")),
+        ("SAC", _is_sac(text)),
         ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
         ("Taiwan CWB or SMART", first.startswith("#StationCode")),
     )
@@ -160,7 +188,7 @@ def parse_smc(text: str, file: str) -> Series:
         times, values = values[::2], values[1::2]
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
-            _check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
+            check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
     station = next((line.strip() for line in lines[2:_SMC_TEXT] if line.startswith("station")), title)
     return Series(re.sub(r"\s+", " ", station), math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 
@@ -207,7 +235,7 @@ def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetCo
     values = scale * _samples(lines, first, counts[0], _GEONET_DATA, file)
     # both numbers are rounded to the digits that are printed
     rounding = scale * 10.0 ** -decimals_of(lines[first][: _GEONET_DATA[1]].strip()) + 10.0 ** -decimals_of(peak[1])
-    _check_peak(float(np.abs(values).max()), abs(float(peak[1])), 0.505 * rounding, where)
+    check_peak(float(np.abs(values).max()), abs(float(peak[1])), 0.505 * rounding, where)
     end = first + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
     if end > len(lines):
         raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
@@ -244,7 +272,7 @@ def parse_knet(text: str, file: str) -> Series:
     if stated is None:
         raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")
     peak = parse_number(stated, f"{file}, Max. Acc.")
-    _check_peak(float(np.abs(values).max()), peak, 2e-3 * abs(peak) + 2e-3, file)
+    check_peak(float(np.abs(values).max()), peak, 2e-3 * abs(peak) + 2e-3, file)
     title = f"{header['Station Code']}, channel {header['Dir']}, mean subtracted"
     return Series(title, 1.0 / rate, "gal", values)
 
@@ -278,7 +306,7 @@ def parse_esm(text: str, file: str) -> Series:
         unit = agree_on_unit(header["UNITS"], None, "acceleration", file)
         scale = float(from_si(to_si(1.0, unit), "cm/s2"))
         found = scale * float(np.abs(values).max())
-        _check_peak(found, peak, 1e-4 * peak + 2e-6 * scale, file)
+        check_peak(found, peak, 1e-4 * peak + 2e-6 * scale, file)
     title = f"{header.get('NETWORK', '')}.{header['STATION_CODE']} {header['STREAM']}"
     return Series(title, dt, header["UNITS"], values)
 
@@ -318,12 +346,3 @@ def _whole(number: float, file: str, what: str) -> int:
     if not 0.0 <= number < 1e9 or abs(number - round(number)) > 1e-6:
         raise ValueError(f"{file}: expected a number of {what}, got {number:g}")
     return parse_count(str(round(number)), file)
-
-
-def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
-    """Raise ValueError if the stated peak is not the peak of the samples."""
-    if not abs(found - stated) <= tolerance:
-        raise ValueError(
-            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
-            "another form than the one that is read here"
-        )

@@ -16,6 +16,7 @@ __all__ = [
     "Series",
     "agree_on_unit",
     "check_count",
+    "check_peak",
     "decimals_of",
     "is_number",
     "parse_count",
@@ -115,6 +116,15 @@ def check_count(found: int, stated: int, where: str) -> None:
     """Raise ValueError if a file has another number of samples than it announces."""
     if found != stated:
         raise ValueError(f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged")
+
+
+def check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
+    """Raise ValueError if the stated peak is not the peak of the samples."""
+    if not abs(found - stated) <= tolerance:
+        raise ValueError(
+            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
+            "another form than the one that is read here"
+        )
 
 
 def parse_number(field: str, where: str) -> float:

@@ -55,6 +55,32 @@ def geonet(components, dt, corrected=True):
     return lines
 
 
+def csmip_v1(values, rate, pairs=False, channel=2):
+    """Lines of one channel in a CSMIP V1 file, in g, or in pairs of times and g/10."""
+    n, peak = len(values), values[np.argmax(np.abs(values))]
+    integers, reals = [0] * 100, [0.0] * 50
+    integers[27], reals[2], reals[6] = n, n / rate, round(peak, 3 if pairs else 6)
+    text = [
+        "Uncorrected Accelerogram Data             Processed: 01/01/20, synthetic",
+        *["synthetic"] * 5,
+        f"Chan  {channel}: 360 Deg",
+        *["synthetic"] * 4,
+        f"Units of uncor {'accel' if pairs else 'data'} are sec and {'g/10' if pairs else 'g'}.   Max = {peak:.3f} g",
+        "RMS",
+    ]
+    header = [
+        *("".join(f"{n:5d}" for n in integers[k : k + 16]) for k in range(0, 100, 16)),
+        *("".join(f"{n:10.{3 if pairs else 6}f}" for n in reals[k : k + 8]) for k in range(0, 50, 8)),
+    ]
+    end = [f"/&  ----------  End of data for channel {channel}"]
+    if pairs:
+        cells = [f"{cell:7.3f}" for k, value in enumerate(values) for cell in (k / rate, 10 * value)]
+        return [*text, *header, *("".join(cells[k : k + 10]) for k in range(0, len(cells), 10)), *end]
+    line = f" {n} Accelerogram points at {rate} pts/sec in units of g.       Format: (8f9.6)  "
+    cells = [f"{value:9.6f}" for value in values]
+    return [*text, *header, line, *("".join(cells[k : k + 8]) for k in range(0, n, 8)), *end]
+
+
 def knet(counts, rate, scale=(3920, 6182761)):
     """Lines of a K-NET file."""
     acceleration = (np.asarray(counts) - np.mean(counts)) * scale[0] / scale[1]

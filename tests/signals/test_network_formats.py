@@ -1,11 +1,14 @@
 """Formats of strong-motion networks: original files where there are some, and synthetic ones."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
 from fe_likelihoods import read_record
 from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
-from tests.signals.network_files import esm, geonet, knet, smc
+from fe_likelihoods.units import G0
+from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, write_at2
 
 VALUES = 30.0 * np.sin(0.3 * np.arange(61.0)) * np.exp(-0.02 * np.arange(61.0))
@@ -192,18 +195,66 @@ def test_other_formats_are_named(tmp_path, name):
 
 def test_formats_that_are_not_read_are_named(tmp_path):
     raw = ["Raw acceleration counts   (Format v01.20 with 13 text lines)", "x", "1 2 3"]
-    uncorrected = ["Uncorrected acceleration  (Format v01.20 with 13 text lines)", "x", "1 2 3"]
     hdf5 = tmp_path / "a.h5"
     hdf5.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     cases = (
         (write(tmp_path / "a.V0", raw), "COSMOS V0 .raw acceleration."),
-        (write(tmp_path / "a.V1", uncorrected), "COSMOS V1 .uncorrected acceleration."),
+        (write(tmp_path / "a.V3", ["RESPONSE AND FOURIER AMPLITUDE SPECTRA", "x"]), "CSMIP V3 .spectra."),
+        (write(tmp_path / "a.htm", ["<!DOCTYPE html>", "<html>"]), "web page .HTML."),
+        (write(tmp_path / "b.V1", ["* VOL1DS FILE:  5522/01", "x"]), "BHRC V1"),
         (hdf5, "HDF5"),
     )
     for path, name in cases:
         for read in (read_record, read_csv, read_at2, read_v2):
             with pytest.raises(ValueError, match=f"this looks like an? {name} file, which is not read"):
                 read(path)
+
+
+V1 = 0.003 * VALUES
+
+
+def test_uncorrected_acceleration_of_csmip_and_cosmos(tmp_path):
+    path = write(tmp_path / "a.V1", csmip_v1(V1, 200) + csmip_v1(-2 * V1, 200, channel=3))
+    record = read_record(path, 3)
+    assert record.dt == 0.005 and record.name == "Chan 3: 360 Deg, uncorrected"
+    np.testing.assert_allclose(record.acceleration / G0, -2 * V1, atol=0.51e-6)
+    record = read_record(write(tmp_path / "b.V1", csmip_v1(V1, 200, pairs=True)))
+    assert record.dt == 0.005
+    np.testing.assert_allclose(record.acceleration / G0, V1, atol=0.51e-4)
+    lines = changed(cosmos(1, VALUES, 0.005), "Corrected acceleration", "Uncorrected acceleration")
+    record = read_record(write(tmp_path / "c.V1c", lines))
+    assert record.name.endswith(", uncorrected") and record.dt == 0.005
+    with zipfile.ZipFile(tmp_path / "d.zip", "w") as archive:
+        archive.write(path, "CHAN002.V1")
+        archive.write(tmp_path / "b.V1", "raw/CHAN002.V0")
+    assert read_record(tmp_path / "d.zip", 2).dt == 0.005
+
+
+def test_v1_with_uneven_times(tmp_path):
+    lines = csmip_v1(V1, 100, pairs=True)
+    lines[27] = lines[27].replace("  0.010", "  0.013")
+    with pytest.raises(ValueError, match="samples are at uneven times; give their nominal step, resample=0.01"):
+        read_record(write(tmp_path / "a.V1", lines))
+    assert read_record(tmp_path / "a.V1", resample=0.01).dt == 0.01
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (csmip_v1(V1, 200)[:-3], "after 48 of the 61 samples|expected 8 numbers of 9 columns, got"),
+        (csmip_v1(V1, 200, pairs=True)[:-2], "the file is truncated or damaged"),
+        (changed(csmip_v1(V1, 200), f"{max(V1):10.6f}", f"{max(V1) + 1e-4:10.6f}"), "the header states a peak of"),
+        (changed(csmip_v1(V1, 200), "200 pts/sec", "100 pts/sec"), "61 samples at 100 per second are not 0.305.* s"),
+        (
+            changed(csmip_v1(V1, 200, pairs=True), "sec and g/10", "cm"),
+            "expected 'Units of uncor data are sec and g' or",
+        ),
+        (changed(csmip_v1(V1, 200, pairs=True), "sec and g/10", "sec and g"), "the header states a peak of"),
+    ],
+)
+def test_damaged_v1_files(tmp_path, lines, message):
+    with pytest.raises(ValueError, match=message):
+        read_v2(write(tmp_path / "a.V1", lines))
 
 
 def test_read_record_recognises_the_others(tmp_path):

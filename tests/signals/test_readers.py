@@ -365,7 +365,7 @@ class TestV2OnRealZips:
         assert read_v2(path).n_steps == 1138
         truncated = tmp_path / "cut.zip"
         truncated.write_bytes((shared / MELOLAND).read_bytes()[:50_000])
-        with pytest.raises(ValueError, match="cut.zip: expected a CSMIP or COSMOS V2 file"):
+        with pytest.raises(ValueError, match="cut.zip: expected a CSMIP or COSMOS V1 or V2 file"):
             read_v2(truncated)
 
 
