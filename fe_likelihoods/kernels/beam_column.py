@@ -44,7 +44,10 @@ PER_SECTION = 7
 MAX_PASSES = 10
 MAX_PASSES_INITIAL = 100
 MAX_SUBDIVISIONS = 4
-MAX_ATTEMPTS = 3000
+MAX_ATTEMPTS = 300
+"""Passes over the sections, in all attempts together."""
+MAX_RISES = 3
+"""An attempt has failed when its error has increased tenfold this often: its passes go round in a circle."""
 
 
 class Elements(NamedTuple):
@@ -144,6 +147,7 @@ def advance(v1, v2, v3, element, elements, sections):
     scheme = 0
     subdivision = 0
     passes = 0
+    rises, last_error = 0, math.inf
     for k in range(n_state):
         work[1, k] = work[0, k]
     target1, target2, target3 = v1, v2, v3
@@ -204,6 +208,9 @@ def advance(v1, v2, v3, element, elements, sections):
         work[1, 2] = q3 + d3
         error = abs(r1 * d1 + r2 * d2 + r3 * d3)
         passes += 1
+        if error > 10.0 * last_error:
+            rises += 1
+        last_error = error
         if error < elements.tolerance:
             work[1, 3], work[1, 4], work[1, 5] = k11, k12, k13
             work[1, 6], work[1, 7], work[1, 8] = k22, k23, k33
@@ -218,12 +225,11 @@ def advance(v1, v2, v3, element, elements, sections):
             for k in range(n_state):
                 work[0, k] = work[1, k]
             part1, part2, part3 = rest1, rest2, rest3
-            scheme, passes, subdivision = 0, 0, 0
+            scheme, subdivision = 0, 0
         else:
             limit = MAX_PASSES_INITIAL if scheme == 1 else MAX_PASSES
-            if passes < limit and math.isfinite(error):
+            if passes < limit and rises < MAX_RISES and math.isfinite(error):
                 continue
-            passes = 0
             if scheme < 2:
                 scheme += 1
             else:
@@ -233,6 +239,7 @@ def advance(v1, v2, v3, element, elements, sections):
                 scheme = 0
                 part1, part2, part3 = 0.1 * part1, 0.1 * part2, 0.1 * part3
         # The next attempt starts from the last state that was reached.
+        passes, rises, last_error = 0, 0, math.inf
         for k in range(n_state):
             work[1, k] = work[0, k]
         if subdivision == 0:

@@ -2,10 +2,11 @@
 
 Newton's method on the equilibrium of forces, K du = load - force(u), with the tangent K. The increment of an imposed
 displacement replaces the row of its degree of freedom, and the required force is the restoring force there. A step that
-does not converge is repeated with a tolerance a hundred times larger, then halved. At the smallest part of a step,
-fibers next to a stress jump are taken across the jump (`fiber_section.cross_jumps`). If this does not help, the column
-may have lost the axial load: after many bars have fractured, the others yield in compression while the cracks are open.
-The top is then lowered until the cracks close and the load is carried again.
+does not converge is repeated with a tolerance a hundred times larger if its iteration has reached this tolerance, then
+halved. At the smallest part of a step, fibers next to a stress jump are taken across the jump
+(`fiber_section.cross_jumps`). If this does not help, the column may have lost the axial load: after many bars have
+fractured, the others yield in compression while the cracks are open. The top is then lowered until the cracks close and
+the load is carried again.
 
 ``docs/theory/time_integration.rst`` describes the steps and the retries.
 """
@@ -105,8 +106,9 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
 
     Returns
     -------
-    bool
-        True on success; the fibers are then committed. False on failure; nothing has then changed.
+    float
+        Smallest norm of a correction that all elements could follow. Below `tolerance`, the position is in equilibrium
+        and the fibers are committed. Otherwise nothing has changed, and a tolerance above this norm is reached.
     """
     u, force, stiffness = position.u, position.force, position.stiffness
     n = u.shape[0]
@@ -116,7 +118,7 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
     copy_vector(force, force_before)
     copy_matrix(stiffness, stiffness_before)
     copy_matrix(column.elements.state, column.state_before)
-    step = increment
+    step, least = increment, math.inf
     for _ in range(max_iterations):
         for i in range(n):
             du[i] = load[i] - force[i]
@@ -143,14 +145,15 @@ def equilibrate(column, position, load, imposed, increment, held, tolerance, max
             norm += du[i] * du[i]
         if not math.isfinite(norm) or not assemble(u, column, force, stiffness):
             break
-        if math.sqrt(norm) < tolerance:
+        least = min(least, math.sqrt(norm))
+        if least < tolerance:
             commit_sections(column)
-            return True
+            return least
     copy_vector(u_before, u)
     copy_vector(force_before, force)
     copy_matrix(stiffness_before, stiffness)
     copy_matrix(column.state_before, column.elements.state)
-    return False
+    return least
 
 
 @kernel
@@ -174,10 +177,12 @@ def lower(column, position, load, imposed, iteration):
     move = downwards * LOWERING * column.length * column.elements.state.shape[0]
     tolerance, max_iterations = LOOSENING * iteration.tolerance, iteration.max_iterations
     for count in range(MAX_LOWERINGS):
-        if not equilibrate(column, position, load, vertical, move, imposed, tolerance, max_iterations):
+        if equilibrate(column, position, load, vertical, move, imposed, tolerance, max_iterations) >= tolerance:
             return False
         if downwards * position.force[vertical] >= downwards * load[vertical]:
-            return count > 0 and equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations)
+            if count == 0:
+                return False
+            return equilibrate(column, position, load, imposed, 0.0, -1, tolerance, max_iterations) < tolerance
     return False
 
 
@@ -194,16 +199,19 @@ def _advance_to(column, position, load, total, share, imposed, increment, iterat
     """
     done, part, retries, crossings, lowerings = 0.0, 1.0, 0, 0, 0
     smallest = 0.5**iteration.halvings
-    tolerance, max_iterations = iteration.tolerance, iteration.max_iterations
+    max_iterations = iteration.max_iterations
     while done < 1.0:
         for i in range(load.shape[0]):
             load[i] += part * share * total[i]
         move = part * increment
-        converged = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
-        if not converged:
+        tolerance = iteration.tolerance
+        reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
+        if reached >= tolerance:
             retries += 1
-            converged = equilibrate(column, position, load, imposed, move, -1, LOOSENING * tolerance, max_iterations)
-        if converged:
+            tolerance *= LOOSENING
+            if reached < tolerance:
+                reached = equilibrate(column, position, load, imposed, move, -1, tolerance, max_iterations)
+        if reached < tolerance:
             done += part
             continue
         for i in range(load.shape[0]):

@@ -300,6 +300,16 @@ def test_impossible_step_ends_the_run_with_its_number(column, motion):
     np.testing.assert_array_equal(history[:, :status], shorter)
 
 
+def test_a_larger_tolerance_is_tried_where_the_iteration_has_reached_it(motion):
+    """The repetition converges, and the run is as one whose tolerance is larger from the beginning."""
+    weak, tolerance, limited = motion[:600], 1e-13, dict(max_iterations=3, halvings=0)
+    (status, _, _), expected = run(golden.column(golden.circle()), weak, tolerance=100.0 * tolerance, **limited)
+    (again, retries, _), history = run(golden.column(golden.circle()), weak, tolerance=tolerance, **limited)
+    assert (status, again) == (0, 0)
+    assert retries > 0
+    np.testing.assert_allclose(history[0], expected[0], rtol=0, atol=1e-12 * np.abs(expected[0]).max())
+
+
 def test_nan_in_the_ground_motion_ends_the_run(column, motion):
     ground = motion[:100].copy()
     ground[50] = np.nan

@@ -781,7 +781,7 @@ def test_a_jump_of_the_steel_law_is_crossed(shared):
     record = read_csv(path).scale(0.85).trim(0.0, 12.0)
     theta = [0.5284587364146686, 1.0214677685625493, 0.32405312400652414, 0.9625611775286573, 1.432206729992988]
     crossed = RCColumn.lhpost(record).history(theta)
-    assert crossed.retries > 10
+    assert crossed.retries == 11  # of the step, its half, ..., its 1024th part; a larger tolerance is never reached
     response = crossed.values[:2]
     finer = RCColumn.lhpost(record, substeps=2).history(theta).values[:2]
     error = np.sqrt(np.sum((response - finer) ** 2, axis=1) / np.sum(finer**2, axis=1))
