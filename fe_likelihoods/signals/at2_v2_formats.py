@@ -251,13 +251,14 @@ def _parse_v1(channel: V2Channel) -> Series:
             raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
         unit = found[1]
         count = parse_count(_header_field(channel, _V1_TEXT, _V1_INTEGERS[1:], _V1_COUNT), where)
+        if count < 2:
+            raise ValueError(f"{where}: expected two samples or more, the header announces {count}")
         pairs = _fixed_width(channel, _V1_HEADER, 2 * count, _V1_PAIRS)
         times, values, first = pairs[::2], pairs[1::2], line[_V1_PAIRS[1] : 2 * _V1_PAIRS[1]]
-        step = float(np.diff(times).mean()) if count > 1 else math.nan
-        if np.all(
-            np.abs(times - times[0] - step * np.arange(count)) <= 10.0 ** -decimals_of(line[: _V1_PAIRS[1]].strip())
-        ):
-            times, dt = None, 1.0 / round(1.0 / step) if abs(1.0 / step - round(1.0 / step)) < 1e-3 / step else step
+        step, digit = float(times[-1] - times[0]) / (count - 1), 10.0 ** -decimals_of(line[: _V1_PAIRS[1]].strip())
+        if step > 0.0 and np.all(np.abs(times - times[0] - step * np.arange(count)) <= digit):
+            rate = round(1.0 / step)
+            times, dt = None, 1.0 / rate if rate and abs(1.0 / rate - step) <= digit / (count - 1) else step
     scale = 0.1 if unit.lower() == "g/10" else 1.0
     rounding = 0.505 * (scale * 10.0 ** -decimals_of(first.strip()) + 10.0 ** -decimals_of(peak))
     largest = scale * float(np.abs(values).max())

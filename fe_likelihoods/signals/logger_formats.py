@@ -51,6 +51,11 @@ def _bracketed(units: list[str]) -> list[str]:
     return [f"[{unit}]" if unit else "" for unit in units]
 
 
+def _without_comment(cells: list[str], width: int) -> list[str]:
+    """Cells of a row without the text in the column of comments; numbers in it show that the row is damaged."""
+    return cells[:width] if len(cells) == width + 1 and not any(map(str.isdigit, cells[width])) else cells
+
+
 def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
     ends = [place for place, (_, cells) in enumerate(lines) if cells[0] == _END]
     if len(ends) != 2:
@@ -74,7 +79,7 @@ def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
     table = [
         (number, ["time [s]", *header[1:width]]),
         (number, _bracketed(["s", *units, *[""] * (width - 1 - len(units))])),
-        *((number, cells[:width]) for number, cells in rows),
+        *((number, _without_comment(cells, width)) for number, cells in rows),
     ]
     if columns != "No":
         return table, []

@@ -203,7 +203,8 @@ def _ungrouped(rows: list[tuple[int, list[str]]], file: str) -> list[tuple[int, 
     if found is None:
         return rows
     mark = next(letter for letter in found[1] if letter in ",.")
-    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:[.,]\d*)?$")
+    decimal = "." if mark == "," else ","
+    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{decimal}\d*)?$")
     for number, cells in rows:
         for k, cell in enumerate(cells):
             if mark in cell and grouped.match(cell):

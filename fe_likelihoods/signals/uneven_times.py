@@ -108,8 +108,8 @@ def uniform_times(times: NDArray[np.float64], step: float, where: str) -> Unifor
     Raises
     ------
     ValueError
-        If the times do not increase, or the step differs from their usual step by more than 5 %: another step would
-        need a filter (`Record.resample`, `Measurements.decimate`).
+        If the times do not increase, more than half of the samples are missing, or the step differs from their usual
+        step by more than 5 %: another step would need a filter (`Record.resample`, `Measurements.decimate`).
     """
     step = check_step(step, f"resample of {where}")
     increments = np.diff(times)
@@ -129,5 +129,10 @@ def uniform_times(times: NDArray[np.float64], step: float, where: str) -> Unifor
     others = increments[increments <= _GAP * usual]
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
+    if times[-1] - times[0] > 2 * times.size * step:
+        raise ValueError(
+            f"{where}: expected samples at most times, got {times.size} in {times[-1] - times[0]:.4g} s with a gap of "
+            f"{gaps.max():.4g} s; cut the file at its long gaps"
+        )
     uniform = times[0] + step * np.arange(int((times[-1] - times[0]) / step + 1e-6) + 1)
     return UniformTimes(times, uniform, usual, gaps, note)

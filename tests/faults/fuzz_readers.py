@@ -3,6 +3,9 @@
 ``python -m tests.faults.fuzz_readers --files 20000`` prints what came of them, by reader. Files are made from small
 valid ones by flipping, deleting, repeating and inserting bytes. Each hundred is read in a forked process, so that a
 crash of a library is counted as well.
+
+Styles of logger files are also changed in the marks between their digits and in the order of their rows: they must be
+refused, or read with the same samples (`altered`).
 """
 
 import argparse
@@ -24,9 +27,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
+from fe_likelihoods.command.listing import describe_data
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
-from tests.signals.network_files import esm, geonet, knet, smc
+from fe_likelihoods.units import G0
+from tests.signals.logger_styles import ACCELERATION, READ, STEP
+from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 
 SLOW = 5.0
@@ -100,7 +106,12 @@ def cases(folder):
     write_dataset(folder / "valid.h5", record, measured, {"truth": [1.0, 2.0]})
     forms = [csmip(1, values, 0.0125, " .013 sec, in cm/sec2. (8f10.6)"), cosmos(1, values, 0.005)]
     v2 = ["\n".join(lines).encode() for lines in forms]
-    archives = [zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", v2[-1])]))])]
+    v2 += ["\n".join(csmip_v1(values, 200, pairs, channel=1)).encode() for pairs in (False, True)]
+    styles = [text.encode() for text in READ.values()]
+    uneven = "\n".join(smc(values, 1.7e38, times=0.01 * np.arange(23) ** 1.01)).encode()
+    archives = [
+        zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", "\n".join(cosmos(2, values, 0.005)).encode())]))])
+    ]
     networks = (
         ("smc", read_smc, smc(values, 200.0)),
         ("V2A", lambda path: read_geonet(path, "Up"), geonet({"N": values, "Up": 2.0 * values}, 0.02)),
@@ -113,7 +124,10 @@ def cases(folder):
         Case("zip", lambda path: read_v2(path, channel=1), archives),
         *(Case(name, read, ["\n".join(lines).encode()]) for name, read, lines in networks),
         Case("any", read_record, [*at2, *csv, v2[0], *("\n".join(lines).encode() for _, _, lines in networks)]),
-        Case("csv", read_csv, csv),
+        Case("csv", read_csv, csv + styles),
+        Case("uneven.csv", lambda path: read_csv(path, resample=0.02), csv + styles),
+        Case("uneven.smc", lambda path: read_smc(path, resample=0.01), [uneven]),
+        Case("listed", describe_data, [*at2, *csv, *styles, *v2, uneven, archives[0]]),
         Case("columns.csv", lambda path: read_columns(path, [TOP], ["acc_g"]), csv[1:2]),
         Case("h5", read_dataset, [(folder / "valid.h5").read_bytes()]),
     ]
@@ -139,6 +153,49 @@ def damage(data, choose):
         else:
             del data[place:]
     return bytes(data)
+
+
+MARKS = ",.;\t '\n\""
+
+
+def altered(text, choose):
+    """A text with one mark among the digits of its rows replaced or inserted, or a row left out, repeated or moved."""
+    lines = text.splitlines()
+    rows = [k for k, line in enumerate(lines) if sum(letter.isdigit() for letter in line) > 3 and k >= len(lines) - 8]
+    row = choose.choice(rows[1:-1])
+    kind = choose.randrange(5)
+    if kind == 0:
+        del lines[row]
+    elif kind == 1:
+        lines.insert(row, lines[row])
+    elif kind == 2:
+        lines[row], lines[row + 1] = lines[row + 1], lines[row]
+    else:
+        line = lines[row]
+        places = [k for k, letter in enumerate(line) if letter in MARKS] if kind == 3 else range(1, len(line))
+        place = choose.choice(list(places) or [1])
+        lines[row] = line[:place] + choose.choice(MARKS) + line[place + (kind == 3) :]
+    return "\n".join(lines) + "\n"
+
+
+def wrong_in_silence(number, seed, path):
+    """Altered texts that are read with other samples than the original, as (style, text)."""
+    wrong = []
+    styles = [style for style in READ if "without times" not in style]
+    for index in range(number):
+        choose = random.Random(1_000_003 * seed + index)
+        style = styles[index % len(styles)]
+        text = altered(READ[style], choose)
+        path.write_text(text, encoding="utf-8")
+        column = {"Campbell TOA5": "Top", "missing channel beside": "acc_g"}.get(style)
+        try:
+            record = read_csv(path, column=column)
+        except ValueError:
+            continue
+        found = record.acceleration / G0
+        if found.shape != (8,) or abs(record.dt - STEP) > 1e-9 or np.abs(found - ACCELERATION).max() > 1e-5:
+            wrong.append((style, text))
+    return wrong
 
 
 def read_damaged(case, data, path):
@@ -207,10 +264,14 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         counts, bad = fuzz(args.files, args.seed, Path(folder), show=print)
+        wrong = wrong_in_silence(args.files // 4, args.seed, Path(folder) / "altered.csv")
+    for style, text in wrong[:20]:
+        print(f"WRONG IN SILENCE: {style}\n{text}")
     for (name, found), count in sorted(counts.items()):
         print(f"{name:14s}{found:24s}{count:7d}")
     print(f"{sum(counts.values())} files in {time.perf_counter() - start:.0f} s, {len(bad)} bad")
-    return 1 if bad else 0
+    print(f"{args.files // 4} altered files, {len(wrong)} wrong in silence")
+    return 1 if bad or wrong else 0
 
 
 if __name__ == "__main__":

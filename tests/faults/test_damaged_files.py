@@ -9,7 +9,8 @@ import pytest
 from fe_likelihoods import Channel, Measurements, Record
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
-from tests.faults.fuzz_readers import fuzz, zipped
+from fe_likelihoods.units import G0
+from tests.faults.fuzz_readers import fuzz, wrong_in_silence, zipped
 from tests.signals.test_readers import cosmos
 
 SECONDS = 3.0
@@ -27,6 +28,25 @@ def refused(read, path, content, match):
 def test_fuzz(tmp_path):
     counts, bad = fuzz(420, 1, tmp_path, forked=False)
     assert not bad and sum(counts.values()) == 420
+
+
+def test_altered_styles_of_loggers_are_refused_or_read_right(tmp_path):
+    assert wrong_in_silence(1500, 1, tmp_path / "a.csv") == []
+
+
+def test_control_of_altered_styles(tmp_path, monkeypatch):
+    """A reader that takes the last mark of a cell for its decimal point is found."""
+    monkeypatch.setattr("tests.faults.fuzz_readers.read_csv", careless)
+    assert len(wrong_in_silence(300, 1, tmp_path / "a.csv")) > 50
+
+
+def careless(path, column=None):
+    """A reader without checks: times and values of all rows that have two numbers."""
+    rows = [line.replace(",", ".").replace(";", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
+    values = [float(row[-1]) for row in rows if len(row) > 1 and row[-1].replace(".", "", 1).lstrip("-").isdigit()]
+    if len(values) < 2:
+        raise ValueError
+    return Record("a", 0.02, G0 * np.array(values))
 
 
 def nested(depth):
