@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from fe_likelihoods import SimulationCache
+from fe_likelihoods import Channel, SimulationCache, read_columns, read_record
 from fe_likelihoods.command.job import parse_job, read_job
 from fe_likelihoods.command.main import _plain_warnings, main
 from fe_likelihoods.command.models import make_problem
@@ -27,6 +27,7 @@ from fe_likelihoods.units import DIMENSIONS
 from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables
 from tests.opensees_column import require_opensees
+from tests.signals.test_readers import csmip
 
 ROOT = Path(__file__).resolve().parents[2]
 OSCILLATOR = """
@@ -408,6 +409,23 @@ def test_slashes_in_names_of_channels(tmp_path, monkeypatch):
     assert "acc/top" in (tmp_path / "results-function" / "report.html").read_text(encoding="utf-8")
     assert "sigma_disp/top" in (tmp_path / "results-function" / "summary.csv").read_text()
     assert "acc_top" in arviz.from_netcdf(str(tmp_path / "results-function" / "posterior.nc"))["observed_data"]
+
+
+def test_accelerations_of_a_v2_file(folder):
+    base = read_record(folder / "base.csv").acceleration
+    top = read_columns(folder / "top.csv", [Channel("top", "acceleration", "g")], ["top [g]"]).values[0]
+    lines = [csmip(k, 100 * row, 0.02, "  .020 sec, in cm/sec2. (8f10.4)", 10, 4) for k, row in ((3, base), (7, top))]
+    (folder / "both.v2").write_text("\n".join(lines[0] + lines[1]))
+    (folder / "frame.toml").write_text(
+        "[model]\nkind = 'frame'\nmasses = [1.0]\nstiffnesses = [62.0]\nfloors = {top = 1}\n"
+        "[record]\nfile = 'both.v2'\nchannel = 3\n[measurements]\nfile = 'both.v2'\ncolumns = {top = 7}\n"
+        "[priors]\nstiffness_1 = 'normal(1, 0.3)'\ndamping_1 = 'normal(0.05, 0.02)'\n"
+    )
+    found = make_problem(read_job(folder / "frame.toml"))
+    measured = found.posterior.likelihood.measurements
+    np.testing.assert_allclose(measured.channel("top"), top, atol=1e-6)
+    np.testing.assert_allclose(found.record.acceleration, base, atol=1e-6)
+    assert "top is Chan 7: 360 Deg" in measured.description
 
 
 def test_uneven_times_are_told(folder):
