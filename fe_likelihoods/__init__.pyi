@@ -47,6 +47,7 @@ from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Unifor
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
+from .reporting.fit_gate import check_fit
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
@@ -111,6 +112,7 @@ __all__ = [
     "align",
     "arias_intensity",
     "average_predictions",
+    "check_fit",
     "compare_tests",
     "damage",
     "damage_measures",

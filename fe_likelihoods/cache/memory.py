@@ -153,6 +153,12 @@ class ResponseMemory:
         with self._lock:
             return [self._outcomes.get((fingerprint, key)) for key in keys]
 
+    def responses(self, fingerprint: str) -> dict[bytes, np.ndarray]:
+        """Responses of a model's simulations that did not fail, by their keys, the oldest first; not to be changed."""
+        with self._lock:
+            found = {key: outcome for (model, key), outcome in self._outcomes.items() if model == fingerprint}
+        return {key: outcome for key, outcome in found.items() if not isinstance(outcome, str)}
+
     def store(self, fingerprint: str, keys: Sequence[bytes], outcomes: Iterable[np.ndarray | str]) -> None:
         """Store copies of responses, and reasons of failures; drops the oldest outcomes beyond the limit."""
         if not self.max_bytes:

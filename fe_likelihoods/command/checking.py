@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..signals.error_measures import opposite_sign, rrmse
+from ..reporting.fit_gate import compare, draws_to_compare, fit_gate
+from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import read_events
 from .job import read_job
-from .models import USER_MODELS, Problem, make_problem, noise_channels_of
+from .models import Problem, make_problem, noise_channels_of
 from .runs import default_folder
 from .sampling import is_emcee, make_sampler
 
@@ -18,7 +19,6 @@ __all__ = ["check_job"]
 
 PICTURE_SECONDS = 10.0
 FEWEST_DRAWS, MOST_DRAWS = 5, 40
-LARGE_ERROR = 0.9  # of a response, relative to the measurements
 
 
 def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
@@ -45,7 +45,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
     sampler = make_sampler(job, problem)
     events = read_events(job, problem)
     _say_data(problem, say)
-    seconds = _say_simulation(problem, job.kind in USER_MODELS, say)
+    seconds = _say_simulation(problem, say)
     for event in events:
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
@@ -88,7 +88,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
             )
 
 
-def _say_simulation(problem: Problem, own: bool, say: Callable[[str], None]) -> float:
+def _say_simulation(problem: Problem, say: Callable[[str], None]) -> float:
     """Simulate at the mean of the prior; return the seconds of a second simulation, which compiles nothing."""
     posterior = problem.posterior
     likelihood, mean = posterior.likelihood, posterior.prior.mean()
@@ -100,24 +100,15 @@ def _say_simulation(problem: Problem, own: bool, say: Callable[[str], None]) -> 
             "check [model] and [priors]"
         )
     response = measured.values - likelihood.residuals(mean)
-    errors, opposite = rrmse(response, measured.values), opposite_sign(response, measured.values)
     start = time.perf_counter()
     likelihood.model.simulate(1.0001 * mean[:n])
     seconds = time.perf_counter() - start
+    errors = rrmse(response, measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
     say(f"One simulation takes {seconds:.2g} s. At the mean of the prior the error of the response (RRMSE) is {fit}")
-    if opposite.any():
-        names = ", ".join(c.name for c, each in zip(measured.channels, opposite, strict=True) if each)
-        say(
-            f"CAUTION: response and measurements have opposite signs: {names}. Where the sensor counts the other way, "
-            "name it in `reversed` of [measurements]"
-        )
-    if own and np.where(opposite, rrmse(-response, measured.values), errors).max() > LARGE_ERROR:
-        say(
-            "CAUTION: a large error of a model of your own may come from its units: it must return SI units (m, m/s², "
-            "N, Pa, rad), whatever the units in [model.channels] and of the measurements. Or from times: zero in "
-            "[measurements] is the time in their file at which the base motion begins"
-        )
+    draws = draws_to_compare(posterior, seconds)
+    for finding in fit_gate(compare(likelihood, draws, False)):
+        say(f"CAUTION: {finding}")
     return seconds
 
 

@@ -19,7 +19,11 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
+from ..reporting.fit_gate import fit_gate
+from ..reporting.fits import fit_data_sets
 from ..reporting.run import FinishedRun, read_run
+from ..reporting.table import parameter_rows
+from ..signals.fit_gate import REMARK, WRONG
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -56,9 +60,9 @@ class Outcome(NamedTuple):
     files : tuple of str
         Names of the result files.
     cautions : tuple of str
-        Doubts about the predictions.
+        Doubts about the fit and the predictions.
     usable : bool
-        Whether the samples can be used at all.
+        Whether the samples can be used at all: neither the sampler nor the fit speaks against it.
     """
 
     folder: Path
@@ -226,7 +230,8 @@ def _write(
 
     Predictions are made here; their responses are in the cache if they were made before.
     """
-    run = read_run(sampler, problem.posterior, discard=discarded(job))
+    run = read_run(sampler, problem.posterior, truth=problem.truth, discard=discarded(job))
+    findings = fit_gate(fit_data_sets(run).compared, () if run.is_inconclusive else parameter_rows(run))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
     samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
@@ -237,10 +242,12 @@ def _write(
     page, truth = folder / "report.html", problem.truth
     report = write_report(page, run, prediction, _command(file, folder), truth, predicted, measured)
     tables = write_tables(folder, run)  # last: they say how many simulations there are
-    cautions = [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
+    cautions = [str(finding) for finding in findings if finding.weight != REMARK]
+    cautions += [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for each in described:
         cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
-    return (report, *tables, samples, *pictures), tuple(cautions), not run.is_inconclusive
+    usable = not run.is_inconclusive and all(finding.weight != WRONG for finding in findings)
+    return (report, *tables, samples, *pictures), tuple(cautions), usable
 
 
 def _chain_only(folder: Path, problem: Problem) -> Any:

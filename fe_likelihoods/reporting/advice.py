@@ -1,53 +1,25 @@
 """What a reader has to know before trusting a result: each doubt in plain words, with what to do about it."""
 
-from math import comb
-from typing import NamedTuple
-
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..signals.error_measures import opposite_sign
+from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
 from .failures import Failures
+from .fit_gate import fit_gate
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits
 from .run import LONGEST_AUTOCORRELATION, FinishedRun
 from .table import ParameterRow
 
-__all__ = ["Advice", "advise", "residual_sentence"]
+__all__ = ["advise", "residual_sentence"]
 
 FEW_SAMPLES = 100.0  # effective, below which the ends of a 90 % interval rest on fewer than five samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
-NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, as a share of the 90 % interval
-SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior
-FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
 LARGE_FAILURE_SHARE = 0.05
-LARGE_ERROR = 0.5  # RRMSE above which a channel is hardly reproduced
+WEIGHTS = WRONG, CARE, REMARK
 STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
 
-SEVERE, CAUTION, REMARK = "severe", "caution", "remark"
 
-
-class Advice(NamedTuple):
-    """One thing to know.
-
-    Attributes
-    ----------
-    level : {"severe", "caution", "remark"}
-        Whether it speaks against the result, limits it, or is good to know.
-    title : str
-        What was found, in a few words.
-    text : str
-        What it means.
-    action : str
-        What to do; may be empty.
-    """
-
-    level: str
-    title: str
-    text: str
-    action: str
-
-
-def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> list[Advice]:
+def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> list[Finding]:
     """All that a reader has to know, the most severe first.
 
     A run that says nothing about the parameters gets no notes that compare its samples with prior, truth or noise.
@@ -63,21 +35,25 @@ def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failu
         *_of_the_verdict(run),
         *_of_the_chain(run, rows),
         *_of_failures(failed, run.is_inconclusive and not run.tempered),
-        *_of_the_responses(fits),
+        *(
+            Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model.")
+            for text in fits.failures
+        ),
+        *fit_gate(fits.compared, () if run.is_inconclusive else rows),
         *_of_the_model(run),
         *_of_the_data(fits),
     ]
     if not run.is_inconclusive:
-        found += [*_of_the_noise(fits), *_of_the_prior(run, rows), *_of_the_truth(rows)]
-    return sorted(found, key=lambda each: (SEVERE, CAUTION, REMARK).index(each.level))
+        found += _of_the_noise(fits)
+    return sorted(found, key=lambda each: WEIGHTS.index(each.weight))
 
 
-def _of_the_verdict(run: FinishedRun) -> list[Advice]:
+def _of_the_verdict(run: FinishedRun) -> list[Finding]:
     if not run.tempered:
         return []
     if run.verdict is None:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
-        return [Advice(CAUTION, "No verdict", text, "Run it again with this version.")]
+        return [Finding("No verdict", CARE, text, "Run it again with this version.")]
     if run.verdict.status == "converged":
         return []
     severe = run.verdict.status == "not usable"
@@ -92,10 +68,10 @@ def _of_the_verdict(run: FinishedRun) -> list[Advice]:
             "max_simulations and run again."
         )
     reasons = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
-    return [Advice(SEVERE if severe else CAUTION, title, reasons, action)]
+    return [Finding(title, WRONG if severe else CARE, reasons, action)]
 
 
-def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
+def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Finding]:
     found, size = [], run.effective_sample_size
     if not run.tempered:
         found += _of_a_markov_chain(run)
@@ -103,11 +79,11 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
         text = f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough."
         if not np.isfinite(size):
             text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
-        found.append(Advice(CAUTION, "Few independent samples", text, "Make more iterations, or use more walkers."))
+        found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
     rough = [row.label for row in rows if row.mean_error > LARGE_MEAN_ERROR * row.sd]
     if rough and size >= FEW_SAMPLES:
         text = f"The error of the mean exceeds a fifth of the standard deviation for {', '.join(rough)}."
-        found.append(Advice(CAUTION, "Rough means", text, "Make more iterations, or use more walkers."))
+        found.append(Finding("Rough means", CARE, text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = (
@@ -115,11 +91,11 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
             "describe none of them, and the fit below is shown for the best sample."
         )
         action = "Look at the corner figure. Data of another kind, or a narrower prior, may tell the regions apart."
-        found.append(Advice(CAUTION, "Several modes", text, action))
+        found.append(Finding("Several modes", CARE, text, action))
     return found
 
 
-def _of_a_markov_chain(run: FinishedRun) -> list[Advice]:
+def _of_a_markov_chain(run: FinishedRun) -> list[Finding]:
     iterations, time, found = run.sampler.iteration - run.discard, run.autocorrelation_time, []
     if not iterations >= LONGEST_AUTOCORRELATION * time:
         known = f"its autocorrelation time is about {time:.0f} iterations"
@@ -130,16 +106,16 @@ def _of_a_markov_chain(run: FinishedRun) -> list[Advice]:
             "autocorrelation times gives no reliable error, and may still be on its way to the posterior."
         )
         found.append(
-            Advice(SEVERE, "The chain is short", text, "Continue it, or use SMCSampler for the same posterior.")
+            Finding("The chain is short", WRONG, text, "Continue it, or use SMCSampler for the same posterior.")
         )
     if run.discard == 0:
         text = "All iterations are used, the first ones included, which depend on where the walkers started."
         action = "Give report(..., discard=n) the number of iterations of the burn-in, if there was one."
-        found.append(Advice(CAUTION, "No burn-in was left out", text, action))
+        found.append(Finding("No burn-in was left out", CARE, text, action))
     return found
 
 
-def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
+def _of_failures(failed: Failures, inconclusive: bool) -> list[Finding]:
     if not failed.count:
         return []
     found, share = [], failed.count / max(failed.attempts, 1)
@@ -154,7 +130,7 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
         "not, a narrower prior saves these simulations."
     )
     largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
-    found.append(Advice(CAUTION if largest > LARGE_FAILURE_SHARE else REMARK, "Simulations failed", text, action))
+    found.append(Finding("Simulations failed", CARE if largest > LARGE_FAILURE_SHARE else REMARK, text, action))
     if failed.near.borders and failed.near.known and not inconclusive:
         text = (
             f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed. "
@@ -164,56 +140,24 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Advice]:
             "See in the table of failures where they happen. Mend the model or the settings of its solver there, and "
             "run again. Only if these parameters are impossible, a bound of the prior may stand there instead."
         )
-        found.append(Advice(SEVERE, "Failures border on the samples", text, action))
+        found.append(Finding("Failures border on the samples", WRONG, text, action))
     elif failed.near.place == "edge" and not inconclusive:
         text = (
             f"{failed.near.adjoining} failed points adjoin the samples at an edge. If the posterior goes on there, its "
             "interval is too narrow."
         )
         action = "See in the table of failures where they happen, and in the figures whether the samples end there."
-        found.append(Advice(CAUTION, "Failures at an edge of the samples", text, action))
+        found.append(Finding("Failures at an edge of the samples", CARE, text, action))
     elif failed.near.place == "scattered" and not inconclusive:
         text = (
             f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed, "
             "scattered among successful ones. The posterior is right if they do not depend on the parameters."
         )
-        found.append(Advice(CAUTION, "Failures among the samples", text, "See their reasons, and mend the model."))
+        found.append(Finding("Failures among the samples", CARE, text, "See their reasons, and mend the model."))
     return found
 
 
-def _of_the_responses(fits: Fits) -> list[Advice]:
-    found = [
-        Advice(CAUTION, "A response is missing", f"{text}.", "Use another point or mend the model.")
-        for text in fits.failures
-    ]
-    poor = [
-        f"{_place(fit, each)} ({100.0 * each.after:.0f} %)"
-        for fit in fits.fits
-        for each in fit.channels
-        if each.after > LARGE_ERROR
-    ]
-    if poor:
-        text = f"After the update, the relative error (RRMSE) is still large: {_listed(poor)}."
-        opposite = [
-            _place(fit, each)
-            for fit in fits.fits
-            if fits.after in fit.responses
-            for each, yes in zip(
-                fit.channels, opposite_sign(fit.responses[fits.after], fit.measurements.values), strict=True
-            )
-            if yes
-        ]
-        if opposite:
-            text += f" Response and measurements have opposite signs: {_listed(opposite)}."
-        action = (
-            "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
-            "the model before you interpret the parameters."
-        )
-        found.append(Advice(CAUTION, "A channel is hardly reproduced", text, action))
-    return found
-
-
-def _of_the_noise(fits: Fits) -> list[Advice]:
+def _of_the_noise(fits: Fits) -> list[Finding]:
     found, doubtful = [], [(fit, each) for fit in fits.fits for each in fit.channels if each.checks is not None]
     white = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise == "white"]
     if white:
@@ -226,7 +170,7 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
             "of frequency (groups = [1.0, 5.0]) or effective_samples=, and look at the residuals for an effect that "
             "the model lacks."
         )
-        found.append(Advice(CAUTION, "The errors are not white noise", text, action))
+        found.append(Finding("The errors are not white noise", CARE, text, action))
     coloured = ("autoregressive", "bands")
     left = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise in coloured]
     if left:
@@ -238,12 +182,12 @@ def _of_the_noise(fits: Fits) -> list[Advice]:
             "Compare with GaussianNoise with bands of frequency (in a TOML file: groups = [1.0, 5.0] in [noise]) or "
             "effective_samples=, and look for an effect that the model lacks."
         )
-        found.append(Advice(CAUTION, "The noise model does not fit the errors", text, action))
+        found.append(Finding("The noise model does not fit the errors", CARE, text, action))
     strange = [_place(fit, each) for fit, each in doubtful if each.checks.normal[0] < SMALL_PROBABILITY]
     if strange:
         text = f"The residuals of {_listed(strange)} have heavier tails, or are more skew, than a normal distribution."
         action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
-        found.append(Advice(REMARK, "The errors are not normal", text, action))
+        found.append(Finding("The errors are not normal", REMARK, text, action))
     return found
 
 
@@ -251,57 +195,7 @@ def _is_correlated(each: ChannelFit) -> bool:
     return each.checks.white[0] < SMALL_PROBABILITY and abs(each.checks.lag_one[0]) > STRONG_CORRELATION
 
 
-def _of_the_prior(run: FinishedRun, rows: list[ParameterRow]) -> list[Advice]:
-    found, edges = [], []
-    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
-    for row in (row for row in rows if row not in flat):  # where the data say little, the prior is at its own edge
-        width = row.high - row.low
-        if width > 0.0 and row.low - row.lower < NEAR_BOUND * width:
-            edges.append(f"{row.label} at {row.lower:.4g}")
-        if width > 0.0 and row.upper - row.high < NEAR_BOUND * width:
-            edges.append(f"{row.label} at {row.upper:.4g}")
-    if edges:
-        text = f"The posterior reaches the edge of its prior: {_listed(edges)}. The bound, not the data, ends it there."
-        action = (
-            "If the bound is physical, nothing is wrong. Otherwise widen the prior, and ask what the parameter makes "
-            "up for in the model."
-        )
-        found.append(Advice(CAUTION, "At the edge of the prior", text, action))
-    if flat:
-        names = _listed([row.label for row in flat])
-        text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
-        action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
-        found.append(Advice(REMARK, "Not informed by the data", text, action))
-    far = [row.label for row in rows if abs(row.mean - row.prior_mean) > FAR_FROM_PRIOR * row.prior_sd]
-    if far:
-        text = (
-            f"The posterior mean of {_listed(far)} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the prior "
-            "away from the mean of the prior: prior and data disagree."
-        )
-        action = (
-            "Check the nominal value and the width of the prior; the parameter may make up for an error of the model."
-        )
-        found.append(Advice(CAUTION, "Far from the prior", text, action))
-    return found
-
-
-def _of_the_truth(rows: list[ParameterRow]) -> list[Advice]:
-    """A caution if fewer true values are within their intervals than chance explains."""
-    known = [row for row in rows if np.isfinite(row.truth)]
-    outside = [row.label for row in known if not row.low <= row.truth <= row.high]
-    # probability that so many 90 % intervals or more miss, if they were independent
-    n, k = len(known), len(outside)
-    if not k or sum(comb(n, j) * 0.1**j * 0.9 ** (n - j) for j in range(k, n + 1)) >= SMALL_PROBABILITY:
-        return []
-    text = (
-        f"The true values of {_listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
-        "usual. The model that was updated is not the one that made the data."
-    )
-    action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
-    return [Advice(CAUTION, "True values are missed", text, action)]
-
-
-def _of_the_model(run: FinishedRun) -> list[Advice]:
+def _of_the_model(run: FinishedRun) -> list[Finding]:
     found, likelihoods = [], [] if run.likelihood is None else [each for each, _ in run.likelihood.parts()]
     for likelihood in likelihoods:
         text = getattr(likelihood.model, "range_remark", "")
@@ -314,16 +208,16 @@ def _of_the_model(run: FinishedRun) -> list[Advice]:
         if text:
             action = "See whether samples of the posterior are concerned, or only draws far from it."
             found.append(
-                Advice(CAUTION, "Beyond the range of a law of the model", f"{text[0].upper()}{text[1:]}.", action)
+                Finding("Beyond the range of a law of the model", CARE, f"{text[0].upper()}{text[1:]}.", action)
             )
     return found
 
 
-def _of_the_data(fits: Fits) -> list[Advice]:
+def _of_the_data(fits: Fits) -> list[Finding]:
     if not any("synthetic" in fit.measurements.description.lower() for fit in fits.fits):
         return []
     text = "The measurements were computed with a model, not measured. The result shows how the method works."
-    return [Advice(REMARK, "Synthetic data", text, "Say so wherever you show the numbers.")]
+    return [Finding("Synthetic data", REMARK, text, "Say so wherever you show the numbers.")]
 
 
 def residual_sentence(fit: Fit, each: ChannelFit) -> str:

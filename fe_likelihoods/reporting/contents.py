@@ -10,7 +10,8 @@ from samplers.output import stored_result
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
-from .advice import SAME_AS_PRIOR, residual_sentence
+from .advice import residual_sentence
+from .fit_gate import SAME_AS_PRIOR
 from .fits import Fits
 from .run import FinishedRun
 from .table import ParameterRow

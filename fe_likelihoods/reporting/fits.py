@@ -12,7 +12,7 @@ from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
-from ..signals.events import find_events
+from .fit_gate import Compared, compare, draws_to_compare, windows_of
 from .run import FinishedRun
 
 __all__ = ["SMALL_PROBABILITY", "ChannelFit", "Fit", "Fits", "fit_data_sets"]
@@ -81,6 +81,8 @@ class Fits(NamedTuple):
         Simulations that were run for them.
     failures : tuple of str
         Simulations that failed, in words.
+    compared : tuple of Compared
+        What `fit_gate` judges.
     """
 
     fits: tuple[Fit, ...]
@@ -88,6 +90,7 @@ class Fits(NamedTuple):
     after: str
     simulations: int
     failures: tuple[str, ...]
+    compared: tuple[Compared, ...] = ()
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:
@@ -107,7 +110,7 @@ def fit_data_sets(run: FinishedRun) -> Fits:
         return Fits((), "", "", 0, ())
     start, start_name = _before(run)
     before, after = f"before: {start_name}", f"after: {run.centre_name}"
-    fits, failures, simulations = [], [], run.likelihood.simulations
+    fits, failures, simulations, compared = [], [], run.likelihood.simulations, []
     keys = getattr(run.likelihood, "likelihoods", {"": None})
     for key, (likelihood, columns) in zip(keys, run.likelihood.parts(), strict=True):
         point = run.centre[columns]
@@ -123,7 +126,10 @@ def fit_data_sets(run: FinishedRun) -> Fits:
                 residuals[title] = likelihood.residuals_of(response, theta)
         values = dict(zip(likelihood.parameter_names, point.tolist(), strict=True))
         fits += _split(likelihood, key, residuals, before, after, values)
-    return Fits(tuple(fits), before, after, run.likelihood.simulations - simulations, tuple(failures))
+        draws = draws_to_compare(run.posterior)[:, columns]
+        compared += compare(likelihood, np.stack([point, *draws]), True, key)
+    made = run.likelihood.simulations - simulations
+    return Fits(tuple(fits), before, after, made, tuple(failures), tuple(compared))
 
 
 def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
@@ -150,10 +156,6 @@ def _split(
     values: dict[str, float],
 ) -> list[Fit]:
     """One fit per event."""
-    measured, events = likelihood.measurements, find_events(likelihood.model)
-    windows = [(key, None)]
-    if events is not None and len(events.windows) > 1:
-        windows = [(f"{key}, {window.name}" if key else window.name, window) for window in events.windows]
     sampled = sampled_noise(likelihood.noise)
     noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
     noise = "bands" if getattr(sampled, "n_bands", 1) > 1 else noise
@@ -161,37 +163,21 @@ def _split(
     checked = residuals.get(after)
     if checked is not None and hasattr(sampled, "whitened"):
         parameters = np.array([values[name] for name in sampled.parameter_names])
-        checked = sampled.whitened(checked, measured.values - checked, parameters)
+        checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
     fits = []
-    for title, window in windows:
-        inside = np.ones(measured.values.shape, dtype=bool)
-        if window is not None:
-            times = np.stack([measured.times(channel.name) for channel in measured.channels])
-            half = 0.5 * np.array(measured.steps)[:, None]
-            inside = (times > window.start - half) & (times < window.end + half)
-        there = inside & np.isfinite(measured.values)
-        rows = np.flatnonzero(there.any(axis=1))
-        columns = np.flatnonzero(inside[rows].any(axis=0))
-        if not len(rows):
-            continue
-        part = Measurements(
-            tuple(measured.channels[row] for row in rows),
-            tuple(measured.steps[row] for row in rows),
-            np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
-            measured.description,
-            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
-        )
-        own = {name: np.where(inside, each, np.nan)[np.ix_(rows, columns)] for name, each in residuals.items()}
-        left = None if checked is None else np.where(inside, checked, np.nan)[np.ix_(rows, columns)]
+    for window in windows_of(likelihood, key):
+        part = window.measurements
+        own = {name: window.of(each) for name, each in residuals.items()}
+        left = None if checked is None else window.of(checked)
         fits.append(
             Fit(
-                title,
+                window.title,
                 part,
                 {name: part.values - each for name, each in own.items()},
                 own.get(after),
                 tuple(
                     _channel_fit(part, row, own, before, after, None if left is None else left[[row]], values, noise)
-                    for row in range(len(rows))
+                    for row in range(part.n_channels)
                 ),
                 noise,
             )

@@ -12,9 +12,10 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
+from ..signals.fit_gate import WRONG, Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
-from .advice import Advice, advise
+from .advice import advise
 from .contents import (
     DataSet,
     PredictedValue,
@@ -67,7 +68,7 @@ class Contents(NamedTuple):
     date: str
     status: str
     summary: list[str]
-    advice: list[Advice]
+    advice: list[Finding]
     data: list[DataSet]
     rows: list[ParameterRow]
     has_truth: bool
@@ -190,7 +191,7 @@ def gather(
     fits, rows, sets = fit_data_sets(run), parameter_rows(run), data_sets(run)
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
     notes = advise(run, rows, fits, failed)
-    doubted = any(note.level == "severe" for note in notes)
+    doubted = any(note.weight == WRONG for note in notes)
     status = "unknown" if run.verdict is None else "not usable" if doubted else run.verdict.status
     return Contents(
         title=title or f"Bayesian updating of {models}",

@@ -1,14 +1,16 @@
 """The table of the parameters: prior, posterior with its errors, nominal and true value, in the units of a reader."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from ..likelihood.parameters import Parameter
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, TruncatedNormal, Uniform
 from ..priors.priors import Prior
 from .run import FinishedRun
 
-__all__ = ["ParameterRow", "describe_prior", "parameter_rows"]
+__all__ = ["ParameterRow", "describe_prior", "parameter_rows", "rows_of"]
 
 
 class ParameterRow(NamedTuple):
@@ -54,17 +56,28 @@ class ParameterRow(NamedTuple):
 
 def parameter_rows(run: FinishedRun) -> list[ParameterRow]:
     """One row per parameter, in the order of the chain."""
-    mean, sd = run.samples.mean(axis=0), run.samples.std(axis=0)
-    low, high = np.quantile(run.samples, [0.05, 0.95], axis=0)
-    rows, known = [], [] if run.prior is None else run.prior.table()[1]
-    for i, parameter in enumerate(run.parameters):
+    return rows_of(run.parameters, run.prior, run.samples, run.mean_error, run.truth)
+
+
+def rows_of(
+    parameters: Sequence[Parameter],
+    prior: Prior | None,
+    samples: np.ndarray,
+    mean_error: np.ndarray,
+    truth: np.ndarray,
+) -> list[ParameterRow]:
+    """One row for each parameter of samples (n, ndim); errors of the means and true values (ndim,) may be NaN."""
+    mean, sd = samples.mean(axis=0), samples.std(axis=0)
+    low, high = np.quantile(samples, [0.05, 0.95], axis=0)
+    rows, known = [], [] if prior is None else prior.table()[1]
+    for i, parameter in enumerate(parameters):
         text, moments, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)
-        if run.prior is not None:
-            text = _words_of(run.prior, parameter.name, parameter.factor)
+        if prior is not None:
+            text = _words_of(prior, parameter.name, parameter.factor)
             moments, bounds = known[i][2:4], known[i][4:6]
-        numbers = mean[i], run.mean_error[i], sd[i]
+        numbers = mean[i], mean_error[i], sd[i]
         shown = [float(each) for each in parameter.shown([*moments, *numbers])]
-        others = [float(each) for each in parameter.shown([low[i], high[i], parameter.nominal, run.truth[i], *bounds])]
+        others = [float(each) for each in parameter.shown([low[i], high[i], parameter.nominal, truth[i], *bounds])]
         cv = float(sd[i] / abs(mean[i])) if mean[i] else np.nan
         unit = parameter.label.removeprefix(parameter.name).strip()
         rows.append(ParameterRow(parameter.name, parameter.label, unit, text, *shown, cv, *others))

@@ -7,9 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["opposite_sign", "rrmse", "sum_of_squares"]
-
-_OPPOSITE = -0.7  # correlation of prediction and measurement below which a sensor may have the opposite sign
+__all__ = ["rrmse", "sum_of_squares"]
 
 
 def rrmse(
@@ -83,23 +81,3 @@ def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> N
             "leave it out"
         )
     return sums
-
-
-def opposite_sign(predicted: ArrayLike, measured: ArrayLike) -> NDArray[np.bool_] | np.bool_:
-    """Whether predicted and measured histories have opposite signs, as if a sensor were mounted the other way round.
-
-    Parameters
-    ----------
-    predicted, measured : (..., n_steps) array_like
-        Histories in the same unit. Samples where either is NaN are left out.
-
-    Returns
-    -------
-    ndarray of bool, shape (...,)
-        True where their correlation is below -0.7.
-    """
-    predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
-    there = np.isfinite(predicted) & np.isfinite(measured)
-    predicted, measured = np.where(there, predicted, 0.0), np.where(there, measured, 0.0)
-    scale = np.sqrt(np.square(predicted).sum(axis=-1) * np.square(measured).sum(axis=-1))
-    return (predicted * measured).sum(axis=-1) < _OPPOSITE * scale

@@ -479,7 +479,9 @@ def test_check_warns_of_what_is_likely_wrong(folder):
 def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_function(tmp_path, "in_mm", "    return response", "    return 1000.0 * response")
-    assert "it must return SI units" in call("check", "in_mm.toml")
+    output = call("check", "in_mm.toml")
+    assert "CAUTION: A unit may be wrong: Responses times 0.00" in output and "the ratio of m and mm" in output
+    assert "returns SI units" in output
 
 
 def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
@@ -492,7 +494,7 @@ def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     assert "opposite" not in call("check", "upright.toml")
     (tmp_path / "synthetic_measured.csv").write_text("\n".join([comment, header, *turned]))
     output = call("check", "upright.toml")
-    assert "opposite signs: displacement. Where" in output and "it must return SI units" not in output
+    assert "opposite signs: displacement; with" in output and "SI units" not in output
     text = (tmp_path / "upright.toml").read_text()
     given = text.replace("[measurements]\n", '[measurements]\nreversed = ["displacement"]\n')
     (tmp_path / "turned.toml").write_text(given)

@@ -50,7 +50,7 @@ def run(posterior, walkers=60, steps=4, **options):
 
 
 def notes_of(contents):
-    return {note.title: note for note in contents.advice}
+    return {note.name: note for note in contents.advice}
 
 
 def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
@@ -61,16 +61,16 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
     assert contents.failures.count == posterior.report()["failure_count"]
     note = notes_of(contents)["Failures border on the samples"]
-    assert note.level == "severe" and contents.status == "not usable"
+    assert note.weight == "wrong" and contents.status == "not usable"
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
     assert (
         f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} simulated points failed"
-        in note.text
+        in note.sentence
     )
     assert "Do not use these numbers" in contents.summary[2]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
-    assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text
+    assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].sentence
 
 
 def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):

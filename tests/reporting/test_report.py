@@ -154,7 +154,8 @@ def test_what_a_reader_has_to_know_is_said(page, vibrating):
     for digest in (posterior.fingerprint, posterior.data_fingerprint, posterior.likelihood.model.fingerprint):
         assert digest in page.text
     assert "SMCSampler( 60, posterior.ndim, posterior, vectorize=True, seed=1, )" in page.text
-    assert ["simulations for this report", "2"] in [row for table in page.tables for row in table]
+    counts = dict(row for table in page.tables for row in table if len(row) == 2)
+    assert int(counts["simulations for this report"]) > 2
     assert "Free vibration" in page.text and "Peaks" in page.text and "95 % quantile" in page.text
     assert "CRPS" in page.text and "of 3 true values are within their 90 % intervals" in page.text
 
@@ -163,7 +164,7 @@ def test_the_fit_is_that_of_the_posterior_mean_and_its_simulations_are_counted(v
     sampler, _ = vibrating
     posterior = vibration()  # nothing is cached
     fits = fit_data_sets(read_run(sampler, posterior))
-    assert (fits.simulations, posterior.report()["simulations"]) == (2, 2)
+    assert fits.simulations == posterior.report()["simulations"] > 2  # before, after, draws of the prior
     centre = sampler.get_chain(flat=True).mean(axis=0)
     median = posterior.prior_transform(np.full(3, 0.5))  # a function has no nominal values
     measured = posterior.likelihood.measurements.values
@@ -180,26 +181,26 @@ def test_correlated_errors_and_edges_are_named():
     posterior = vibration("measured", 0.02 * slow[None, : len(TIME)], prior)
     finished = read_run(run(posterior), posterior)
     fits, rows = fit_data_sets(finished), parameter_rows(finished)
-    notes = {note.title: note for note in advise(finished, rows, fits, Failures((), 0, 100))}
-    assert "top" in notes["The errors are not white noise"].text
-    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].text
+    notes = {note.name: note for note in advise(finished, rows, fits, Failures((), 0, 100))}
+    assert "top" in notes["The errors are not white noise"].sentence
+    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].sentence
     assert "Synthetic data" not in notes and "Simulations failed" not in notes
     assert "are worth" in residual_sentences(fits)[0]
-    notes = {note.title: note for note in advise(finished, rows, fits, Failures((), 30, 100))}
-    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].text
-    assert notes["Simulations failed"].level == "caution"
+    notes = {note.name: note for note in advise(finished, rows, fits, Failures((), 30, 100))}
+    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].sentence
+    assert notes["Simulations failed"].weight == "care"
 
 
 def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
     finished = read_run(*vibrating)
     rows, fits = parameter_rows(finished), fit_data_sets(finished)
-    (fit,) = fits.fits
-    turned = fit._replace(
-        responses={title: -response for title, response in fit.responses.items()},
-        channels=tuple(each._replace(after=2.0) for each in fit.channels),
-    )
-    notes = {n.title: n for n in advise(finished, rows, fits._replace(fits=(turned,)), Failures((), 0, 1))}
-    assert notes["A channel is hardly reproduced"].text.endswith("have opposite signs: top.")
+    (one,) = fits.compared
+    turned = fits._replace(compared=(one._replace(responses=-one.responses),))
+    notes = {n.name: n for n in advise(finished, rows, turned, Failures((), 0, 1))}
+    assert "opposite signs: top" in notes["A sign may be wrong"].sentence
+    assert "top" in notes["The model does not follow the measurements"].sentence
+    quiet = {n.name for n in advise(finished, rows, fits, Failures((), 0, 1))}
+    assert not quiet & {"A sign may be wrong", "The model does not follow the measurements"}
 
 
 def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_named(vibrating):
@@ -207,15 +208,15 @@ def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_n
     finished = read_run(sampler, posterior)
     rows = parameter_rows(finished)
     fits = fit_data_sets(finished)
-    assert "True values are missed" not in {n.title for n in advise(finished, rows, fits, Failures((), 0, 1))}
+    assert "True values are missed" not in {n.name for n in advise(finished, rows, fits, Failures((), 0, 1))}
     missed = [row._replace(truth=row.high + row.sd) for row in rows]
-    notes = {note.title: note for note in advise(finished, missed, fits, Failures((), 0, 1))}
-    assert "sigma_top [mm]" in notes["True values are missed"].text
+    notes = {note.name: note for note in advise(finished, missed, fits, Failures((), 0, 1))}
+    assert "sigma_top [mm]" in notes["True values are missed"].sentence
     moved = [row._replace(prior_mean=row.mean - 4.0 * row.sd, prior_sd=1.01 * row.sd) for row in rows]
-    notes = {note.title: note for note in advise(finished, moved, fits, Failures((), 0, 100))}
+    notes = {note.name: note for note in advise(finished, moved, fits, Failures((), 0, 100))}
     for title in ("Not informed by the data", "Far from the prior"):
-        assert "sigma_top [mm]" in notes[title].text and title not in {
-            n.title for n in advise(finished, rows, fits, Failures((), 0, 1))
+        assert "sigma_top [mm]" in notes[title].sentence and title not in {
+            n.name for n in advise(finished, rows, fits, Failures((), 0, 1))
         }
 
 
@@ -250,7 +251,7 @@ def test_every_data_set_and_every_event_has_its_block():
     posterior = Posterior(joint, prior)
     fits = fit_data_sets(read_run(run(posterior), posterior))
     assert [fit.title for fit in fits.fits] == ["a & b, EQ1", "a & b, EQ2", "short"]
-    assert fits.simulations == 4 and not fits.failures
+    assert fits.simulations > 4 and not fits.failures
     for fit, n in zip(fits.fits, (200, 200, 200), strict=True):
         assert [each.samples for each in fit.channels] == [n, n]
         assert all(each.after < each.before for each in fit.channels)

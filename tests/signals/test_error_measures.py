@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import rrmse
-from fe_likelihoods.signals.error_measures import opposite_sign, sum_of_squares
+from fe_likelihoods.signals.error_measures import sum_of_squares
 from fe_likelihoods.signals.sampling import same_sampling
 
 
@@ -15,13 +15,6 @@ def test_rrmse_is_its_definition(rng):
     assert rrmse(predicted[0], measured[0]) == rrmse(predicted, measured)[0]
     assert rrmse([0.0, 0.0], [3.0, 4.0]) == 1.0 and rrmse([3.0, 4.0], [3.0, 4.0]) == 0.0
     assert rrmse(1.1 * measured[0], measured[0]) == pytest.approx(0.1)
-
-
-def test_opposite_signs_are_found_without_the_missing_samples(rng):
-    motion = rng.normal(size=200)
-    measured = np.stack([-2.0 * motion, motion, rng.normal(size=200), np.zeros(200)])
-    measured[0, ::3] = np.nan
-    assert opposite_sign(np.tile(motion, (4, 1)), measured).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("predicted", [np.ones(3), np.ones((2, 4)), 1.0])

@@ -1,0 +1,131 @@
+"""The gate before every result: unit errors that a fit hides, clocks of supports, quiet on good fits, events alone."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    BridgeDeck,
+    Events,
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    LinearOscillator,
+    LinearStructure,
+    Measurements,
+    Posterior,
+    Record,
+    TruncatedNormal,
+    Uniform,
+    check_fit,
+)
+from fe_likelihoods.emulation.modes import find_modes
+from fe_likelihoods.problems import table_motion
+from fe_likelihoods.reporting.fit_gate import compare, draws_to_compare, fit_gate
+from samplers import SMCSampler
+
+MOTION = table_motion().trim(0.0, 8.0).resample(0.02)
+DECK = {"frequency": Uniform(2.0, 7.0), "damping": Uniform(0.01, 0.3), "share": Uniform(0.2, 1.0)}
+
+
+def supports(late=0):
+    """Three motions; the two ends are late by a number of steps."""
+    rng, time = np.random.default_rng(7), 0.02 * np.arange(600)
+    burst = np.exp(-(((time - 5.0) / 2.0) ** 2))
+    motions = [burst * np.convolve(rng.standard_normal(600), np.hanning(8), "same") for _ in range(3)]
+    return [
+        Record(name, 0.02, np.roll(motion, late if name != "column" else 0))
+        for name, motion in zip(("column", "south", "north"), motions, strict=True)
+    ]
+
+
+def deck(late=0):
+    """A deck whose ends are recorded late, measured with an error of a tenth."""
+    true = LinearStructure(BridgeDeck("deck"), supports()).simulate([4.0, 0.08, 0.6])
+    error = np.convolve(np.random.default_rng(8).standard_normal(true.shape[1]), np.ones(4) / 2.0, "same")
+    model = LinearStructure(BridgeDeck("deck"), supports(late))
+    return model, Measurements(model.channels, 0.02, true + 0.1 * true.std() * error)
+
+
+def sampled(model, measured, prior, **noise):
+    law = GaussianNoise(model.channels, **noise)
+    scale = 0.3 if noise else float(measured.root_mean_squares[0])
+    posterior = Posterior(
+        FELikelihood(model, measured, law), prior | {n: HalfNormal(scale) for n in law.parameter_names}
+    )
+    sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sampler.run_mcmc(None, 1, progress=False)
+    return posterior, sampler.get_chain(flat=True)
+
+
+def names(findings):
+    return {finding.name for finding in findings if finding.weight == "wrong"}
+
+
+@pytest.mark.parametrize("noise", [{}, {"level": "measured"}])
+def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
+    """A frequency makes up for a part of the factor."""
+    model, measured = deck()
+    posterior, samples = sampled(model, replace(measured, values=measured.values / 9.80665), DECK, **noise)
+    for found in (check_fit(posterior, samples), check_fit(posterior)):
+        assert names(found) >= {"A unit may be wrong"}
+        (unit,) = (each for each in found if each.name == "A unit may be wrong")
+        assert "m/s² and g" in unit.sentence or "cm and mm" in unit.sentence
+    good, samples = sampled(model, measured, DECK, **noise)
+    assert not names(check_fit(good, samples)) and not check_fit(good)
+
+
+def test_a_late_recorder_of_an_input_is_named():
+    model, measured = deck(late=5)
+    posterior, samples = sampled(model, measured, DECK)
+    (found,) = (each for each in check_fit(posterior, samples) if each.weight == "wrong")
+    assert found.name == "Clocks of input recorders may differ"
+    assert "of south and north seems to be 0.1 s later" in found.sentence
+
+
+def test_parameters_at_bounds_and_far_from_their_prior_are_named():
+    model, measured = deck()
+    posterior, samples = sampled(model, measured, DECK | {"frequency": Uniform(2.0, 3.0)})
+    assert "At the edge of the prior" in {each.name for each in check_fit(posterior, samples)}
+
+
+def test_the_fault_of_one_event_is_named_with_it():
+    events = Events([MOTION, MOTION.scale(0.5)], rest=2.0, names=("EQ1", "EQ2"))
+    model = LinearOscillator(events, 0.8)
+    values = model.simulate([1.1, 0.9])
+    values[:, events.window("EQ2").samples] *= 1000.0
+    values[:, ~events.in_events] = np.nan
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in model.parameter_names}
+    likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values))
+    prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
+    (found,) = check_fit(Posterior(likelihood, prior))
+    assert "(EQ2)" in found.sentence and "m and mm" in found.sentence
+
+
+def test_what_a_guide_has_simulated_is_compared_as_well():
+    model, measured = deck()
+    posterior = Posterior(FELikelihood(model, measured), DECK | {"sigma_deck": HalfNormal(1.0)})
+    single = Posterior(FELikelihood(LinearOscillator(MOTION), _oscillation()), _prior())
+    find_modes(single, starts=2, seed=1, max_simulations=40)
+    (compared,) = compare(single.likelihood, draws_to_compare(single)[:3], False)
+    assert len(compared.responses) > 5  # three draws, and runs of the search
+    (of_supports,) = compare(posterior.likelihood, draws_to_compare(posterior)[:3], False)
+    assert set(of_supports.parts) == {"column", "south", "north"}
+    np.testing.assert_allclose(sum(of_supports.parts.values()), of_supports.responses, atol=1e-12)
+    assert fit_gate((of_supports, compared)) == ()
+
+
+def _oscillation():
+    model = LinearOscillator(MOTION)
+    response = model.simulate([1.05, 1.0])
+    noise = np.random.default_rng(2).standard_normal(response.shape)
+    return Measurements(model.channels, model.dt, response + 0.05 * response.std(axis=1, keepdims=True) * noise)
+
+
+def _prior():
+    known = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+    return known | {name: HalfNormal(1.0) for name in ("sigma_acceleration", "sigma_displacement")}

@@ -1,0 +1,88 @@
+"""Faults of data are found among responses of other parameters, and good fits are left alone."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import LinearOscillator, Measurements
+from fe_likelihoods.problems import table_motion
+from fe_likelihoods.signals.fit_gate import describe_unit, find_faults
+
+MOTION = table_motion().trim(0.0, 10.0).resample(0.02)
+MODEL = LinearOscillator(MOTION, 0.8)
+RNG = np.random.default_rng(5)
+RESPONSES = np.stack([MODEL.simulate(theta) for theta in RNG.uniform(0.4, 1.8, (40, 2))])
+TRUE = MODEL.simulate([1.1, 0.9])
+LATE = 5  # steps of 0.02 s
+
+
+def measured(values, share=0.1):
+    """Measurements with errors that are correlated from sample to sample and have a share of the level."""
+    noise = np.apply_along_axis(
+        np.convolve, 1, np.random.default_rng(3).standard_normal(TRUE.shape), np.ones(5), "same"
+    )
+    level = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
+    return Measurements(MODEL.channels, MODEL.dt, values + share * level * noise / noise.std())
+
+
+def later(values, steps):
+    return np.concatenate([np.zeros((len(values), steps)), values[:, :-steps]], axis=1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.15])
+def test_a_good_fit_has_no_fault(share):
+    assert find_faults(measured(TRUE, share), RESPONSES) == ()
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1e-3, 9.80665, 1.0 / 9.80665])
+def test_units_of_all_and_of_one_channel_are_named(factor):
+    (fault,) = find_faults(measured(factor * TRUE), RESPONSES)
+    assert fault.kind == "factor" and fault.names == ("acceleration", "displacement")
+    assert fault.value == pytest.approx(factor, rel=0.1) and fault.after < 0.3
+    (fault,) = find_faults(measured(TRUE * [[factor], [1.0]]), RESPONSES)
+    assert (fault.kind, fault.names) == ("factor", ("acceleration",))
+    assert describe_unit(fault.value)
+
+
+def test_signs_lags_and_exchanged_channels_are_named():
+    (fault,) = find_faults(measured(-TRUE), RESPONSES)
+    assert fault.kind == "sign" and math.isnan(fault.value)
+    (fault,) = find_faults(measured(TRUE * [[1.0], [-1.0]]), RESPONSES)
+    assert (fault.kind, fault.names) == ("sign", ("displacement",))
+    (fault,) = find_faults(measured(later(TRUE, LATE)), RESPONSES)
+    assert fault.kind == "lag" and len(fault.names) == 2 and fault.value == pytest.approx(0.1, abs=0.021)
+    early = np.concatenate([TRUE[:, LATE:], np.full((2, LATE), np.nan)], axis=1)
+    (fault,) = find_faults(measured(np.nan_to_num(early)), RESPONSES)
+    assert fault.kind == "lag" and fault.value == pytest.approx(-0.1, abs=0.021)
+    two = [MODEL.channels[0], MODEL.channels[0].__class__("other", MODEL.channels[0].quantity, "g")]
+    pairs = np.stack([RESPONSES[:, 0], np.roll(RESPONSES[:, 0], 60, axis=-1)], axis=1)
+    values = np.stack([np.roll(TRUE[0], 60), TRUE[0]])
+    (fault,) = find_faults(Measurements(two, MODEL.dt, values), pairs)
+    assert fault.kind == "swap" and fault.names == ("acceleration", "other")
+
+
+def test_two_faults_are_found_one_after_the_other():
+    faults = find_faults(measured(9.80665 * TRUE * [[1.0], [-1.0]]), RESPONSES)
+    assert {fault.kind for fault in faults} == {"factor", "sign"}
+
+
+def test_a_late_support_is_told_from_a_late_sensor():
+    """Two parts of a response, one of which has another clock."""
+    one, other = RESPONSES, np.stack([MODEL.with_record(MOTION.scale(-0.7)).simulate(t) for t in [[0.6, 1.0]] * 40])
+    parts = {"left": one, "right": np.roll(other, 90, axis=-1)}
+    values = TRUE + np.roll(later(other[0], 2 * LATE), 90, axis=-1)
+    (fault,) = find_faults(measured(values, 0.03), sum(parts.values()), parts)
+    assert (fault.kind, fault.names) == ("input lag", ("right",))
+    assert fault.value == pytest.approx(-0.2, abs=0.05)  # the motion of the model is early
+    assert find_faults(measured(TRUE + parts["right"][0], 0.03), sum(parts.values()), parts) == ()
+
+
+def test_missing_samples_and_failed_responses_are_left_out():
+    values = -TRUE.copy()
+    values[0, 100:160] = np.nan
+    responses = RESPONSES.copy()
+    responses[3] = np.nan
+    gaps = Measurements(MODEL.channels, MODEL.dt, values)
+    assert [fault.kind for fault in find_faults(gaps, responses)] == ["sign"]
+    assert find_faults(gaps, responses[3:4]) == ()
