@@ -40,6 +40,7 @@ from . import (
     sequential,
     starts,
     startup,
+    stiffness_loss,
     storage,
     strain_penetration,
     transfer,
@@ -96,6 +97,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "transfer_frame": measured_tests.frame,
     "transfer_meloland": measured_tests.meloland,
     "transfer_columns": measured_columns.columns,
+    "stiffness_loss": stiffness_loss.stiffness_losses,
     "strain_penetration": strain_penetration.evidence,
 }
 QUICK: dict[str, dict[str, Any]] = {
@@ -120,6 +122,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "level_ratios": {"data_sets": 2},
     "fragility_bands": {"data_sets": 2},
     "transfer_twins": {"data_sets": 2},
+    "stiffness_loss": {"twins": 4, "file": "results/stiffness_loss_quick.jsonl"},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""
 

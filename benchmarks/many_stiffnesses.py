@@ -24,9 +24,21 @@ from fe_likelihoods import (
 )
 from tests.statistics.brute_force import Reference
 
-__all__ = ["RIDGES", "ridge", "ridge_reference", "shear_building", "shear_truth"]
+__all__ = [
+    "DT",
+    "RIDGES",
+    "floors",
+    "ground_motion",
+    "nominal_stiffnesses",
+    "ridge",
+    "ridge_reference",
+    "shear_building",
+    "shear_model",
+    "shear_truth",
+]
 
-_N_STEPS, _DT, _DAMPING = 1500, 0.02, 0.03
+DT = 0.02
+_N_STEPS, _DAMPING, _MOTION = 1500, 0.03, 5
 _SENSORS, _NOISE = 4, 0.05
 _RIDGE_STEPS, _RIDGE_NOISE = 300, 1e-3
 RIDGES = {
@@ -37,20 +49,21 @@ RIDGES = {
 
 
 @cache
-def _ground_motion() -> np.ndarray:
+def ground_motion(seed: int = _MOTION) -> np.ndarray:
     """Filtered white noise in an envelope, peak 3 m/s2."""
-    time, frequency, ratio = _DT * np.arange(_N_STEPS), 2.0 * np.pi * 2.5, 0.6
-    decay, turn = np.exp(-ratio * frequency * _DT), np.cos(frequency * np.sqrt(1.0 - ratio**2) * _DT)
-    motion = lfilter([1.0], [1.0, -2.0 * decay * turn, decay**2], np.random.default_rng(5).standard_normal(_N_STEPS))
+    time, frequency, ratio = DT * np.arange(_N_STEPS), 2.0 * np.pi * 2.5, 0.6
+    decay, turn = np.exp(-ratio * frequency * DT), np.cos(frequency * np.sqrt(1.0 - ratio**2) * DT)
+    motion = lfilter([1.0], [1.0, -2.0 * decay * turn, decay**2], np.random.default_rng(seed).standard_normal(_N_STEPS))
     motion *= np.minimum(1.0, time / 3.0) * np.exp(-np.maximum(0.0, time - 10.0) / 6.0)
     return 3.0 * motion / np.abs(motion).max()
 
 
-def _floors(storeys: int) -> np.ndarray:
+def floors(storeys: int) -> np.ndarray:
+    """Indices of the measured floors."""
     return np.unique(np.round(np.linspace(storeys / _SENSORS, storeys, _SENSORS)).astype(int) - 1)
 
 
-def _nominal(storeys: int) -> np.ndarray:
+def nominal_stiffnesses(storeys: int) -> np.ndarray:
     """Stiffnesses of the storeys over the mass of a floor [1/s2]."""
     fundamental = 2.0 * np.pi / (0.1 * storeys) / (2.0 * np.sin(0.5 * np.pi / (2 * storeys + 1)))
     return fundamental**2 * np.linspace(1.3, 0.7, storeys)
@@ -58,57 +71,58 @@ def _nominal(storeys: int) -> np.ndarray:
 
 def _modes(storeys: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Squared angular frequencies (n_modes,), and shapes (n_floors, n_modes) of length one."""
-    stiffness = _nominal(storeys) * theta
+    stiffness = nominal_stiffnesses(storeys) * theta
     diagonal = stiffness.copy()
     diagonal[:-1] += stiffness[1:]
     return eigh_tridiagonal(diagonal, -stiffness[1:])
 
 
-def _accelerations(storeys: int, theta: np.ndarray) -> np.ndarray:
+def _accelerations(storeys: int, seed: int, theta: np.ndarray) -> np.ndarray:
     """Absolute accelerations [m/s2] of the measured floors; each mode by its ramp-invariant filter."""
     squares, shapes = _modes(storeys, theta)
-    motion, floors = _ground_motion(), _floors(storeys)
-    response, remaining = np.zeros((len(floors), _N_STEPS)), np.ones(len(floors))
+    motion, measured = ground_motion(seed), floors(storeys)
+    response, remaining = np.zeros((len(measured), _N_STEPS)), np.ones(len(measured))
     for omega, shape in zip(np.sqrt(squares), shapes.T, strict=True):
-        if omega > np.pi / _DT:
+        if omega > np.pi / DT:
             break
-        damped, decay = omega * np.sqrt(1.0 - _DAMPING**2) * _DT, np.exp(-_DAMPING * omega * _DT)
+        damped, decay = omega * np.sqrt(1.0 - _DAMPING**2) * DT, np.exp(-_DAMPING * omega * DT)
         cosine, ratio = decay * np.cos(damped), decay * np.sin(damped) / damped
         numerator = [1.0 - ratio, 2.0 * (ratio - cosine), decay**2 - ratio]
-        amplitude = shape[floors] * shape.sum()
+        amplitude = shape[measured] * shape.sum()
         response += np.outer(amplitude, lfilter(numerator, [1.0, -2.0 * cosine, decay**2], motion))
         remaining -= amplitude
     return response + np.outer(remaining, motion)
 
 
-def _derivatives(storeys: int, theta: np.ndarray) -> np.ndarray:
+def _derivatives(storeys: int, seed: int, theta: np.ndarray) -> np.ndarray:
     """Derivatives (n_storeys, n_floors, n_steps) of `_accelerations` by the factors of the stiffnesses."""
     squares, shapes = _modes(storeys, theta)
-    motion, floors = _ground_motion(), _floors(storeys)
+    motion, measured = ground_motion(seed), floors(storeys)
     drifts = np.diff(shapes, axis=0, prepend=0.0)  # (storey, mode)
     # K' of a storey couples modes m and n by the product of their drifts in it
-    coupled = _nominal(storeys)[:, None, None] * drifts[:, :, None] * drifts[:, None, :]
+    coupled = nominal_stiffnesses(storeys)[:, None, None] * drifts[:, :, None] * drifts[:, None, :]
     gaps = squares[None, :] - squares[:, None]
     mixing = coupled / np.where(gaps == 0.0, np.inf, gaps)  # of shape m in the derivative of shape n
     shape_slopes = np.einsum("fm,kmn->kfn", shapes, mixing)
-    total, result = shapes.sum(axis=0), np.zeros((storeys, len(floors), _N_STEPS))
+    total, result = shapes.sum(axis=0), np.zeros((storeys, len(measured), _N_STEPS))
     undamped = np.sqrt(1.0 - _DAMPING**2)
     for n, omega in enumerate(np.sqrt(squares)):
-        if omega > np.pi / _DT:
+        if omega > np.pi / DT:
             break
-        angle, decay = omega * undamped * _DT, np.exp(-_DAMPING * omega * _DT)
+        angle, decay = omega * undamped * DT, np.exp(-_DAMPING * omega * DT)
         cosine, sine = decay * np.cos(angle), decay * np.sin(angle)
         ratio = sine / angle
         # derivatives by omega
-        shrink, turn = -_DAMPING * _DT, undamped * _DT
+        shrink, turn = -_DAMPING * DT, undamped * DT
         d_cosine, d_sine = shrink * cosine - turn * sine, shrink * sine + turn * cosine
         d_ratio, d_square = (d_sine - ratio * turn) / angle, 2.0 * shrink * decay**2
         poles = [1.0, -2.0 * cosine, decay**2]
         motion_of_mode = lfilter([1.0 - ratio, 2.0 * (ratio - cosine), decay**2 - ratio], poles, motion)
         by_omega = lfilter([-d_ratio, 2.0 * (d_ratio - d_cosine), d_square - d_ratio], poles, motion)
         by_omega -= lfilter([0.0, -2.0 * d_cosine, d_square], poles, motion_of_mode)
-        amplitudes = shapes[floors, n] * total[n]
-        changes = shape_slopes[:, floors, n] * total[n] + shapes[floors, n] * shape_slopes[:, :, n].sum(axis=1)[:, None]
+        amplitudes = shapes[measured, n] * total[n]
+        own, whole = shape_slopes[:, measured, n], shape_slopes[:, :, n].sum(axis=1)
+        changes = own * total[n] + shapes[measured, n] * whole[:, None]
         frequency_slopes = coupled[:, n, n] / (2.0 * omega)
         result += changes[:, :, None] * (motion_of_mode - motion)
         result += (frequency_slopes[:, None] * amplitudes)[:, :, None] * by_omega
@@ -122,23 +136,29 @@ def shear_truth(storeys: int, seed: int) -> np.ndarray:
     return truth
 
 
+def shear_model(storeys: int, jacobian: bool = False, motion: int = _MOTION) -> FunctionModel:
+    """Shear building of d storeys under a ground motion with the given seed."""
+    channels = [Channel(f"floor_{k + 1}", "acceleration", "m/s2") for k in floors(storeys)]
+    names = [f"k_{k + 1}" for k in range(storeys)]
+    version = f"shear building, {storeys} storeys" + (f", motion {motion}" if motion != _MOTION else "")
+    own = partial(_derivatives, storeys, motion) if jacobian else None
+    function = partial(_accelerations, storeys, motion)
+    return FunctionModel(function, names, channels, DT, _N_STEPS, version=version, jacobian=own)
+
+
 def shear_building(storeys: int, seed: int, jacobian: bool = False) -> Posterior:
     """Stiffness factors of all storeys, with priors of mean 1 and standard deviation 0.2; noise of 5 %.
 
     With `jacobian`, the model has derivatives in closed form.
     """
-    function = partial(_accelerations, storeys)
-    channels = [Channel(f"floor_{k + 1}", "acceleration", "m/s2") for k in _floors(storeys)]
-    names = [f"k_{k + 1}" for k in range(storeys)]
-    version = f"shear building, {storeys} storeys"
-    own = partial(_derivatives, storeys) if jacobian else None
-    model = FunctionModel(function, names, channels, _DT, _N_STEPS, version=version, jacobian=own)
-    clean = function(shear_truth(storeys, seed))
+    model = shear_model(storeys, jacobian)
+    names, channels = model.parameter_names, model.channels
+    clean = model.simulate(shear_truth(storeys, seed))
     rms = np.sqrt(np.square(clean).mean(axis=1, keepdims=True))
     values = clean + _NOISE * rms * np.random.default_rng(seed).standard_normal(clean.shape)
     prior = {name: TruncatedNormal(1.0, 0.2) for name in names}
     prior |= {f"sigma_{c.name}": HalfNormal(float(s)) for c, s in zip(channels, rms[:, 0], strict=True)}
-    measured = Measurements(channels, _DT, values, f"SYNTHETIC, seed {seed}")
+    measured = Measurements(channels, DT, values, f"SYNTHETIC, seed {seed}")
     return Posterior(FELikelihood(model, measured, GaussianNoise(channels)), prior).marginal()
 
 

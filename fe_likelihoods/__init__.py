@@ -31,6 +31,7 @@ _IN_MODULES = {
     "emulation.guide": "ResponseGuide",
     "emulation.modes": "Mode ModeSearch find_modes",
     "events.agreement": "Agreement",
+    "events.stiffness_loss": "StiffnessLoss",
     "likelihood.block_likelihood": "BlockLogLikelihood",
     "likelihood.failures": "TooManyFailures",
     "likelihood.parameters": "Parameter",

@@ -8,6 +8,7 @@ from .events.hierarchical_posterior import HierarchicalPosterior, Varying
 from .events.hierarchy_result import Hierarchy
 from .events.leave_one_out import leave_one_out
 from .events.ratios import EventRatios, LevelRatios
+from .events.stiffness_loss import stiffness_loss
 from .events.stored_posterior import StoredPosterior
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
@@ -158,5 +159,6 @@ __all__ = [
     "rrmse",
     "score_left_out",
     "share_within",
+    "stiffness_loss",
     "to_si",
 ]

@@ -7,7 +7,7 @@ the population, the prior density at them, and a mixture of normal distributions
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from ..priors.priors import Prior
 from ..signals.channels import Measurements
 from ..text_tables import number, text_table
 from .scales import Scales
+
+if TYPE_CHECKING:
+    from ..emulation.modes import ModeSearch
 
 __all__ = [
     "DescribedPosterior",
@@ -54,6 +57,8 @@ class StoredPosterior:
         or for weighted samples the effective sample size of the weights.
     measurements : Measurements, optional
         What was measured in the test. `predict_new_event` warns of predictions outside the range of all tests.
+    concerns : sequence of str
+        Why the samples may be wrong, which `stiffness_loss` passes on.
 
     Raises
     ------
@@ -73,6 +78,72 @@ class StoredPosterior:
     log_evidence_error: float = 0.0
     effective_sample_size: float | None = None
     measurements: Measurements | None = None
+    concerns: Sequence[str] = ()
+
+    @classmethod
+    def from_run(cls, sampler: Any, posterior: Any) -> "StoredPosterior":
+        """Posterior of a finished run of `samplers.SMCSampler` or `samplers.TMCMCSampler`, with its evidence.
+
+        After a run with a guide that has an emulator, the samples are the many draws of the emulated posterior, whose
+        covariances are more accurate than covariances of the chain. A verdict other than "converged" is a concern.
+
+        Parameters
+        ----------
+        sampler : SMCSampler or TMCMCSampler
+        posterior : Posterior
+            The sampled posterior.
+
+        Returns
+        -------
+        StoredPosterior
+        """
+        verdict, signed = sampler.verdict, sampler.signed_sample
+        concerns = () if verdict.status == "converged" else (f"{verdict.status}: {'; '.join(verdict.reasons)}",)
+        evidence = float(sampler.log_evidence), float(sampler.log_evidence_error)
+        if signed is None or verdict.status == "not usable":
+            samples, weights = sampler.get_chain(flat=True), None
+            size = min(verdict.effective_sample_size, len(samples))
+        else:
+            known = (signed.rounds == 0) & (signed.weights > 0.0)
+            samples, weights = signed.coords[known], np.log(signed.weights[known])
+            size = None
+        return cls(samples, posterior.prior, weights, *evidence, size, concerns=concerns)
+
+    @classmethod
+    def from_search(cls, search: "ModeSearch", posterior: Any, n: int = 5000, seed: int = 0) -> "StoredPosterior":
+        """Draws of the Laplace approximation at the highest mode of a search: few simulations, and no check of it.
+
+        Parameters
+        ----------
+        search : ModeSearch
+            Result of `fe_likelihoods.emulation.modes.find_modes`. What it says against one mode is a concern.
+        posterior : Posterior
+            The posterior that was searched.
+        n, seed : int
+            Number of draws, and their seed.
+
+        Returns
+        -------
+        StoredPosterior
+
+        Raises
+        ------
+        ValueError
+            If the search found no mode.
+        """
+        if not search.modes:
+            raise ValueError("the search found no mode: use more starts, or a larger limit of simulations")
+        mode, concerns = search.modes[0], []
+        if not search.finished:
+            concerns.append("the limit of simulations ended the search for modes")
+        if not mode.converged:
+            concerns.append("the search ended before the top of the mode")
+        if len(search.modes) > 1:
+            concerns.append(f"the search found {len(search.modes)} modes, of which the highest is used")
+        if sum(end == 0 for end in search.ends) < 2:
+            concerns.append(f"only one of {len(search.ends)} starts led to the mode")
+        coords = np.random.default_rng(seed).multivariate_normal(mode.coords, mode.covariance, n, method="cholesky")
+        return cls(posterior.prior.from_normal(coords), posterior.prior, concerns=concerns)
 
     def __post_init__(self) -> None:
         if not isinstance(self.prior, Prior):
@@ -114,6 +185,7 @@ class StoredPosterior:
             ("samples", points),
             ("log_weights", weights),
             ("effective_sample_size", float(effective)),
+            ("concerns", tuple(self.concerns)),
         ):
             object.__setattr__(self, name, value)
 
