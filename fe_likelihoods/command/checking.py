@@ -68,6 +68,8 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     if record is not None:
         peak = from_si(np.abs(record.acceleration).max(), "g").item()
         say(f"Record: {record.name}, {record.n_steps} samples at {record.dt:g} s, peak {peak:.3g} g")
+        if record.source:
+            say(f"  from {record.source}")
     say(f"Measurements: {measured.description or 'without a description'}")
     for channel, values in zip(measured.channels, measured.values, strict=True):
         shown = from_si(values[np.isfinite(values)], channel.unit)

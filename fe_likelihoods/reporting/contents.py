@@ -73,7 +73,7 @@ def data_sets(run: FinishedRun) -> list[DataSet]:
 def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
     model, measurements = likelihood.model, likelihood.measurements
     excitations = (getattr(model, name, None) for name in ("record", "loading"))
-    excitation = next((each.name for each in excitations if isinstance(getattr(each, "name", None), str)), "")
+    excitation = next((_named(each) for each in excitations if isinstance(getattr(each, "name", None), str)), "")
     samples = np.isfinite(measurements.values).sum(axis=1)
     channels = [
         f"{channel.name} [{channel.unit}], {count} samples at {step:g} s"
@@ -81,6 +81,12 @@ def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
     ]
     noise = noise_title(likelihood.noise)
     return DataSet(key, type(model).__name__, excitation, measurements.description, noise, "; ".join(channels))
+
+
+def _named(excitation: Any) -> str:
+    """Name of an excitation, with its origin and how it was processed, if it states them."""
+    source = getattr(excitation, "source", "")
+    return f"{excitation.name} ({source})" if source else excitation.name
 
 
 def summary_sentences(run: FinishedRun, rows: list[ParameterRow], fits: Fits, *, doubted: bool = False) -> list[str]:

@@ -221,9 +221,15 @@ def read_record(
         if resample is not None:
             raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
         return _READERS[reader](path, channel, units)
-    return _read_csv(path, units, column=channel, missing=missing, resample=resample)
+    try:
+        return _read_csv(path, units, column=channel, missing=missing, resample=resample)
+    except ValueError as error:
+        if Path(path).suffix.lower() in _TABLES:
+            raise
+        raise ValueError(f"{error}. The file has no known format of ground motions and was read as a table") from error
 
 
+_TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".xlsx", ".xlsm")
 _READERS: dict[str, Callable[..., Record]] = {
     "read_at2": lambda path, channel, units: read_at2(path, units),
     "read_geonet": lambda path, channel, units: read_geonet(path, channel),

@@ -155,6 +155,7 @@ def _name_of(lines: list[str], text: str) -> str:
         ("SAC", _is_sac(text)),
         ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
         ("Taiwan CWB or SMART", first.startswith("#StationCode")),
+        ("binary", "\0" in text and not text.startswith(("PK", "\xff\xfe", "\xfe\xff"))),  # no workbook, no UTF-16
     )
     return next((name for name, fits in rules if fits), "")
 

@@ -195,7 +195,8 @@ def test_other_formats_are_named(tmp_path, name):
 
 def test_formats_that_are_not_read_are_named(tmp_path):
     raw = ["Raw acceleration counts   (Format v01.20 with 13 text lines)", "x", "1 2 3"]
-    hdf5 = tmp_path / "a.h5"
+    binary, hdf5 = tmp_path / "a.bin", tmp_path / "a.h5"
+    binary.write_bytes(bytes(range(256)) * 10)
     hdf5.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     cases = (
         (write(tmp_path / "a.V0", raw), "COSMOS V0 .raw acceleration."),
@@ -203,6 +204,7 @@ def test_formats_that_are_not_read_are_named(tmp_path):
         (write(tmp_path / "a.htm", ["<!DOCTYPE html>", "<html>"]), "web page .HTML."),
         (write(tmp_path / "b.V1", ["* VOL1DS FILE:  5522/01", "x"]), "BHRC V1"),
         (hdf5, "HDF5"),
+        (binary, "binary"),
     )
     for path, name in cases:
         for read in (read_record, read_csv, read_at2, read_v2):
@@ -255,6 +257,14 @@ def test_v1_with_uneven_times(tmp_path):
 def test_damaged_v1_files(tmp_path, lines, message):
     with pytest.raises(ValueError, match=message):
         read_v2(write(tmp_path / "a.V1", lines))
+
+
+def test_text_of_an_unknown_format(tmp_path):
+    path = write(tmp_path / "a.acc", ["station 7", "rate 200", "1 2 3", "4 5"])
+    with pytest.raises(
+        ValueError, match="expected 3 cells .* no known format of ground motions and was read as a table"
+    ):
+        read_record(path)
 
 
 def test_read_record_recognises_the_others(tmp_path):
