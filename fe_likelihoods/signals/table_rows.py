@@ -31,6 +31,7 @@ _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or on
 # Separators of thousands that cannot be decimal marks: another mark or a second group follows
 _GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
 _SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
+_SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
 _SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
 _HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
 _EXCEL = {".xlsx", ".xlsm"}
@@ -113,6 +114,8 @@ def _split(line: str, separator: str, where: str) -> list[str]:
     except csv.Error as error:
         raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
     cells = [cell.strip() for cell in cells]
+    if not _SPACE.search(line):
+        return cells
     return [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells]
 
 
@@ -199,7 +202,8 @@ def _check_short_header(lines: Sequence[tuple[int, list[str]]], width: int, file
 
 def _ungrouped(rows: list[tuple[int, list[str]]], file: str) -> list[tuple[int, list[str]]]:
     """Rows without separators of thousands, if a number such as ``1,234.5`` or ``1.234.567`` shows which mark it is."""
-    found = next(((number, cell) for number, cells in rows for cell in cells if _GROUPED.match(cell)), None)
+    marked = ((number, cell) for number, cells in rows for cell in cells if "," in cell or cell.count(".") > 1)
+    found = next((each for each in marked if _GROUPED.match(each[1])), None)
     if found is None:
         return rows
     mark = next(letter for letter in found[1] if letter in ",.")

@@ -141,7 +141,10 @@ def parse_number(field: str, where: str) -> float:
 
 def decimals_of(field: str) -> int:
     """Return how many digits after the decimal point the number in a field has, less than zero for 1e3."""
-    mantissa, _, exponent = _FORTRAN_EXPONENT.sub("e", field).lower().partition("e")
+    digits = field.partition(".")[2]
+    if digits.isdecimal():  # most fields
+        return len(digits)
+    mantissa, _, exponent = field.lower().replace("d", "e").partition("e")
     power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
     return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)
 
@@ -166,4 +169,7 @@ def _as_float(field: str) -> float:
     """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
     if "_" in field:
         raise ValueError
-    return float(_FORTRAN_EXPONENT.sub("e", field))
+    try:
+        return float(field)
+    except ValueError:
+        return float(_FORTRAN_EXPONENT.sub("e", field))
