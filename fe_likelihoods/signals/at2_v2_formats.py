@@ -42,6 +42,7 @@ from .text_files import (
     check_count,
     check_peak,
     decimals_of,
+    fixed_width_samples,
     is_number,
     parse_count,
     parse_number,
@@ -251,8 +252,6 @@ def _parse_v1(channel: V2Channel) -> Series:
             raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
         unit = found[1]
         count = parse_count(_header_field(channel, _V1_TEXT, _V1_INTEGERS[1:], _V1_COUNT), where)
-        if count < 2:
-            raise ValueError(f"{where}: expected two samples or more, the header announces {count}")
         pairs = _fixed_width(channel, _V1_HEADER, 2 * count, _V1_PAIRS)
         times, values, first = pairs[::2], pairs[1::2], line[_V1_PAIRS[1] : 2 * _V1_PAIRS[1]]
         step, digit = float(times[-1] - times[0]) / (count - 1), 10.0 ** -decimals_of(line[: _V1_PAIRS[1]].strip())
@@ -362,23 +361,12 @@ def _header_field(channel: V2Channel, start: int, form: tuple[int, int], place: 
 
 
 def _fixed_width(channel: V2Channel, start: int, count: int, form: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the `count` numbers in a block of Fortran columns."""
+    """Return the samples in a block of Fortran columns, after which the file must have no further ones."""
     per_line, width = form
-    values: list[float] = []
-    for offset in range(start, start - (-count // per_line)):
-        line = channel.lines[offset].rstrip() if offset < len(channel.lines) else ""
-        where = f"{channel.file}, line {channel.first + offset}"
-        wanted = min(per_line, count - len(values))
-        found = math.ceil(len(line) / width)
-        if found != wanted:
-            raise ValueError(
-                f"{where}: expected {wanted} numbers of {width} columns, got {found}, after {len(values)} of the "
-                f"{count} samples that the file announces; the file is truncated or damaged"
-            )
-        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
+    values = fixed_width_samples(channel.lines, start, count, form, channel.file, channel.first)
     following = channel.lines[start - (-count // per_line) :][:1]
     if following and is_number(following[0][:width].strip()):
         raise ValueError(
             f"{channel.file}, line {channel.first + start}: the file announces {count} samples but has more after them"
         )
-    return np.array(values)
+    return values

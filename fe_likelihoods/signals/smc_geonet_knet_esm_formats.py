@@ -26,7 +26,6 @@ import re
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..units import from_si, to_si
 from .clock_times import is_clock
@@ -37,6 +36,7 @@ from .text_files import (
     check_count,
     check_peak,
     decimals_of,
+    fixed_width_samples,
     is_number,
     parse_count,
     parse_number,
@@ -184,7 +184,7 @@ def parse_smc(text: str, file: str) -> Series:
     start = first_real + _SMC_REALS[0] // _SMC_REALS[1] + comments
     if not all(line.startswith("|") for line in lines[start - comments : start]):
         raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
-    values, times = _samples(lines, start, count, _SMC_DATA, file), None
+    values, times = fixed_width_samples(lines, start, count, _SMC_DATA, file), None
     if uneven:
         times, values = values[::2], values[1::2]
     for stated, found in ((highest, values.max()), (lowest, values.min())):
@@ -233,7 +233,7 @@ def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetCo
         )
     unit = _GEONET_UNIT.search(head)
     scale = float(unit[1]) if unit else 1.0
-    values = scale * _samples(lines, first, counts[0], _GEONET_DATA, file)
+    values = scale * fixed_width_samples(lines, first, counts[0], _GEONET_DATA, file)
     # both numbers are rounded to the digits that are printed
     rounding = scale * 10.0 ** -decimals_of(lines[first][: _GEONET_DATA[1]].strip()) + 10.0 ** -decimals_of(peak[1])
     check_peak(float(np.abs(values).max()), abs(float(peak[1])), 0.505 * rounding, where)
@@ -322,24 +322,6 @@ def _numbers(lines: list[str], start: int, count: int, per_line: int, width: int
             parse_number(line[column * width : (column + 1) * width].strip(), f"{file}, line {start + row + 1}")
         )
     return numbers
-
-
-def _samples(lines: list[str], start: int, count: int, form: tuple[int, int], file: str) -> NDArray[np.float64]:
-    """Samples in Fortran columns that may touch, from the line with index `start`."""
-    per_line, width = form
-    values: list[float] = []
-    for k in range(start, start - (-count // per_line)):
-        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {k + 1}"
-        wanted = min(per_line, count - len(values))
-        if math.ceil(len(line) / width) != wanted:
-            raise ValueError(
-                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
-                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
-            )
-        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
-    if len(values) < 2:
-        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
-    return np.array(values)
 
 
 def _whole(number: float, file: str, what: str) -> int:

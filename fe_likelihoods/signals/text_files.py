@@ -18,6 +18,7 @@ __all__ = [
     "check_count",
     "check_peak",
     "decimals_of",
+    "fixed_width_samples",
     "is_number",
     "parse_count",
     "parse_number",
@@ -137,6 +138,46 @@ def parse_number(field: str, where: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{where}: expected a finite number, got {field[:100]!r}")
     return value
+
+
+def fixed_width_samples(
+    lines: list[str], start: int, count: int, form: tuple[int, int], file: str, first: int = 1
+) -> NDArray[np.float64]:
+    """Return samples in Fortran columns, which may touch; raise ValueError if a line has too few or too many.
+
+    Parameters
+    ----------
+    lines : list of str
+        Lines of a file, or of a part of it.
+    start : int
+        Index of the line with the first sample.
+    count : int
+        Number of samples.
+    form : (int, int)
+        Numbers per line, and columns per number.
+    file : str
+        The file, for messages.
+    first : int
+        Number of the first of the lines in the file.
+
+    Returns
+    -------
+    ndarray, shape (count,)
+    """
+    per_line, width = form
+    values: list[float] = []
+    for k in range(start, start - (-count // per_line)):
+        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {first + k}"
+        wanted = min(per_line, count - len(values))
+        if math.ceil(len(line) / width) != wanted:
+            raise ValueError(
+                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
+                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
+            )
+        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
+    if len(values) < 2:
+        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
+    return np.array(values)
 
 
 def decimals_of(field: str) -> int:

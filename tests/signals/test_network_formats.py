@@ -243,7 +243,7 @@ def test_v1_with_uneven_times(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (csmip_v1(V1, 200)[:-3], "after 48 of the 61 samples|expected 8 numbers of 9 columns, got"),
+        (csmip_v1(V1, 200)[:-3], "expected 8 numbers of 9 columns after 48 of 61 samples, got"),
         (csmip_v1(V1, 200, pairs=True)[:-2], "the file is truncated or damaged"),
         (changed(csmip_v1(V1, 200), f"{max(V1):10.6f}", f"{max(V1) + 1e-4:10.6f}"), "the header states a peak of"),
         (changed(csmip_v1(V1, 200), "200 pts/sec", "100 pts/sec"), "61 samples at 100 per second are not 0.305.* s"),
