@@ -1,13 +1,16 @@
 """Formats of seismology that the package obspy reads: miniSEED, SAC, GSE2."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 
+from .smc_geonet_knet_esm_formats import recognise
 from .text_files import Series, read_bytes
 
 __all__ = ["parse_obspy"]
 
+_FORMATS = {"miniSEED": "MSEED", "SAC": "SAC", "GSE2": "GSE2"}  # names in `recognise` and in obspy
 _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
@@ -19,9 +22,13 @@ def parse_obspy(path: str | Path, channel: str | None) -> Series:
         raise ValueError(
             f"reading {path} needs the package obspy: install it with pip install obspy, or write the record as CSV"
         ) from error
-    read_bytes(path)  # the checks of existence and size
+    content = read_bytes(path)
+    form = _FORMATS.get(recognise(content[:8000].decode("latin-1"))[0])
+    if form is None:
+        raise ValueError(f"{path}: expected a file in {', '.join(_FORMATS)}")
     try:
-        stream = obspy.read(str(path)).merge()
+        # by name: obspy would also find formats such as pickle, which runs code of the file
+        stream = obspy.read(io.BytesIO(content), format=form).merge()
         traces = [trace for trace in stream if channel is None or trace.id.endswith(channel)]
     except Exception as error:  # a damaged file may raise anything
         raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error

@@ -13,9 +13,8 @@ from .text_files import NUMBER, agree_on_unit
 
 __all__ = ["nominal_step", "row_times", "table_start", "table_step", "time_column"]
 
-_TIME = re.compile(
-    r"(elapsed |relative )?(t|(time|timestamp|unix|epoch|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE
-)
+_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
+_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
 _DAY_1970 = datetime.date(1970, 1, 1).toordinal()
 _UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
 _UNIX_SECONDS = (1e9, 4.2e9)  # seconds since 1970 of the years 2001 to 2103
@@ -114,8 +113,11 @@ def time_column(table: Table) -> int | None:
     clock = min(table.clocks, default=None)
     if not table.names:
         return 0 if table.time_unit is not None and table.values.shape[1] > 1 else clock
-    named = (i for i, name in enumerate(table.names) if _TIME.match(name) and i not in table.clocks | table.dates)
-    return min(named, key=lambda i: (_unix_unit(table, i) is not None, i), default=clock)
+    for form in (_TIME, _STAMP):
+        for i, name in enumerate(table.names):
+            if form.match(name) and i not in table.clocks | table.dates:
+                return i
+    return clock
 
 
 def _unix_unit(table: Table, place: int) -> str | None:
@@ -217,7 +219,8 @@ def _check_single_clock(table: Table, place: int) -> None:
     for other, name in enumerate(table.names):
         if place in table.clocks or other in table.clocks | table.dates:
             continue
-        unit = stated_unit(table, other) if other != place and _TIME.match(name) else None
+        like_time = other != place and (_TIME.match(name) or _STAMP.match(name))
+        unit = stated_unit(table, other) if like_time else None
         try:
             is_time = unit is not None and find_unit(unit).dimension == "time"
         except ValueError:  # another quantity, such as a temperature T [°C]

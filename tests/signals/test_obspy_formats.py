@@ -59,6 +59,14 @@ def test_what_is_refused(tmp_path, trace):
         read_record(tmp_path / "velocity.sac", units="g")
 
 
+def test_no_code_of_a_file_is_run(tmp_path, trace):
+    """obspy would read a pickle."""
+    path = tmp_path / "a.mseed"
+    trace.write(str(path), format="PICKLE")
+    with pytest.raises(ValueError, match="expected a file in miniSEED, SAC, GSE2|looks like a binary file"):
+        read_obspy(path, "g")
+
+
 def test_without_obspy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "obspy", None)
     (tmp_path / "a.mseed").write_bytes(b"000001D SYN     HNZXX" + bytes(500))
