@@ -74,7 +74,7 @@ def exceedance_draws(
     rng: np.random.Generator,
     below: bool = False,
     failed: np.ndarray | None = None,
-    failures_exceed: bool = False,
+    exceeding: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draws of the probability that the value in a new event exceeds the limit.
 
@@ -88,15 +88,15 @@ def exceedance_draws(
         Draws of the samples and of the ratios' population. All entries of the values have the same draws.
     failed : (n, ...) ndarray of bool, optional
         Values that are not known, because their simulation failed. Default: none.
-    failures_exceed : bool
-        Whether failed values count as exceedances. Otherwise they are left out.
+    exceeding : (n, ...) ndarray of bool, optional
+        Failed values that count as exceedances. Default: none; the others are left out.
 
     Returns
     -------
     (n_draws, ...) ndarray
         Probability given each draw of the population; NaN where its sample failed and is left out.
     """
-    failed = np.zeros(values.shape, dtype=bool) if failed is None else failed
+    failed, exceeding = (np.zeros(values.shape, dtype=bool) if each is None else each for each in (failed, exceeding))
     known = np.where(failed, np.nanmax(np.where(failed, -np.inf, values), initial=-np.inf), values)
     if spread.weights is None:  # each draw has one of the samples
         rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))[:, None]
@@ -117,10 +117,8 @@ def exceedance_draws(
             part = RatioPopulations(populations.log_levels, populations.center[chunk], populations.sd[chunk])
             single = _given_populations(known[at], limits[at], part, below)
         counted = np.ones(single.shape)
-        if failures_exceed:
-            single = np.where(failed[at], 1.0, single)
-        else:
-            counted[failed[at]] = 0.0
+        single = np.where(exceeding[at], 1.0, single)
+        counted[failed[at] & ~exceeding[at]] = 0.0
         weights = np.ones(at.shape) if spread.weights is None else spread.weights[chunk]
         total = np.einsum("hj,hj...->h...", weights, counted)
         share = np.einsum("hj,hj...->h...", weights, single * counted)

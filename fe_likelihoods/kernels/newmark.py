@@ -70,6 +70,8 @@ class Dynamics(NamedTuple):
         Rayleigh damping: factors of the mass [1/s] and of the committed tangent stiffness [s].
     velocity : float
         Initial velocity of the top along x [m/s].
+    collapse : float
+        Lateral displacement of the top beyond which the column has collapsed, and the analysis ends [m].
     """
 
     gravity: np.ndarray
@@ -77,6 +79,7 @@ class Dynamics(NamedTuple):
     a0: float
     a1: float
     velocity: float
+    collapse: float = math.inf
 
 
 @kernel(inline=True)
@@ -126,7 +129,7 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
     Returns
     -------
     status : int
-        0 on success, -1 when gravity failed, k when step k failed.
+        0 on success, -1 when gravity failed, k when step k failed, -1 - k when the column had collapsed after step k.
     retries, iterations : int
     """
     gravity, mass, a0, a1 = dynamics.gravity, dynamics.mass, dynamics.a0, dynamics.a1
@@ -253,6 +256,8 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
             copy_matrix(stiffness, committed)
             done += part
             loose = False
+        if abs(u[top]) > dynamics.collapse:
+            return -1 - step, retries, total_iterations
         if step % every == 0:
             m = step // every
             history[0, m] = u[top]

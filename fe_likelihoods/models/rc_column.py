@@ -127,6 +127,10 @@ class RCColumn(ThreadedModel):
         Low-cycle fatigue of the bars. None: bars neither lose strength nor fracture.
     buckling : BarBuckling or None
         Buckling of the bars. None: bars in compression stay straight.
+    collapse_drift : float
+        Displacement of the top by the height at which a column under a `Record` has collapsed, and the simulation ends
+        with the reason "collapse". Tested columns have lost their strength at 0.05 to 0.15. Without a limit, columns
+        whose bars do not fracture would come back from any drift.
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (`RCColumn` lists them).
     n_elements : int
@@ -218,6 +222,7 @@ class RCColumn(ThreadedModel):
     penetration: float = 0.0
     fatigue: LowCycleFatigue | None = None
     buckling: BarBuckling | None = None
+    collapse_drift: float = 0.2
     parameters: tuple[str, ...] = ("Ec", "Es", "a0", "a1", "ft")
     n_elements: int = 2
     n_points: int = 3
@@ -461,7 +466,10 @@ class RCColumn(ThreadedModel):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
         check_fields(
             self,
-            positive=("diameter", "height", "mass", "tolerance", "element_tolerance", "max_increment"),
+            positive=(
+                *("diameter", "height", "mass", "tolerance", "element_tolerance", "max_increment"),
+                "collapse_drift",
+            ),
             non_negative=("cover", "rotational_inertia", "a0", "a1", "penetration"),
             finite=("axial_load",),
             optional=("max_increment", "axial_load"),

@@ -39,6 +39,9 @@ __all__ = [
 LARGEST_DRIFT = 0.5
 """Largest imposed displacement by the height; tested columns have failed at 0.05 to 0.15."""
 
+LOST_BARS = 0.5
+"""Share of the bar area in a section: with more fractured bars, a column without equilibrium has collapsed."""
+
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
 
 IMPOSED_ROWS = (
@@ -144,7 +147,7 @@ class BaseMotion(NamedTuple):
         first: int,
         energies: np.ndarray,
     ) -> Analysis:
-        """Integrate the equations of motion; SimulationFailed if a step does not converge.
+        """Integrate the equations of motion; SimulationFailed at collapse, or if a step does not converge.
 
         Parameters
         ----------
@@ -170,6 +173,11 @@ class BaseMotion(NamedTuple):
         status, retries, _ = newmark(
             column, dynamics, *loading, iteration, history, sections, first * self.substeps, energies
         )
+        if status < -1:
+            raise SimulationFailed(
+                f"collapse: at t = {-(status + 1) * self.dt:.4g} s, the displacement of the top exceeded the limit of "
+                f"{dynamics.collapse:.4g} m (collapse_drift)"
+            )
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
@@ -353,4 +361,6 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason
+    if lost > LOST_BARS:
+        reason = f"collapse: {reason}"
     return f"{reason}; bars with {lost:.0%} of the area of all bars in a section had fractured before"

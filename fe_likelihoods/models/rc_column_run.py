@@ -94,7 +94,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     Raises
     ------
     SimulationFailed
-        If the parameters describe no structure, or the solution does not converge.
+        If the parameters describe no structure, the column collapses, or the solution does not converge.
     ValueError
         If `state` is not a state of this column at a sample before the last one.
     """
@@ -122,7 +122,9 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     else:
         mass = np.zeros(3 * model.n_elements)
         mass[-3:] = values["mass"], values["mass"] * model.vertical_mass, model.rotational_inertia
-        dynamics = Dynamics(gravity, mass, float(values["a0"]), float(values["a1"]), 0.0)
+        dynamics = Dynamics(
+            gravity, mass, float(values["a0"]), float(values["a1"]), 0.0, model.collapse_drift * model.height
+        )
         energies = np.zeros(_N_ENERGIES)
         first = 0 if state is None else _restore(column, energies, state, model.n_steps)
         analysis = prepared.motion.run(column, dynamics, iteration, record, first, energies)

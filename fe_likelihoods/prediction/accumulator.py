@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..noise.draws import SampleNoise
-from ..simulation.model import split_seconds
+from ..simulation.model import is_collapse, split_seconds
 from .model_error import ModelError
 from .streaming import RetainedResults, RunningMoments
 
@@ -50,6 +50,8 @@ class Accumulator:
         Results for quantiles, None if there are none.
     failed : list of ndarray
         Indices of samples that are left out.
+    collapsed : list of ndarray
+        Indices of those whose structure collapsed.
     reasons : Counter
         Number of samples left out for each reason, without the durations of the simulations.
     shape : tuple of int or None
@@ -68,6 +70,7 @@ class Accumulator:
     noise_variance: RunningMoments = field(default_factory=RunningMoments)
     retained: RetainedResults | None = None
     failed: list[np.ndarray] = field(default_factory=list)
+    collapsed: list[np.ndarray] = field(default_factory=list)
     reasons: Counter = field(default_factory=Counter)
     shape: tuple[int, ...] | None = None
 
@@ -177,4 +180,6 @@ class Accumulator:
 
     def _leave_out(self, samples: np.ndarray, reason: str) -> None:
         self.failed.append(samples)
+        if is_collapse(reason):
+            self.collapsed.append(samples)
         self.reasons[split_seconds(reason)[0]] += len(samples)

@@ -27,7 +27,7 @@ from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
 from .new_event import draw_new_event, of_hierarchy
-from .propagation import check_effective_sample_size, propagate
+from .propagation import AllFailed, check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import (
     binomial_interval,
@@ -60,7 +60,10 @@ class Fragility(NamedTuple):
     lower, upper : ndarray, shape (n_records,)
         Interval of each probability, as in `Exceedance`.
     n_failed : ndarray of int, shape (n_records,)
-        Number of samples whose simulation failed.
+        Number of samples whose simulation failed, without those whose structure collapsed.
+    n_collapsed : ndarray of int, shape (n_records,)
+        Number of samples whose structure collapsed (`fe_likelihoods.SimulationFailed` with a reason that begins with
+        "collapse"). They count as exceedances.
     curve : FragilityCurve or None
         The fitted curve, None if the points do not determine one (the reason is logged as a warning).
     threshold : float
@@ -86,6 +89,7 @@ class Fragility(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     n_failed: np.ndarray
+    n_collapsed: np.ndarray
     curve: FragilityCurve | None
     threshold: float
     from_state: str = "virgin"
@@ -96,11 +100,11 @@ class Fragility(NamedTuple):
 
     def __str__(self) -> str:
         intensity = f"intensity [{self.intensity_unit}]" if self.intensity_unit else "intensity"
-        rows = [("record", intensity, "P(exceed)", "MC error", "interval", "failed")]
+        rows = [("record", intensity, "P(exceed)", "MC error", "interval", "failed", "collapsed")]
         for k, name in enumerate(self.names):
             numbers = number(self.intensity[k]), number(self.probability[k]), number(self.standard_error[k], 2)
             ends = f"{number(self.lower[k])} to {number(self.upper[k])}"
-            rows.append((name, *numbers, ends, f"{self.n_failed[k]}"))
+            rows.append((name, *numbers, ends, f"{self.n_failed[k]}", f"{self.n_collapsed[k]}"))
         unit = "" if self.unit == "1" else f" {self.unit}"
         lines = [f"Probability to exceed {number(self.threshold)}{unit}, from the state {self.from_state!r}"]
         lines += [
@@ -215,8 +219,8 @@ def fragility(
         Function that returns a positive number for an element of `records`. Default: peak acceleration [m/s²], of the
         first record of a tuple (the horizontal component, or the first support).
     failures_exceed : bool
-        Count a failed simulation as an exceedance, for models whose simulation fails at collapse. Default: failed
-        samples are left out.
+        Count a failed simulation as an exceedance, for models whose simulation fails at collapse without saying so.
+        Default: failed samples are left out. A failure whose reason begins with "collapse" is always an exceedance.
     from_state, rest
         State of the structure at the beginning of each record, as in `propagate`. With "end" every record follows the
         excitation of the model, not the other records.
@@ -241,7 +245,7 @@ def fragility(
         As `propagate` and `exceedance`, before any simulation where possible. Also if there are no records, an
         intensity is not positive, or the quantity is not one number.
     SimulationFailed
-        If every simulation under a record fails and failures do not count as exceedances.
+        If every simulation under a record fails, none by collapse, and failures do not count as exceedances.
 
     Warns
     -----
@@ -279,6 +283,7 @@ def fragility(
     check_level(level)
 
     values = np.full((n, len(records)), np.nan)
+    collapsed = np.zeros(values.shape, dtype=bool)
     for k, record in enumerate(records):
         try:
             prediction = propagate(
@@ -293,15 +298,18 @@ def fragility(
                 seed=seed,
                 **(settings if k == np.argmax(intensities) else settings | {"calibrated": ()}),  # warned of once
             )
-        except SimulationFailed as error:
-            if not failures_exceed:
+        except AllFailed as error:
+            if not failures_exceed and len(error.collapsed) == 0:
                 raise SimulationFailed(f"record {_name(record)!r}: {error.reason}") from error
+            collapsed[error.collapsed, k] = True
             continue
         if prediction.values is None or prediction.values.ndim != 1:
             raise ValueError(f"fragility needs one number as quantity; got arrays of shape {prediction.mean.shape}")
         values[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True), k] = prediction.values
+        collapsed[prediction.collapsed, k] = True
     spread = EventSpread(values, weights, ratios)
-    found = _probabilities(spread, float(limit), failures_exceed, effective, level, seed)
+    exceeding = np.isnan(values) if failures_exceed else collapsed
+    found = _probabilities(spread, float(limit), exceeding, effective, level, seed)
     intensity_unit = DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else ""
     try:
         rng = np.random.default_rng(seed)
@@ -317,7 +325,8 @@ def fragility(
         found.standard_error,
         found.lower,
         found.upper,
-        np.isnan(values).sum(axis=0),
+        (np.isnan(values) & ~collapsed).sum(axis=0),
+        collapsed.sum(axis=0),
         curve,
         float(limit),
         state,
@@ -388,21 +397,24 @@ class _Found(NamedTuple):
 
 
 def _probabilities(
-    spread: EventSpread, limit: float, failures_exceed: bool, effective: float, level: float, seed: int | None
+    spread: EventSpread, limit: float, exceeding: np.ndarray, effective: float, level: float, seed: int | None
 ) -> _Found:
-    """Probabilities of samples (n_records, n) and of records, from values (n, n_records) with NaN for failures."""
+    """Probabilities of samples (n_records, n) and of records, from values (n, n_records) with NaN for failures.
+
+    Failures count as exceedances where `exceeding` (n, n_records) is true; the others are left out.
+    """
     values = spread.values
     failed = np.isnan(values)
     known, limits = np.where(failed, 1.0, values), np.full(values.shape, limit)
-    single = np.where(failed, float(failures_exceed), exceedance_of_samples(known, limits, spread.ratios)).T
-    counted = np.ones(single.shape) if failures_exceed else 1.0 - failed.T
+    single = np.where(failed, exceeding, exceedance_of_samples(known, limits, spread.ratios)).T
+    counted = 1.0 - (failed & ~exceeding).T
     trials = effective * counted.mean(axis=1)
     share = single.sum(axis=1) / counted.sum(axis=1)
     if spread.ratios is None and spread.weights is None:
         lower, upper = binomial_interval(share, trials, level)
         return _Found(single, counted, share, np.sqrt(share * (1.0 - share) / trials), lower, upper, None)
     rng = np.random.default_rng(seed)
-    draws = exceedance_draws(values, limits, spread, rng, failed=failed, failures_exceed=failures_exceed)
+    draws = exceedance_draws(values, limits, spread, rng, failed=failed, exceeding=exceeding)
     lower, upper = interval_of_draws(draws, share, trials, spread, level)
     deviation = np.sqrt((np.square(single - share[:, None]) * counted).sum(axis=1) / counted.sum(axis=1))
     return _Found(single, counted, share, deviation / np.sqrt(trials), lower, upper, draws)

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,6 +60,8 @@ class Prediction:
         Effective number of independent samples, for the Monte Carlo errors.
     failed : ndarray of int, shape (n_failed,)
         Indices of the samples that are left out, because the simulation failed or the quantity is not finite.
+    collapsed : ndarray of int, shape (n_collapsed,)
+        Indices of the failed samples whose structure collapsed. Mean and quantiles are those of the other structures.
     failure_reasons : dict of str to int
         Number of samples left out for each reason, without the durations of the simulations.
     channels : tuple of Channel
@@ -104,6 +106,7 @@ class Prediction:
     quantity: object = None
     spread: EventSpread | None = None
     remarks: tuple[str, ...] = ()
+    collapsed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @property
     def sd(self) -> np.ndarray:
@@ -362,7 +365,8 @@ class Prediction:
         if self.has_ratios:
             lines.append("the ratio of a new event has no mean: use the quantiles")
         if self.n_failed:
-            lines.append(f"{self.n_failed} samples failed and are left out")
+            collapse = f" (the structure collapsed in {len(self.collapsed)})" if len(self.collapsed) else ""
+            lines.append(f"{self.n_failed} samples failed{collapse} and are left out")
         lines += [f"CAUTION: {remark}" for remark in self.remarks]
         units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
         if self.dt is not None:

@@ -63,7 +63,7 @@ from .transfer_checks import (
     sample_to_check,
 )
 
-__all__ = ["check_effective_sample_size", "fit_measures", "propagate"]
+__all__ = ["AllFailed", "check_effective_sample_size", "fit_measures", "propagate"]
 
 logger = logging.getLogger(__name__)
 
@@ -397,6 +397,14 @@ def check_effective_sample_size(effective_sample_size: float | None, n: int) -> 
     return effective_sample_size
 
 
+class AllFailed(SimulationFailed):
+    """No sample is left to predict from; `collapsed` has the indices of those whose structure collapsed."""
+
+    def __init__(self, reason: str, collapsed: np.ndarray) -> None:
+        super().__init__(reason)
+        self.collapsed = collapsed
+
+
 def _prediction(
     accumulator: Accumulator,
     n: int,
@@ -406,10 +414,13 @@ def _prediction(
     from_state: str,
     shifted: tuple[str, ...],
 ) -> Prediction:
-    failed = np.sort(np.concatenate(accumulator.failed)) if accumulator.failed else np.zeros(0, dtype=int)
+    failed, collapsed = (
+        np.sort(np.concatenate([np.zeros(0, dtype=int), *samples]))
+        for samples in (accumulator.failed, accumulator.collapsed)
+    )
     frequent = "; ".join(f"{count}: {reason}" for reason, count in accumulator.reasons.most_common(3))
     if len(failed) == n:
-        raise SimulationFailed(f"nothing to predict from, all {n} samples failed ({frequent})")
+        raise AllFailed(f"nothing to predict from, all {n} samples failed ({frequent})", collapsed)
     if len(failed):
         logger.warning("%d of %d samples failed and are left out of the prediction (%s)", len(failed), n, frequent)
     used = np.setdiff1d(np.arange(n), failed, assume_unique=True)
@@ -448,6 +459,7 @@ def _prediction(
         n_quantile=n_quantile if probabilities else 0,
         effective_sample_size=float(effective),
         failed=failed,
+        collapsed=collapsed,
         failure_reasons=dict(accumulator.reasons),
         channels=channels,
         dt=dt if histories else None,

@@ -34,6 +34,7 @@ __all__ = [
     "derivatives_batch",
     "first_part",
     "has_batch_method",
+    "is_collapse",
     "misfit_batch",
     "misfit_of_responses",
     "most_responses",
@@ -53,12 +54,18 @@ class SimulationFailed(FailedRun):
     """A simulation that failed.
 
     `reason` says why, in words. It may end with the duration of the run, as in "crashed after 12.3 s"
-    (`split_seconds`).
+    (`split_seconds`). A reason that begins with "collapse" says that the structure has collapsed (`is_collapse`): this
+    is a result, which `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
     """
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = (reason if isinstance(reason, str) else str(reason)) or "no reason given"
+
+
+def is_collapse(reason: str) -> bool:
+    """Return whether a simulation ended because the structure collapsed: its reason begins with "collapse"."""
+    return reason.startswith("collapse")
 
 
 def split_seconds(reason: str) -> tuple[str, float | None]:

@@ -1,6 +1,7 @@
 """Columns whose bars buckle, lose strength and fracture: options, parameters, failures, warnings and continued runs."""
 
 import logging
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.kernels import bar_fatigue_buckling
 from fe_likelihoods.problems import bridge_column_data
+from fe_likelihoods.simulation.model import is_collapse
 from fe_likelihoods.units import G0
 from tests.kernels import golden
 
@@ -162,9 +164,38 @@ def test_the_fatigue_coefficient_is_found_from_a_test_to_fracture(column):
     assert values[2] - np.sort(values)[-2] > 100.0
 
 
+def test_a_drift_beyond_the_limit_is_a_collapse():
+    """The simulation ends at the first sample beyond the limit; other limits change no bit."""
+    record = bridge_column_data().record.scale(3.0).trim(5.0, 11.0)
+    model = RCColumn.lhpost(record)
+    whole = model.simulate(np.ones(5))
+    drift = np.abs(whole[1]) / model.height
+    with pytest.raises(SimulationFailed) as error:
+        replace(model, collapse_drift=0.5 * drift.max()).simulate(np.ones(5))
+    first = np.argmax(drift > 0.5 * drift.max())
+    assert is_collapse(error.value.reason)
+    assert f"at t = {first * model.dt:.4g} s" in error.value.reason
+    before = replace(model, collapse_drift=0.5 * drift.max()).first((first - 1) * model.dt)
+    np.testing.assert_array_equal(before.simulate(np.ones(5)), whole[:, :first])
+    np.testing.assert_array_equal(replace(model, collapse_drift=1.001 * drift.max()).simulate(np.ones(5)), whole)
+
+
+def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_failed(column):
+    model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02)
+    with pytest.raises(SimulationFailed) as error:
+        replace(model, axial_load=16e6).simulate([1.0])
+    lost = float(re.search(r"bars with (\d+)% of the area", error.value.reason)[1])
+    assert is_collapse(error.value.reason) == (lost > 50.0)
+    failing = dict(fatigue=LowCycleFatigue(cf=0.037, cd=0.389), buckling=BarBuckling(10.8), max_increment=0.02)
+    with pytest.raises(SimulationFailed, match="bars with 33% of the area") as error:
+        weakened(column, (0.01, 0.03, 0.05, 0.07), axial_load=0.53e6, **failing).simulate([1.0])
+    assert not is_collapse(error.value.reason)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        (dict(collapse_drift=0.0), "positive"),
         (dict(parameters=("Cf",)), "add fatigue=LowCycleFatigue"),
         (dict(parameters=("slenderness",)), "add buckling=BarBuckling"),
         (dict(fatigue=0.26), r"expected LowCycleFatigue\(...\) as fatigue"),

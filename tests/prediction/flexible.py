@@ -20,17 +20,17 @@ class Flexible:
     fingerprint = "flexible"
     path_dependent = False
 
-    def __init__(self, record, collapse=np.inf):
-        self.record, self.collapse = record, collapse
+    def __init__(self, record, limit=np.inf, reason="did not converge"):
+        self.record, self.limit, self.reason = record, limit, reason
         self.dt, self.n_steps = record.dt, record.n_steps
 
     def with_record(self, record):
         if not isinstance(record, Record):
             raise ValueError(f"expected a Record; got {type(record).__name__}")
-        return type(self)(record, self.collapse)
+        return type(self)(record, self.limit, self.reason)
 
     def simulate(self, theta):
         displacement = 0.1 / MEDIAN * np.exp(theta[0]) * self.record.acceleration
-        if np.abs(displacement).max() > self.collapse:
-            raise SimulationFailed("collapse")
+        if np.abs(displacement).max() > self.limit:
+            raise SimulationFailed(self.reason)
         return displacement[None]

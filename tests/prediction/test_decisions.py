@@ -362,7 +362,7 @@ def test_fragility_with_ratios_is_that_of_the_closed_form(record, rng):
 def test_failures_and_what_cannot_be_used(record, rng):
     samples = rng.normal(0.0, DISPERSION, size=(200, 1))
     records = [record.scale(MEDIAN * k) for k in (0.5, 1.0, 2.0)]
-    model = Flexible(record, collapse=0.15)
+    model = Flexible(record, limit=0.15)
     options = dict(ratios=RATIOS, seed=1, progress=False)
     counted = fragility(model, samples, records, peak("displacement"), 0.1, failures_exceed=True, **options)
     left_out = fragility(model, samples, records, peak("displacement"), 0.1, **options)
