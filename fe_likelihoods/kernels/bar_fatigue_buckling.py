@@ -23,7 +23,7 @@ unloaded point xr of the largest tensile strain xs, and L/d the ratio of unsuppo
     beyond     phi_b = (phi* s_b(z*) - 0.02 E0 (z-z*)) / s_b(z)
 
 but phi_b s_b >= 0.2 fy. In tension a buckled bar becomes straight again at the strain xs; until then the factor grows
-linearly from its value at the lowest strain.
+linearly from its value at the lowest strain. The rules for cycles have not been validated by tests of bars.
 
 ``docs/theory/reinforcing_steel.rst`` has the equations and compares them with OpenSees.
 

@@ -262,6 +262,23 @@ def test_differences_from_opensees_in_compression():
         assert 0.5 * limit < difference.max() < limit
 
 
+@pytest.mark.parametrize(
+    ("turns", "stated"),
+    [((0.04, -0.01), (0.014, 0.087, 0.256, 0.308)), ((0.02, -0.02), (0.015, 0.078, 0.246, 0.310))],
+)
+def test_differences_from_opensees_under_cycles(turns, stated):
+    """The figures of the documentation; without buckling there is no difference."""
+    require_opensees()
+    strain, steel = path(*turns * 4), tuple(value / 1e6 for value in STEEL[:4]) + STEEL[4:]
+    (straight,) = bar_stresses(steel, (), [strain])
+    np.testing.assert_allclose(lawful(strain), 1e6 * straight, rtol=0, atol=1e-9 * FY)
+    for slenderness, expected in zip((5.0, 8.0, 12.0, 16.0), stated, strict=True):
+        (theirs,) = bar_stresses(steel, ("-DMBuck", slenderness, 1.0), [strain])
+        difference = follow(strain, slenderness=slenderness)[0] - 1e6 * theirs
+        assert np.linalg.norm(difference) / np.linalg.norm(1e6 * theirs) == pytest.approx(expected, abs=2e-3)
+        assert np.square(difference[theirs >= 0.0]).sum() > 0.6 * np.square(difference).sum()
+
+
 # --- both ------------------------------------------------------------------------------------------------------------
 
 
