@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..units import find_unit
 from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight
 from .table_rows import read_rows
-from .text_files import agree_on_unit, decimals_of, parse_number
+from .text_files import agree_on_unit, decimals_of, is_number, parse_number
 
 __all__ = ["Table", "column_unit", "read_table", "stated_unit"]
 
@@ -45,7 +45,7 @@ class Table(NamedTuple):
     clocks : frozenset of int
         Columns of clock times. Their values are the seconds since the midnight before the first clock time.
     dates : frozenset of int
-        Columns of dates, which have no values.
+        Columns of dates or of text, such as a state of the logger, which have no values.
     clock : ClockTime or None
         The first clock time.
     """
@@ -102,7 +102,7 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
             values[:, column] = seconds_since_midnight(times, file)
             decimals.append(max(time.decimals for time in times if time is not None))
             clock = next(time for time in times if time is not None) if clock is None else clock
-        elif any(is_date(cell) for cell, _ in cells) and all(is_date(cell) or not cell for cell, _ in cells):
+        elif any(cell for cell, _ in cells) and all(not cell or is_date(cell) or _is_word(cell) for cell, _ in cells):
             dates.add(column)
             values[:, column] = np.nan
             decimals.append(0)
@@ -113,6 +113,11 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     units = rows.units or ("",) * width
     numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
     return Table(file, *numbers, frozenset(clocks), frozenset(dates), clock)
+
+
+def _is_word(cell: str) -> bool:
+    """Whether a cell is text that is no number: also inf is one."""
+    return cell[0] not in "+-.,0123456789" and not is_number(cell)
 
 
 def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:

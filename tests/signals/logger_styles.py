@@ -78,6 +78,7 @@ READ = {
     + _rows(lambda k: [_clock(k, '"%Y-%m-%d %H:%M:%S.%f')[:-4] + '"', f"{k}", f"{ACCELERATION[k]:.4f}"]),
     "LabVIEW": LABVIEW.format(columns="One") + _rows(lambda k: [f"{k * STEP:.6f}", f"{ACCELERATION[k]:.6f}", ""], "\t"),
     "LabVIEW without times": LABVIEW.format(columns="No") + _rows(lambda k: ["", f"{ACCELERATION[k]:.6f}", ""], "\t"),
+    "text beside": "State,time_s,acc_g,Flag\n" + _rows(lambda k: ["ok", _seconds(k), f"{ACCELERATION[k]:.4f}", "A"]),
     "missing channel beside": "time_s,acc_g,wind\n" + _rows(lambda k: [_seconds(k), f"{ACCELERATION[k]:.4f}", "NAN"]),
 }
 """Texts that are read as `ACCELERATION` with `STEP`."""
