@@ -5,7 +5,8 @@ Campbell Scientific TOA5
     Formats").
 LabVIEW measurement (.lvm)
     Tags and values up to ``***End_of_Header***``, the same for each segment, a line of names that begins with
-    ``X_Value``, and rows (National Instruments, "Specification for the LabVIEW Measurement File").
+    ``X_Value``, and rows. With X_Columns "No" the cells of this column are empty, with "Multi" each channel has its
+    own, and they must agree (National Instruments, "Specification for the LabVIEW Measurement File").
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]
     Raises
     ------
     ValueError
-        If a LabVIEW file has several segments, several columns of times, or another quantity than time on its axis.
+        If a LabVIEW file has several segments, or another quantity than time on its axis.
     """
     first = lines[0][1][0] if lines and lines[0][1] else ""
     if first == "TOA5" and len(lines) > 3:
@@ -68,17 +69,18 @@ def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
     columns, axis = (
         next(iter(tags.get(tag, ())), usual) for tag, usual in (("X_Columns", "One"), ("X_Dimension", "Time"))
     )
-    if not names or names[0][1].count("X_Value") != 1 or axis != "Time":
+    if not names or names[0][1][0] != "X_Value" or axis != "Time":
         raise ValueError(
-            f"{file}: expected a LabVIEW file with one column X_Value of times, got X_Columns {columns!r} and "
-            f"X_Dimension {axis!r}; write it with one column of times"
+            f"{file}: expected a LabVIEW file whose first column X_Value has times, got "
+            f"{names[0][1][:1] if names else []} and X_Dimension {axis!r}; write it with times"
         )
     number, header = names[0]
     width = len(header) - (header[-1] == "Comment")
-    units = tags.get("Y_Unit_Label", [])[: width - 1]
+    labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
+    units = ["s" if name == "X_Value" else labels[k] for k, name in enumerate(header[:width])]
     table = [
-        (number, ["time [s]", *header[1:width]]),
-        (number, _bracketed(["s", *units, *[""] * (width - 1 - len(units))])),
+        (number, ["time [s]" if name == "X_Value" else name for name in header[:width]]),
+        (number, _bracketed(units)),
         *((number, _without_comment(cells, width)) for number, cells in rows),
     ]
     if columns != "No":

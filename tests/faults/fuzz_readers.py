@@ -31,7 +31,7 @@ from fe_likelihoods.command.listing import describe_data
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from fe_likelihoods.units import G0
-from tests.signals.logger_styles import ACCELERATION, READ, STEP
+from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, STEP
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
 
@@ -187,7 +187,7 @@ def wrong_in_silence(number, seed, path):
         style = styles[index % len(styles)]
         text = altered(READ[style], choose)
         path.write_text(text, encoding="utf-8")
-        column = {"Campbell TOA5": "Top", "missing channel beside": "acc_g"}.get(style)
+        column = COLUMNS.get(style)
         try:
             record = read_csv(path, column=column)
         except ValueError:

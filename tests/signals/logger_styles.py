@@ -78,10 +78,18 @@ READ = {
     + _rows(lambda k: [_clock(k, '"%Y-%m-%d %H:%M:%S.%f')[:-4] + '"', f"{k}", f"{ACCELERATION[k]:.4f}"]),
     "LabVIEW": LABVIEW.format(columns="One") + _rows(lambda k: [f"{k * STEP:.6f}", f"{ACCELERATION[k]:.6f}", ""], "\t"),
     "LabVIEW without times": LABVIEW.format(columns="No") + _rows(lambda k: ["", f"{ACCELERATION[k]:.6f}", ""], "\t"),
+    "LabVIEW with times for each channel": LABVIEW.format(columns="Multi")
+    .replace("\tTop\t", "\tacc\tX_Value\tdeck\t")
+    .replace("_Label\tg", "_Label\tg\t\tg")
+    + _rows(lambda k: [f"{k * STEP:.6f}", f"{ACCELERATION[k]:.6f}", f"{k * STEP:.6f}", "0.1"], "\t"),
     "text beside": "State,time_s,acc_g,Flag\n" + _rows(lambda k: ["ok", _seconds(k), f"{ACCELERATION[k]:.4f}", "A"]),
     "missing channel beside": "time_s,acc_g,wind\n" + _rows(lambda k: [_seconds(k), f"{ACCELERATION[k]:.4f}", "NAN"]),
 }
 """Texts that are read as `ACCELERATION` with `STEP`."""
+
+COLUMNS = {"Campbell TOA5": "Top", "missing channel beside": "acc_g", "LabVIEW with times for each channel": "acc"}
+COLUMNS["LabVIEW, different times"] = "Top"
+"""Columns of the styles with several ones."""
 
 REFUSED = {
     "month or day first": (
@@ -114,10 +122,10 @@ REFUSED = {
         LABVIEW.format(columns="One") + "0.0\t1.0\n" + "Channels\t1\n***End_of_Header***\nX_Value\tTop\n0.02\t1.0\n",
         "LabVIEW file with one segment, found 2; write a file for each segment",
     ),
-    "LabVIEW, times for each channel": (
+    "LabVIEW, different times": (
         LABVIEW.format(columns="Multi").replace("X_Value\tTop", "X_Value\tTop\tX_Value\tDeck")
-        + _rows(lambda k: [f"{k * STEP:.6f}", "1.0", f"{k * STEP:.6f}", "2.0"], "\t"),
-        "one column X_Value of times, got X_Columns 'Multi'",
+        + _rows(lambda k: [f"{k * STEP:.6f}", "1.0", f"{k * STEP + 0.01:.6f}", "2.0"], "\t"),
+        "the columns 'time .s.' and 'time .s.' have different times; write one file for each",
     ),
 }
 """Texts that are refused, and what the message says."""

@@ -6,7 +6,7 @@ import pytest
 from fe_likelihoods import Channel, read_columns
 from fe_likelihoods.signals.readers import read_csv
 from fe_likelihoods.units import G0, to_si
-from tests.signals.logger_styles import ACCELERATION, READ, REFUSED, STEP
+from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, REFUSED, STEP
 
 TOP = Channel("top", "acceleration", "g")
 
@@ -15,7 +15,7 @@ TOP = Channel("top", "acceleration", "g")
 def test_styles_that_are_read(tmp_path, style):
     path = tmp_path / "a.txt"
     path.write_text(READ[style], encoding="utf-8")
-    column = {"Campbell TOA5": "Top", "missing channel beside": "acc_g"}.get(style)
+    column = COLUMNS.get(style)
     record = read_csv(path, column=column)
     assert record.dt == pytest.approx(STEP, rel=1e-12)
     np.testing.assert_allclose(record.acceleration / G0, ACCELERATION, atol=6e-6)
@@ -26,7 +26,7 @@ def test_styles_that_are_refused(tmp_path, style):
     text, message = REFUSED[style]
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(ValueError, match=message):
-        read_csv(tmp_path / "a.txt")
+        read_csv(tmp_path / "a.txt", column=COLUMNS.get(style))
 
 
 def test_zero_as_clock_time_of_unix_times(tmp_path):
