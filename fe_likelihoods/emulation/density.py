@@ -16,6 +16,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from .emulator import ResponseEmulator
 from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
@@ -32,10 +34,20 @@ _WIDENED = 1.1  # variances of a fitted component, as multiples of its points' v
 _CURVED = 0.15  # share of effective points in the pool below which kernels are used
 _KERNELS = 300
 _KERNEL_SHARE = 0.7
-_KERNEL_FREEDOM = 8.0
+_NEIGHBOURS = 20  # points from which the covariance of a kernel comes
+_THINNEST = 1e-5  # standard deviation of a kernel, as a share of the pool's
+_THIN = 0.3  # of the ratio that the local variances of a Gaussian have at least, smallest over largest
+_REFITS, _GAIN = 6, 1.2  # of the kernels, while the effective share grows by this factor
+_PLAUSIBLE = 8.0  # log-density below the top, besides 1 per dimension, of runs that the pool must reach
+_UNREACHED = 2.0  # log-weight of such a run above the largest in the pool
 _STEPS = 6  # independence Metropolis steps of a draw
 _RIDGE = 1e-9
 _SMALLEST_SLOPE = 1e-9
+_COMPARED = 1000  # points of the pool among which ends are found
+_ONE_SIDED = (
+    0.4  # distance to the mean of the nearest points, as a share of their distance, from which a point is an end
+)
+_STRIDE, _APART = 0.5, 0.75  # prior standard deviations beyond an end; as a share, away from all runs
 
 
 class Region(NamedTuple):
@@ -173,12 +185,16 @@ class EmulatedPosterior:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draws (n, ndim) of a mixture in scaled parameters, their coordinates and their log-weights (n,)."""
         scaled = draw_mixture(mixture, n, random)
+        return scaled, *self._log_weights_of(mixture, scaled)
+
+    def _log_weights_of(self, mixture: StudentMixture, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates (n, ndim) of scaled parameters, and log-weights (n,) over the density of a mixture."""
         coords, log_volume = self._target.unscaled(scaled)
-        log_weights = np.full(n, -np.inf)
+        log_weights = np.full(len(scaled), -np.inf)
         inside = np.flatnonzero(log_volume > -np.inf)
         log_weights[inside] = self.log_density(coords[inside]) + log_volume[inside]
         log_weights[inside] -= mixture_log_density(mixture, scaled[inside])
-        return scaled, coords, log_weights
+        return coords, log_weights
 
     def _in_scaled(self, region: Region) -> Region:
         """A region with its centre and covariance in scaled parameters."""
@@ -186,6 +202,11 @@ class EmulatedPosterior:
         low, at, high = self._target.scaled(np.stack([region.centre - sd, region.centre, region.centre + sd]))
         slopes = np.maximum((high - low) / (2.0 * sd), _SMALLEST_SLOPE)
         return region._replace(centre=at, covariance=region.covariance * np.outer(slopes, slopes))
+
+    @property
+    def curved(self) -> bool:
+        """Whether no ellipsoids cover the posterior, since it is thin in directions that change along it."""
+        return self._mixture is not self._ellipsoids and self._thinness < _THIN
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -199,6 +220,26 @@ class EmulatedPosterior:
             order = np.argsort(along)
             rows += list(order[np.searchsorted(np.cumsum(self._weights[order]), [0.01, 0.99])])
         return self._pool[rows]
+
+    def beyond(self, n: int, runs: np.ndarray) -> np.ndarray:
+        """At most n points (k, d) beyond the ends of a curved posterior, away from runs (m, d)."""
+        d = runs.shape[1]
+        levels = (np.arange(_COMPARED) + 0.5) / _COMPARED
+        points = np.unique(self._pool[np.searchsorted(np.cumsum(self._weights), levels)][:, :d], axis=0)
+        distances, near = cKDTree(points).query(points, min(len(points), _COMPARED // 4))
+        close = distances < 0.5 * _STRIDE
+        apart = (points[near] - points[:, None]) * close[:, :, None]
+        inwards = apart.sum(axis=1)  # at an end, all close points are on one side
+        size = np.sqrt(np.square(apart).sum(axis=(1, 2)) * close.sum(axis=1))
+        onesided = np.linalg.norm(inwards, axis=1) / np.maximum(size, 1e-300)
+        along = np.einsum("nki,nkj,nj->ni", apart, apart, inwards, optimize=True)  # hardly in thin directions
+        outside = points - along * (_STRIDE / np.maximum(np.linalg.norm(along, axis=1), 1e-300))[:, None]
+        open_ = (onesided > _ONE_SIDED) & (cdist(outside, runs).min(axis=1) > _APART * _STRIDE)
+        found: list[int] = []
+        for row in np.flatnonzero(open_)[np.argsort(-onesided[open_])]:
+            if len(found) < n and all(np.linalg.norm(outside[row] - outside[k]) > _STRIDE for k in found):
+                found.append(int(row))
+        return outside[found]
 
     def moments(self) -> list[Region]:
         """The regions with the mean, covariance and evidence that the pool gives them, where it suffices."""
@@ -247,25 +288,61 @@ class EmulatedPosterior:
                 if fitted is not None:
                     regions[k] = region._replace(centre=fitted[0], covariance=fitted[1])
             mixture = self._mixture_of(regions, shares)
+        self._ellipsoids = mixture
         self._fill(mixture, random)
-        if effective_sample_size(self._log_weights) < _CURVED * _POOL:
-            self._fill(self._kernels(regions, random), random)
+        runs = self._runs()
+        for _ in range(_REFITS):
+            missed, share = self._missed(runs), self.effective_share
+            if not len(missed) and share >= _CURVED:
+                break
+            self._fill(self._kernels(missed, random), random)
+            if not len(missed) and self.effective_share < _GAIN * share:
+                if self.effective_share < share:  # as with many parameters
+                    self._fill(mixture, random)
+                break
 
-    def _kernels(self, regions: Sequence[Region], random: np.random.RandomState) -> StudentMixture:
-        """The components, and narrower ones around weighted points: for a posterior that no ellipsoid covers."""
+    def _runs(self) -> np.ndarray:
+        """Coordinates (m, ndim) of the simulations, with the noise of the nearest region."""
+        structural = self._target.archive.coords
+        nearest, _ = self._nearest(structural)
+        noise = np.array([region.centre[structural.shape[1] :] for region in self._regions])
+        return np.column_stack([structural, noise[nearest]])
+
+    def _missed(self, runs: np.ndarray) -> np.ndarray:
+        """Scaled parameters (n, ndim) of the most probable simulations that the pool does not reach."""
+        density = self.log_density(runs)
+        runs = runs[np.argsort(-density)[: np.sum(density > self.top - _PLAUSIBLE - self._target.ndim)]]
+        scaled = self._target.scaled(runs)
+        apart = self._log_weights_of(self._mixture, scaled)[1] - self._log_weights.max()
+        return scaled[apart > _UNREACHED][:_KERNELS]
+
+    def _kernels(self, missed: np.ndarray, random: np.random.RandomState) -> StudentMixture:
+        """The mixture with narrow components around weighted points and missed runs (n, ndim), in scaled parameters.
+
+        It covers a posterior that no ellipsoid covers. The covariance of a component comes from its nearest points.
+        """
         ndim = self._target.ndim
         rows = random.choice(len(self._pool), _KERNELS, p=self._weights)
-        width = (4.0 / (ndim + 2.0)) ** (1.0 / (ndim + 4.0)) * _KERNELS ** (-1.0 / (ndim + 4.0))
-        nearest, _ = self._nearest(self._pool[rows])
-        narrow = [width * factor_of(region.covariance) for region in regions]
-        weights = np.concatenate(
-            [(1.0 - _KERNEL_SHARE) * self._mixture.weights, np.full(_KERNELS, _KERNEL_SHARE / _KERNELS)]
+        centres = np.concatenate([self._target.scaled(self._pool[np.unique(rows)]), missed])
+        count = np.concatenate(
+            [np.unique(rows, return_counts=True)[1], np.full(len(missed), _KERNELS / max(len(missed), 1))]
         )
+        # in whitened coordinates
+        factor = factor_of(np.cov(centres, rowvar=False).reshape(ndim, ndim))
+        white = np.linalg.solve(factor, (centres - centres.mean(axis=0)).T).T
+        near = cKDTree(white).query(white, min(len(white), max(_NEIGHBOURS, 3 * ndim)))[1]
+        apart = white[near] - white[:, None]
+        local = np.einsum("nki,nkj->nij", apart, apart) / near.shape[1] + _THINNEST**2 * np.eye(ndim)
+        values, noise = np.linalg.eigvalsh(local), np.sqrt(ndim / near.shape[1])
+        self._thinness = float(np.median(values[:, 0] / values[:, -1])) / ((1.0 - noise) / (1.0 + noise)) ** 2
+        factors = factor @ np.linalg.cholesky(local)
+        base = self._ellipsoids
+        weights = np.concatenate([(1.0 - _KERNEL_SHARE) * base.weights, _KERNEL_SHARE * count / count.sum()])
         return StudentMixture(
             weights,
-            np.concatenate([self._mixture.centres, self._target.scaled(self._pool[rows])]),
-            np.concatenate([self._mixture.factors, [narrow[k] for k in nearest]]),
-            _KERNEL_FREEDOM,
+            np.concatenate([base.centres, centres]),
+            np.concatenate([base.factors, factors]),
+            _FREEDOM,
         )
 
     def _fill(self, mixture: StudentMixture, random: np.random.RandomState) -> None:

@@ -22,7 +22,17 @@ from scipy.linalg import eigh
 from .density import EmulatedPosterior, KnownDensity, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
-from .modes import UNSEEN, Mode, ModeSearch, check_starts, draw_starts, search_from, search_modes, unseen_share
+from .modes import (
+    UNSEEN,
+    Mode,
+    ModeSearch,
+    approach,
+    check_starts,
+    draw_starts,
+    search_from,
+    search_modes,
+    unseen_share,
+)
 from .stacked import is_joint
 from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import ResponseTarget
@@ -65,11 +75,12 @@ _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
 )
-_LATE = 0.1  # growth of the emulated log-evidence after draws were made that is a reason for concern
-_GREW = (
-    "the emulated posterior grew after draws were made, so these did not reach all of the posterior, and the evidence "
-    "may be too small"
+_MOST_CURVES, _ENDS = 24, 2  # steps along a curved posterior, and its ends from which each step is made
+_OPEN_ENDS = (
+    "the posterior is curved, and it was not followed to all of its ends: fix one of the parameters that the data do "
+    "not tell apart, or use the combination of them that the data determine as the parameter"
 )
+_LATE = 0.1  # growth of the emulated log-evidence after draws were made, from which ridges are followed again
 _FEW_ENDED = 0.5  # share of the starts below which their ends say little
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
@@ -120,6 +131,8 @@ class ResponseGuide:
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
         self._wide: StudentMixture | None = None
+        self._beyond = np.empty((0, self._target.n_structural))  # points beyond the ends of a curved posterior
+        self._curves = 0  # times that such points were tried
         self._extensions = 0  # of the emulator along directions that the data leave to the prior
 
     def check(self, log_prob_fn: Callable) -> None:
@@ -257,8 +270,9 @@ class ResponseGuide:
             return
         # the evidence of an emulator of a rough response changes by about its error from fit to fit
         if self._emulated.log_evidence > earlier.log_evidence + _LATE + self._left_out_error():
-            self._add_concern(_GREW)
             yield from self._follow_ridges(session)
+        else:
+            yield from self._follow_curves(session)
 
     # ------------------------------------------------------------------ parts
 
@@ -324,6 +338,7 @@ class ResponseGuide:
             self._extensions += 1
             yield
             self._emulate(session.random)
+        yield from self._follow_curves(session)
         self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
         reached = self._free_directions()[1]
         if np.any(reached < _REACHED):
@@ -334,6 +349,31 @@ class ResponseGuide:
                 f"only {ended} of {len(self.search.ends)} starts led to a mode, the others were given up far below it, "
                 "and the data leave a direction to the prior, or the posterior is curved: parts of it may be missing"
             )
+
+    def _follow_curves(self, session: Any) -> Iterator[None]:
+        """Simulate beyond the ends of a curved posterior until it ends there."""
+        while self._emulated is not None and self._emulated.curved:
+            points = self._emulated.beyond(_ENDS, np.concatenate([self._plausible(), self._beyond]))
+            if not len(points):
+                break
+            if self._curves == _MOST_CURVES:
+                self._add_concern(_OPEN_ENDS)
+                break
+            self._curves += 1
+            self._beyond = np.concatenate([self._beyond, points])
+            finished = yield from self._counted(approach(self._target, points, session.remember, session.fits))
+            self._emulate(session.random)
+            if not finished:
+                self._add_concern(_OPEN_ENDS)
+                break
+
+    def _plausible(self) -> np.ndarray:
+        """Structural coordinates (n, d) of the runs that are not far less probable than the mode, by their noise."""
+        archive, d = self._target.archive, self._target.n_structural
+        best = max(self._modes, key=lambda mode: mode.log_density)
+        noise = np.repeat(best.coords[None, d:], len(archive), axis=0)
+        density = self._target.log_likelihood(archive.statistics, noise) + self._target.log_prior(archive.coords)
+        return archive.coords[density > density.max() - _IMPLAUSIBLE - d]
 
     def _free_directions(self) -> tuple[np.ndarray, np.ndarray]:
         """Combinations (n, ndim) of parameters that the data leave to the prior, and how far the draws reach along.

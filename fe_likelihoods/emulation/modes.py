@@ -18,6 +18,7 @@ __all__ = [
     "UNSEEN",
     "Mode",
     "ModeSearch",
+    "approach",
     "check_starts",
     "draw_starts",
     "find_modes",
@@ -381,3 +382,17 @@ def search_from(
     for points in batches.complete({0: ascent}, lambda *_: None):
         yield float(points)
     return laplace(target, known[0]) if known and not batches.interrupted else None
+
+
+def approach(
+    target: ResponseTarget, points: np.ndarray, remember: Remember, fits: Callable[[float], bool]
+) -> Generator[float, None, bool]:
+    """Simulate from points (n, n_structural) towards the nearest points that fit the data.
+
+    The prior is centred at the points, so that no step climbs along a ridge. Returns False if the budget ended it.
+    """
+    jacobians, batches = Jacobians(), Batches(target, remember, fits)
+    ascents = {k: ascend(target, jacobians, k, point, point, {}, designed=False) for k, point in enumerate(points)}
+    for new in batches.complete(ascents, lambda *_: None):
+        yield float(new)
+    return not batches.interrupted

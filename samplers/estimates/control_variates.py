@@ -31,9 +31,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .genealogy import student_factor
-from .importance import Round
+from .importance import KnownDensity, Round
 
-__all__ = ["Expectation", "SignedSample", "signed_sample"]
+__all__ = ["Expectation", "SignedSample", "signed_sample", "unreached_share"]
 
 # A round counts with the inverse of the mean square of its differences, plus this share of the mean over all rounds:
 # few draws may have small differences by chance.
@@ -45,6 +45,10 @@ SMALLEST_STEP = 0.1
 FEW = 10.0
 # Smallest number of degrees of freedom of an error.
 FEWEST_CONTRIBUTIONS = 2.0
+# A density hardly reaches a point where another one is more than this many times larger.
+HARDLY = 10.0
+# Points of a known density on which another one is evaluated.
+COMPARED = 2000
 
 
 class Expectation(NamedTuple):
@@ -167,6 +171,18 @@ def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
         numbers.append(np.zeros(len(density.weights), dtype=int))
     log_evidence, error = _evidence(found, shares)
     return SignedSample(np.concatenate(coords), np.concatenate(weights), np.concatenate(numbers), log_evidence, error)
+
+
+def unreached_share(earlier: KnownDensity, latest: KnownDensity) -> float:
+    """Probability under `latest` of the points that `earlier` hardly reaches.
+
+    A guide may learn late that the posterior is larger. Few draws of the earlier density then have all but equal
+    weights, and say nothing of the part that is missing.
+    """
+    every = max(1, len(latest.weights) // COMPARED)
+    coords, weights = latest.coords[::every], latest.weights[::every]
+    hardly = earlier.log_density(coords) < latest.log_density(coords) - np.log(HARDLY)
+    return float(weights[hardly].sum() / weights.sum())
 
 
 def _meets_known(r: Round) -> bool:

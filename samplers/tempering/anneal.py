@@ -288,6 +288,8 @@ def _from_guide(
     if found.signed is not None:
         yield population, found.signed
     if found.stopped:
+        if found.shortfall:
+            yield population, Concern(found.shortfall, True)
         raise stopped_rounds(found)
     pooled = found.pooled
     start = GuidedStart(found.reason, "" if found.reason else found.shortfall, pooled.pareto_shape)

@@ -3,6 +3,7 @@
 The density of a round is fixed before its draws are made, and each draw is weighted by this density
 (`samplers.estimates.importance`). The rounds end with a *reliable* round: fresh draws with a good effective share and
 Pareto shape. All rounds together must then have an effective sample size as large as the number of walkers.
+Rounds whose draws hardly reached a part of the posterior that the guide knows by then are left out.
 
 Draws that are submitted together are a `Batch`; they may arrive in any order. A batch becomes a round when all its
 draws have arrived. Until then, its draws influence no weight, no share of a round and no decision: the first arrivals
@@ -14,13 +15,14 @@ density can find it; other guides depend on their search (`concerns`). Constants
 trials on posteriors with known answers.
 """
 
+import logging
 from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..budget import Budget
-from ..estimates.control_variates import SignedSample, signed_sample
+from ..estimates.control_variates import SignedSample, signed_sample, unreached_share
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
     LARGEST_SHAPE,
@@ -51,6 +53,8 @@ __all__ = [
     "reliable",
 ]
 
+logger = logging.getLogger(__name__)
+
 # Draws in each later round, as a share of the number of walkers. After a reliable round, a round has as many draws as
 # are expected to suffice.
 ROUND_SHARE = 0.6
@@ -62,11 +66,17 @@ RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # Largest number of rounds.
 MOST_ROUNDS = 20
+# Rounds are left out if more than this share of the guide's latest known density was hardly reached by theirs.
+LARGEST_UNREACHED = 0.03
 # The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
 # size below 1.5: a round of few draws has an effective share of at least one over their number.
 HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
 # The check of a run's first values needs some values that arrive together.
 FIRST_TOGETHER = 8
+UNREACHED = (
+    "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
+    "and standard deviations may be too small. Use a larger limit of simulations"
+)
 LIGHT_TAILS = (
     "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
     "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
@@ -112,7 +122,8 @@ class RoundsOfGuide(NamedTuple):
     reason : str
         Why the draws cannot be used; empty if they can.
     shortfall : str
-        What was not reached although the draws can be used, or that their tails are too light; else empty.
+        What was not reached although the draws can be used, or that their tails are too light, or that they hardly
+        reached a part of the posterior when the limit of simulations ended the rounds; else empty.
     pooled : PooledRounds, or None
         All draws; None if the limit of simulations did not allow any.
     last : Round, or None
@@ -280,7 +291,8 @@ def draw_rounds(
     """
     guide, session, budget = guidance
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
-    rounds: list[Round] = []
+    made, last = 0, None
+    rounds: list[Round] = []  # those whose draws reach all of the posterior that the guide knows
     batches: list[Batch] = []  # of which draws are running
     lessons: list[Batch] = []  # of which the guide has not learned from all draws
     refused, pooled = False, None
@@ -290,20 +302,23 @@ def draw_rounds(
 
     def judge(most: int) -> Generator[tuple[Population, Report], None, RoundsOfGuide | None]:
         """Let draws arrive; returns how the rounds end, or None if another round follows."""
-        nonlocal population, pooled
+        nonlocal population, pooled, made, last
         while True:
             let_arrive(batches, most, density, guide, session)
             outcome = None
             while batches and batches[0].pending.complete:
-                rounds.append(batches.pop(0).as_round())
+                last = batches.pop(0).as_round()
+                rounds.append(last)
+                made += 1
                 pooled = pool_rounds(rounds, guide.log_density_error)
                 population = population._replace(effective_sample_size=pooled.effective_sample_size)
-                yield population, _report(rounds[-1], pooled)
-                yield tick(f"round {len(rounds)}", True)
-                outcome = _outcome(rounds, pooled, size)
+                yield population, _report(last, pooled)
+                yield tick(f"round {made}", True)
+                outcome = _outcome(rounds, pooled, size, made)
             if refused or budget.refused:  # a search that was cut short goes on first, if the limit is raised
-                outcome = RoundsOfGuide("", "", pooled, rounds[-1] if rounds else None, True)
-            if not batches or (outcome is None and _too_few(rounds, batches, size, guide)):
+                shortfall = "" if rounds or pooled is None else UNREACHED
+                outcome = RoundsOfGuide("", shortfall, pooled, last, True)
+            if not batches or (outcome is None and _too_few(rounds, batches, size, guide, made)):
                 return outcome and outcome._replace(signed=signed_sample(rounds))
             most = 0  # submitted draws are part of the result
 
@@ -311,7 +326,7 @@ def draw_rounds(
     for _ in guide.prepare(session):
         yield tick("search", True)
     while True:
-        yield tick(f"round {len(rounds) + len(batches) + 1}", False)
+        yield tick(f"round {made + len(batches) + 1}", False)
         coords = guide.draw(_next_size(rounds, batches, size, guide), random)
         batch = submit_batch(coords, density, guide, session)
         refused = batch.pending.refused
@@ -319,15 +334,29 @@ def draw_rounds(
             batches.append(batch)
             lessons.append(batch)
         outcome = yield from judge(0 if refused or budget.refused else most_running(density, len(coords)))
-        if outcome is not None:
+        # with the last round as well, a guide with a known density may learn that the posterior is larger
+        final = outcome is not None and (outcome.stopped or outcome.reason or guide.known_density is None)
+        if final or (outcome is not None and made == MOST_ROUNDS):
             return outcome
         parts = [each.take_lesson(guide.learns_from_parts) for each in lessons]
         lessons = [each for each in lessons if not each.learned]
         points, log_prob = (np.concatenate(column) for column in zip(*parts, strict=True))
         for _ in guide.refine(points, log_prob, session) if len(points) > 0 else ():
-            yield tick(f"after round {len(rounds)}", True)
+            yield tick(f"after round {made}", True)
+        reaching = [each for each in rounds if _reaches(each, guide.known_density)]
+        if len(reaching) < len(rounds):
+            logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)
+            rounds, outcome = reaching, None
+        if outcome is not None:
+            return outcome
         if budget.refused:
             return (yield from judge(0))
+
+
+def _reaches(earlier: Round, latest: KnownDensity | None) -> bool:
+    """Whether the draws of a round reach all of the guide's latest known density."""
+    known = earlier.known
+    return known is None or latest is None or unreached_share(known, latest) <= LARGEST_UNREACHED
 
 
 def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
@@ -342,27 +371,27 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
     )
 
 
-def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int) -> RoundsOfGuide | None:
-    """How the rounds end; None if they continue."""
+def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int, made: int) -> RoundsOfGuide | None:
+    """How the rounds end; None if they continue. `made` rounds include those that were left out."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
     if enough and reliable(last) and _even(pooled):
         light = tails_are_light([r for r in rounds if reliable(r)])
         return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
     if reason := _impossible(rounds) or _hopeless(rounds):
         return RoundsOfGuide(reason, "", pooled, last)
-    if len(rounds) < MOST_ROUNDS:
+    if made < MOST_ROUNDS:
         return None
     shortfall = _describe(last, pooled)
     usable = last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
     return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
 
 
-def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> bool:
+def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide, made: int) -> bool:
     """Whether more draws are made while some are running, since the running draws will not be enough.
 
     A guide that learns only from complete rounds would draw from the same density again.
     """
-    if len(rounds) + len(batches) >= MOST_ROUNDS:
+    if made + len(batches) >= MOST_ROUNDS:
         return False
     if rounds and reliable(rounds[-1]):
         return _missing(rounds, batches, size, guide) > 0.0

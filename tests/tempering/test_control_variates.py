@@ -5,9 +5,10 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler
-from samplers.estimates.control_variates import signed_sample
+from samplers.estimates.control_variates import signed_sample, unreached_share
 from samplers.estimates.importance import KnownDensity, Round, pool_rounds
-from tests.contract.targets import Gaussian
+from samplers.tempering import guided
+from tests.contract.targets import Box, Gaussian
 from tests.tempering.guides import FixedGuide
 
 NDIM, POOL, LOG_EVIDENCE = 3, 2000, 4.0
@@ -136,3 +137,54 @@ def test_a_sampler_uses_what_its_guide_knows():
     assert np.all(found.error < 0.5 * knowing.mean_error())
     assert knowing.log_evidence_error < 0.7 * plain.log_evidence_error
     assert abs(knowing.log_evidence - posterior.log_evidence) < 4.0 * knowing.log_evidence_error
+
+
+def two_modes(shares, n=POOL):
+    """Normal densities of standard deviation .1 about 1 and -1, with points of equal weight."""
+    parts = [stats.multivariate_normal(np.full(2, centre), 0.01) for centre in (1.0, -1.0)]
+    points = [
+        p.rvs(int(share * n), random_state=np.random.RandomState(3)) for p, share in zip(parts, shares, strict=True)
+    ]
+
+    def log_density(coords):
+        with np.errstate(divide="ignore"):
+            return np.logaddexp.reduce([np.log(w) + p.logpdf(coords) for w, p in zip(shares, parts, strict=True)])
+
+    points = np.concatenate(points)
+    return KnownDensity(log_density, points, np.full(len(points), 1.0 / len(points)), 0.0)
+
+
+@pytest.mark.parametrize(
+    "earlier, latest, share", [(1.0, 0.5, 0.5), (0.02, 0.3, 0.3), (0.5, 1.0, 0.0), (0.5, 0.5, 0.0)]
+)
+def test_the_share_that_an_earlier_density_hardly_reaches(earlier, latest, share):
+    found = unreached_share(two_modes([earlier, 1.0 - earlier]), two_modes([latest, 1.0 - latest]))
+    assert found == pytest.approx(share, abs=0.01)
+
+
+class GrowingGuide(FixedGuide):
+    """Knows one of two modes, and the other one after the first round."""
+
+    def __init__(self, posterior):
+        super().__init__(posterior, [[1.0, 1.0]], [0.012 * np.eye(2)])
+        self.known_density = two_modes([1.0, 0.0])
+
+    def refine(self, coords, log_prob, session):
+        both = np.array([[1.0, 1.0], [-1.0, -1.0]])
+        super().__init__(self.posterior, both, [0.012 * np.eye(2)] * 2)
+        self.known_density = two_modes([0.5, 0.5])
+
+
+@pytest.mark.parametrize("left_out", [True, False])
+def test_rounds_that_missed_a_part_of_the_posterior_are_left_out(left_out, monkeypatch):
+    if not left_out:  # control: such a round makes the evidence too small, in silence
+        monkeypatch.setattr(guided, "LARGEST_UNREACHED", 1.0)
+    exact = two_modes([0.5, 0.5])
+    box = Box([-4.0, -4.0], [4.0, 4.0], lambda x: exact.log_density(np.atleast_2d(x)).reshape(np.shape(x)[:-1]))
+    sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=GrowingGuide(box))
+    sampler.run_mcmc(None, 1)
+    error = sampler.log_evidence + np.log(64.0)
+    if left_out:
+        assert abs(error) < 4.0 * sampler.log_evidence_error < 0.2
+    else:
+        assert error < -4.0 * sampler.log_evidence_error

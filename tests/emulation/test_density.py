@@ -1,0 +1,86 @@
+"""The emulated posterior in memory: thin and curved ones, whose runs lie along an arc."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from fe_likelihoods.emulation import density
+from fe_likelihoods.emulation.density import EmulatedPosterior, Region
+
+RADIUS, THICKNESS, REACH = 1.0, 0.01, 100.0
+
+
+class Target:
+    """Two parameters with standard normal priors, which are their own scaled parameters; runs along an arc [rad]."""
+
+    ndim = n_structural = 2
+
+    def __init__(self, arc, runs=40):
+        angles = np.linspace(-arc, arc, runs)
+        self.archive = SimpleNamespace(coords=RADIUS * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+    def log_prior(self, coords):
+        return -0.5 * np.square(coords).sum(axis=1) - np.log(2.0 * np.pi)
+
+    def scaled(self, coords):
+        return coords
+
+    def unscaled(self, scaled):
+        return scaled, np.zeros(len(scaled))
+
+
+def emulated(arc, runs):
+    """A likelihood that depends on the radius alone, on an arc about the mode at an angle of zero."""
+
+    def log_likelihood(coords):
+        radius, angle = np.hypot(*coords.T), np.arctan2(coords[:, 1], coords[:, 0])
+        return np.where(np.abs(angle) < arc, -0.5 * np.square((radius - RADIUS) / THICKNESS), -np.inf)
+
+    emulator = SimpleNamespace(
+        log_likelihood=log_likelihood, reach=REACH, squared_distance=lambda coords: np.square(coords).sum(axis=1)
+    )
+    region = Region(np.array([RADIUS, 0.0]), np.diag([THICKNESS**2, 1.0]), emulator, 0.0)
+    return EmulatedPosterior(Target(runs), [region], np.random.RandomState(1))
+
+
+def log_evidence(arc):
+    """By quadrature over the radius."""
+    value, _ = quad(lambda r: r * np.exp(-0.5 * r * r - 0.5 * ((r - RADIUS) / THICKNESS) ** 2), 0.9, 1.1, points=[1.0])
+    return np.log(value * arc / np.pi)
+
+
+@pytest.mark.parametrize("arc", [0.3, 1.5, 3.0])
+def test_a_thin_arc_is_covered_where_runs_were_made(arc):
+    found = emulated(arc, arc)
+    assert abs(found.log_evidence - log_evidence(arc)) < 4.0 * found.log_evidence_error < 0.15
+    assert found.curved == (arc > 1.0)
+
+
+def test_control_without_refits_a_thin_arc_is_not_covered(monkeypatch):
+    monkeypatch.setattr(density, "_REFITS", 0)
+    found = emulated(3.0, 3.0)
+    assert found.log_evidence < log_evidence(3.0) - 0.15 or found.log_evidence_error > 0.15
+
+
+def test_steps_go_beyond_the_ends_of_an_arc_until_it_ends_there():
+    found, runs = emulated(1.0, 1.0), Target(1.0).archive.coords
+    outside = found.beyond(2, runs)
+    angles = np.sort(np.arctan2(outside[:, 1], outside[:, 0]))
+    assert np.all(np.abs(np.abs(angles) - 1.5) < 0.25) and angles[0] < 0.0 < angles[1]
+    assert not len(found.beyond(2, np.concatenate([runs, outside])))
+
+
+def test_a_gaussian_has_no_ends():
+    target = Target(0.0, runs=1)
+    emulator = SimpleNamespace(
+        log_likelihood=lambda coords: -0.5 * (np.square(coords) / [0.01, 1e-4]).sum(axis=1),
+        reach=REACH,
+        squared_distance=lambda coords: np.square(coords).sum(axis=1),
+    )
+    found = EmulatedPosterior(
+        target, [Region(np.zeros(2), np.diag([0.01, 1e-4]), emulator, 0.0)], np.random.RandomState(2)
+    )
+    assert not found.curved
+    assert found.log_evidence == pytest.approx(-0.5 * np.log(101.0 * 10001.0), abs=0.03)
