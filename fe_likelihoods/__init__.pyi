@@ -48,6 +48,7 @@ from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Unifor
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
+from .reporting.advice import check_result
 from .reporting.fit_gate import check_fit
 from .reporting.report import report
 from .signals.alignment import align
@@ -114,6 +115,7 @@ __all__ = [
     "arias_intensity",
     "average_predictions",
     "check_fit",
+    "check_result",
     "compare_tests",
     "damage",
     "damage_measures",

@@ -11,6 +11,7 @@ import numpy as np
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..prediction.prediction import Prediction
+from ..reporting.advice import Judgement
 from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
 from ..signals.channels import Measurements
@@ -21,13 +22,14 @@ from .models import NotRun
 __all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
 
 
-def write_tables(folder: Path, run: FinishedRun) -> tuple[str, ...]:
-    """Write the moments of the parameters, the stages and the errors of the fit.
+def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[str, ...]:
+    """Write the judgement, the moments of the parameters, the stages and the errors of the fit.
 
     Parameters
     ----------
     folder : Path
     run : FinishedRun
+    judgement : Judgement
 
     Returns
     -------
@@ -45,6 +47,8 @@ def write_tables(folder: Path, run: FinishedRun) -> tuple[str, ...]:
     fit = _fit_rows(posterior, run.samples)
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
+        str(judgement),
+        "",
         str(moments),
         "",
         *_of_the_sampler(run),
@@ -136,12 +140,18 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def write_samples(folder: Path, run: FinishedRun, prediction: Prediction | None, draws: int) -> str:
-    """Write the samples in netCDF, with the responses of `draws` of them; return the name of the file."""
+def write_samples(
+    folder: Path, run: FinishedRun, prediction: Prediction | None, draws: int, judgement: Judgement
+) -> str:
+    """Write the samples in netCDF, with the responses of `draws` of them and the judgement as an attribute.
+
+    Returns the name of the file.
+    """
     from samplers import to_arviz
 
     options = {"draws": draws} if draws else {}
     data = to_arviz(run.sampler, run.posterior if draws else None, prediction, discard=run.discard, **options)
+    data.posterior.attrs["judgement"] = str(judgement)
     data.to_netcdf(str(folder / "posterior.nc"))
     return "posterior.nc"
 

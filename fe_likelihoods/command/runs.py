@@ -19,11 +19,12 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
-from ..reporting.fit_gate import fit_gate
+from ..reporting.advice import advise
+from ..reporting.failures import failures
 from ..reporting.fits import fit_data_sets
 from ..reporting.run import FinishedRun, read_run
 from ..reporting.table import parameter_rows
-from ..signals.fit_gate import REMARK, WRONG
+from ..signals.fit_gate import REMARK
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -60,9 +61,9 @@ class Outcome(NamedTuple):
     files : tuple of str
         Names of the result files.
     cautions : tuple of str
-        Doubts about the fit and the predictions.
+        Doubts about the result and the predictions.
     usable : bool
-        Whether the samples can be used at all: neither the sampler nor the fit speaks against it.
+        Whether the result can be used, if with care.
     """
 
     folder: Path
@@ -231,23 +232,22 @@ def _write(
     Predictions are made here; their responses are in the cache if they were made before.
     """
     run = read_run(sampler, problem.posterior, truth=problem.truth, discard=discarded(job))
-    findings = fit_gate(fit_data_sets(run).compared, () if run.is_inconclusive else parameter_rows(run))
+    judgement = advise(run, parameter_rows(run), fit_data_sets(run), failures(run))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
-    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS))
+    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS), judgement)
     predicted = predict_events(job, events, problem, drawn, progress)
     described = describe_events(events, predicted)
     pictures = write_events(folder, events, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
     page, truth = folder / "report.html", problem.truth
     report = write_report(page, run, prediction, _command(file, folder), truth, predicted, measured)
-    tables = write_tables(folder, run)  # last: they say how many simulations there are
-    cautions = [str(finding) for finding in findings if finding.weight != REMARK]
+    tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
+    cautions = [str(finding) for finding in judgement.findings if finding.weight != REMARK]
     cautions += [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for each in described:
         cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
-    usable = not run.is_inconclusive and all(finding.weight != WRONG for finding in findings)
-    return (report, *tables, samples, *pictures), tuple(cautions), usable
+    return (report, *tables, samples, *pictures), tuple(cautions), judgement.status != "do not use"
 
 
 def _chain_only(folder: Path, problem: Problem) -> Any:

@@ -47,7 +47,7 @@ _COMPARED = 1000  # points of the pool among which ends are found
 _ONE_SIDED = (
     0.4  # distance to the mean of the nearest points, as a share of their distance, from which a point is an end
 )
-_STRIDE, _APART = 0.5, 0.75  # prior standard deviations beyond an end; as a share, away from all runs
+_STRIDE, _APART = 0.5, 0.5  # prior standard deviations beyond an end; as a share, away from all runs
 
 
 class Region(NamedTuple):
@@ -226,14 +226,11 @@ class EmulatedPosterior:
         d = runs.shape[1]
         levels = (np.arange(_COMPARED) + 0.5) / _COMPARED
         points = np.unique(self._pool[np.searchsorted(np.cumsum(self._weights), levels)][:, :d], axis=0)
-        distances, near = cKDTree(points).query(points, min(len(points), _COMPARED // 4))
-        close = distances < 0.5 * _STRIDE
-        apart = (points[near] - points[:, None]) * close[:, :, None]
-        inwards = apart.sum(axis=1)  # at an end, all close points are on one side
-        size = np.sqrt(np.square(apart).sum(axis=(1, 2)) * close.sum(axis=1))
-        onesided = np.linalg.norm(inwards, axis=1) / np.maximum(size, 1e-300)
-        along = np.einsum("nki,nkj,nj->ni", apart, apart, inwards, optimize=True)  # hardly in thin directions
-        outside = points - along * (_STRIDE / np.maximum(np.linalg.norm(along, axis=1), 1e-300))[:, None]
+        distances, near = cKDTree(points).query(points, min(len(points), 2 * _NEIGHBOURS))
+        inwards = points[near].mean(axis=1) - points  # at an end, all near points are on one side
+        length = np.maximum(np.linalg.norm(inwards, axis=1), 1e-300)
+        onesided = length / np.maximum(np.sqrt(np.square(distances).mean(axis=1)), 1e-300)
+        outside = points - inwards * (_STRIDE / length)[:, None]
         open_ = (onesided > _ONE_SIDED) & (cdist(outside, runs).min(axis=1) > _APART * _STRIDE)
         found: list[int] = []
         for row in np.flatnonzero(open_)[np.argsort(-onesided[open_])]:

@@ -1,26 +1,91 @@
-"""What a reader has to know before trusting a result: each doubt in plain words, with what to do about it."""
+"""What a reader has to know before trusting a result: one judgement, and each doubt with what to do about it."""
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
-from .failures import Failures
+from .failures import Failures, failures
 from .fit_gate import fit_gate
-from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits
-from .run import LONGEST_AUTOCORRELATION, FinishedRun
-from .table import ParameterRow
+from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
+from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
+from .table import ParameterRow, parameter_rows
 
-__all__ = ["advise", "residual_sentence"]
+__all__ = ["Judgement", "advise", "check_result", "judge", "residual_sentence"]
 
 FEW_SAMPLES = 100.0  # effective, below which the ends of a 90 % interval rest on fewer than five samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
 LARGE_FAILURE_SHARE = 0.05
 WEIGHTS = WRONG, CARE, REMARK
 STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
+STATUS = {WRONG: "do not use", CARE: "use with care", REMARK: "use"}
 
 
-def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> list[Finding]:
-    """All that a reader has to know, the most severe first.
+class Judgement(NamedTuple):
+    """Whether a result can be used, from all that was found about sampling, fit, residuals, failures, priors and data.
+
+    ``str`` gives it in one sentence.
+
+    Attributes
+    ----------
+    status : {"use", "use with care", "do not use"}
+    findings : tuple of Finding
+        The reasons, the most severe first, and remarks.
+    """
+
+    status: str
+    findings: tuple[Finding, ...]
+
+    def __str__(self) -> str:
+        reasons = [each.name for each in self.findings if STATUS[each.weight] == self.status != "use"]
+        text = f"{self.status[0].upper()}{self.status[1:]}"
+        return f"{text}: {'; '.join(f'{name[0].lower()}{name[1:]}' for name in reasons)}." if reasons else f"{text}."
+
+
+def judge(findings: list[Finding]) -> Judgement:
+    """The judgement that follows from findings: the most severe one decides."""
+    ordered = tuple(sorted(findings, key=lambda each: WEIGHTS.index(each.weight)))
+    return Judgement(STATUS[ordered[0].weight] if ordered else "use", ordered)
+
+
+def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Judgement:
+    """Judge the result of a run: sampling, fit, residuals, failures, priors and data.
+
+    The report and ``fe-likelihoods run`` give the same judgement.
+
+    Parameters
+    ----------
+    sampler : SMCSampler, TMCMCSampler or emcee.EnsembleSampler
+        A sampler that has run.
+    posterior : Posterior, optional
+        Default: what was sampled.
+    discard : int
+        Iterations to leave out at the beginning of a Markov chain.
+
+    Returns
+    -------
+    Judgement
+        The mean, and draws of the prior, are simulated where they are not cached (`check_fit`).
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no chain.
+
+    Examples
+    --------
+    >>> judgement = check_result(sampler)
+    >>> print(judgement)
+    >>> for finding in judgement.findings:
+    ...     print(finding)
+    """
+    run = read_run(sampler, posterior, discard=discard)
+    return advise(run, parameter_rows(run), fit_data_sets(run), failures(run))
+
+
+def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> Judgement:
+    """The judgement of a run, with all that a reader has to know.
 
     A run that says nothing about the parameters gets no notes that compare its samples with prior, truth or noise.
 
@@ -45,7 +110,7 @@ def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failu
     ]
     if not run.is_inconclusive:
         found += _of_the_noise(fits)
-    return sorted(found, key=lambda each: WEIGHTS.index(each.weight))
+    return judge(found)
 
 
 def _of_the_verdict(run: FinishedRun) -> list[Finding]:
@@ -57,7 +122,7 @@ def _of_the_verdict(run: FinishedRun) -> list[Finding]:
     if run.verdict.status == "converged":
         return []
     severe = run.verdict.status == "not usable"
-    title = "The result is not usable" if severe else "The result is usable, with limits"
+    title = "The sampling is not usable" if severe else "The sampling has limits"
     more = run.verdict.more_simulations
     action = "Compare with a second run of another seed and more walkers before you use the numbers."
     if more is None:

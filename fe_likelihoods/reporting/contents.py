@@ -10,7 +10,7 @@ from samplers.output import stored_result
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
-from .advice import residual_sentence
+from .advice import Judgement, residual_sentence
 from .fit_gate import SAME_AS_PRIOR
 from .fits import Fits
 from .run import FinishedRun
@@ -89,8 +89,10 @@ def _named(excitation: Any) -> str:
     return f"{excitation.name} ({source})" if source else excitation.name
 
 
-def summary_sentences(run: FinishedRun, rows: list[ParameterRow], fits: Fits, *, doubted: bool = False) -> list[str]:
-    """Three sentences: what was updated with which data, what was found, and whether to trust it."""
+def summary_sentences(
+    run: FinishedRun, rows: list[ParameterRow], fits: Fits, judgement: Judgement | None = None
+) -> list[str]:
+    """Whether to use the result, what was updated with which data, what was found, and from how many samples."""
     sets = data_sets(run)
     if sets:
         models = " and ".join(sorted({each.model for each in sets}))
@@ -101,11 +103,12 @@ def summary_sentences(run: FinishedRun, rows: list[ParameterRow], fits: Fits, *,
         what += " (synthetic data)." if any("synthetic" in each.description.lower() for each in sets) else "."
     else:
         what = f"{len(rows)} parameters were sampled from a log-density of the user's own."
-    trust = _trust(run, doubted)
+    first = [] if judgement is None else [str(judgement)]
     fast = set(getattr(run.posterior, "fast_parameters", ()))
     if run.is_inconclusive:
-        return [what, "Nothing can be said about the parameters yet: the table shows what the run has so far.", trust]
-    return [what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), trust]
+        nothing = "Nothing can be said about the parameters yet: the table shows what the run has so far."
+        return [*first, what, nothing, _worth(run)]
+    return [*first, what, _finding([row for i, row in enumerate(rows) if i not in fast], fits), _worth(run)]
 
 
 def _finding(rows: list[ParameterRow], fits: Fits) -> str:
@@ -126,17 +129,9 @@ def _finding(rows: list[ParameterRow], fits: Fits) -> str:
     return f"{found}." if found else "Means and intervals of the parameters are in the table below."
 
 
-def _trust(run: FinishedRun, doubted: bool) -> str:
+def _worth(run: FinishedRun) -> str:
     if run.tempered:
-        words = {
-            "converged": "Nothing that the run can observe speaks against the result",
-            "usable": "The result can be used with the limits that are named below",
-            "not usable": "Do not use these numbers before the doubts below are settled",
-        }
-        text = "The run has no stored verdict" if run.verdict is None else words[run.verdict.status]
-        if doubted and run.verdict is not None:
-            text = words["not usable"]
-        return f"{text} ({len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones)."
+        return f"{len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones."
     if (verdict := stored_result(run.sampler.backend)[1]) is not None:
         return f"{len(run.samples)} samples. The verdict that the run has stored is “{verdict.status}”."
     if np.isfinite(run.effective_sample_size):

@@ -12,7 +12,7 @@ import numpy as np
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
-from ..signals.fit_gate import WRONG, Finding
+from ..signals.fit_gate import Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .advice import advise
@@ -68,7 +68,7 @@ class Contents(NamedTuple):
     date: str
     status: str
     summary: list[str]
-    advice: list[Finding]
+    advice: tuple[Finding, ...]
     data: list[DataSet]
     rows: list[ParameterRow]
     has_truth: bool
@@ -187,18 +187,16 @@ def gather(
     repeat: str = "",
 ) -> Contents:
     """Make the contents of a report; simulates the response at two points where it is not cached."""
-    failed = failures(run)
     fits, rows, sets = fit_data_sets(run), parameter_rows(run), data_sets(run)
+    failed = failures(run)  # those of the fits included
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
-    notes = advise(run, rows, fits, failed)
-    doubted = any(note.weight == WRONG for note in notes)
-    status = "unknown" if run.verdict is None else "not usable" if doubted else run.verdict.status
+    judgement = advise(run, rows, fits, failed)
     return Contents(
         title=title or f"Bayesian updating of {models}",
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        status=status,
-        summary=summary_sentences(run, rows, fits, doubted=doubted),
-        advice=notes,
+        status=judgement.status,
+        summary=summary_sentences(run, rows, fits, judgement),
+        advice=judgement.findings,
         data=sets,
         rows=rows,
         has_truth=bool(np.isfinite(run.truth).any()),

