@@ -77,6 +77,7 @@ def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
     posterior = posterior_of([1.05, 0.8], lambda theta: free_vibration(theta, numbers=True))
     sampler = run(posterior)
     posterior.likelihood.simulate([[1.1 + 1e-3 * k, 1.0] for k in range(1, 131)])
+    text = read_page(report(sampler, posterior, out=tmp_path / "run.html")).text  # it makes simulations as well
     found = failures(read_run(sampler, posterior))
     (row,) = found.rows
     assert (row.reason, row.count) == ("no convergence, residual #", found.count)
@@ -87,7 +88,6 @@ def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
     first = f"{stiffness[0]:.4g}, damping = {damping[0]:.4g}"
     assert row.example == f"no convergence, residual {stiffness[0]:.9e}: stiffness = {first}"
     assert row.where.startswith("at stiffness above 1.1 (100 %")
-    text = read_page(report(sampler, posterior, out=tmp_path / "run.html")).text
     assert text.count("no convergence, residual") == 2 and row.ranges in text
 
 
