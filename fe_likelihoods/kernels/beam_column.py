@@ -44,8 +44,8 @@ PER_SECTION = 7
 MAX_PASSES = 10
 MAX_PASSES_INITIAL = 100
 MAX_SUBDIVISIONS = 4
-MAX_ATTEMPTS = 300
-"""Passes over the sections, in all attempts together."""
+MAX_ATTEMPTS = 130
+"""Passes over the sections in all attempts together: one round of the three schemes, and ten more."""
 MAX_RISES = 3
 """An attempt has failed when its error has increased tenfold this often: its passes go round in a circle."""
 
