@@ -22,7 +22,7 @@ __all__ = ["steps"]
 STEPS = {
     "bouc-wen": (5e-4, 2.5e-4, 1e-4),
     "elastic-plastic": (2.5e-4, 1e-4, 5e-5),
-    "coulomb": (2.5e-4, 1e-4, 5e-5, 2.5e-5),
+    "coulomb": (2.5e-4, 1e-4),
 }
 GROUPS = {"displacements": ("Ub", "drift", "Ud"), "forces": ("Fb", "shear"), "accelerations": ("acc",)}
 

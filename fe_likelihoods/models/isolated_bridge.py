@@ -57,7 +57,7 @@ _NOMINAL_UNITS = {
     for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
 }
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
-_LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.025e-3}  # of the default [s]
+_LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.25e-3}  # of the default [s]
 _STATE_ROWS = (
     *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
@@ -109,11 +109,10 @@ class IsolatedBridge(ThreadedModel):
         Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
     friction : str
         "bouc-wen" (regularised, the default), "elastic-plastic" (the slider law in other codes), or "coulomb" (exact
-        stick and slip, with isolator forces that are constant over a step, hence of first order).
+        stick and slip, whose instants are located within a step).
     step : float, optional
-        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms for
-        "bouc-wen", 0.05 ms for "elastic-plastic" and 0.025 ms for "coulomb" (accuracy:
-        ``docs/theory/time_integration.rst``).
+        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms, or up to
+        0.05 ms for "elastic-plastic" (accuracy: ``docs/theory/time_integration.rst``).
     every : int
         The response has one sample per `every` samples of the record.
     p_delta : bool
@@ -143,14 +142,14 @@ class IsolatedBridge(ThreadedModel):
     ===================  ==============  ==================  ===============  ========
     ``bouc-wen``         0.004 %         0.02 %              0.02 % (0.12 %)  0.04 %
     ``elastic-plastic``  0.008 %         0.05 %              0.1 % (0.14 %)   0.008 %
-    ``coulomb``          0.03 %          0.05 %              0.1 % (0.21 %)   0.11 %
+    ``coulomb``          0.05 %          0.02 %              0.01 % (0.08 %)  0.03 %
     ===================  ==============  ==================  ===============  ========
 
     Values in parentheses are for the pier accelerations under the record of 0.04 g, in which the bearings slide by 1
-    mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick. This instant is found to
-    within one step; a sample in between differs by the jump. With "elastic-plastic", many simulations fail (6 of 60 at
-    -1.1 g, 48 of 60 at -2 g) where a `vertical` acceleration below -g removes the load of a bearing; their
-    log-likelihood is -inf. Use "bouc-wen" or "coulomb" for such records.
+    mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick; steps are halved there
+    until the instant is known within h/64. With "elastic-plastic", many simulations fail (6 of 60 at -1.1 g, 48 of 60
+    at -2 g) where a `vertical` acceleration below -g removes the load of a bearing; their log-likelihood is -inf. Use
+    "bouc-wen" or "coulomb" for such records.
 
     The channels of the two piers and of the deck are:
 

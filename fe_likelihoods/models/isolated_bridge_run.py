@@ -23,6 +23,9 @@ from .validation import check_state, check_values
 __all__ = ["FORMS", "BridgeRun", "PreparedBridge", "prepare_bridge", "run_bridge"]
 
 FORMS = {"bouc-wen": BOUC_WEN, "elastic-plastic": ELASTIC_PLASTIC, "coulomb": COULOMB}
+COULOMB_HALVINGS = 6
+"""How often a step with Coulomb's law is halved to find the instant at which a bearing begins or ceases to stick."""
+
 _MAY_BE_ZERO = ("df_1", "a_1", "df_2", "a_2")
 
 
@@ -101,7 +104,8 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     check_values(v, _MAY_BE_ZERO)
     dampers = [Damper(v[f"Kd_{i}"], v[f"C0_{i}"], damper.count) for i, damper in enumerate(model.dampers, 1)]
     step = model.integration_step
-    matrices = prepared.linear.step_matrices(dampers, step, constant_forces=model.friction == "coulomb")
+    coulomb = model.friction == "coulomb"
+    matrices = prepared.linear.step_matrices(dampers, step, COULOMB_HALVINGS if coulomb else None)
     sliders = tuple(
         Slider(
             f_min=float(v[f"fmin_{i}"]),
@@ -136,6 +140,8 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     if status:
         n_steps = n_sub * (ground.size - 1)
         raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
+    if coulomb:
+        prepared.linear.hold_stuck_bearings(dampers, ground, out)
     start = 0 if state is None else first + model.every
     values = out[start:].T
     return BridgeRun(

@@ -97,8 +97,8 @@ class BridgeStateSpace(NamedTuple):
         inputs[5:10, 1:] = -inverse @ b.T
         return cls(a, inputs, b)
 
-    def step_matrices(self, dampers: Sequence[Damper], step: float, *, constant_forces: bool) -> StepMatrices:
-        """Matrices of one step with these dampers.
+    def step_matrices(self, dampers: Sequence[Damper], step: float, halvings: int | None = None) -> StepMatrices:
+        """Matrices of the steps with these dampers.
 
         Parameters
         ----------
@@ -106,14 +106,24 @@ class BridgeStateSpace(NamedTuple):
             The dampers of each pier.
         step : float
             Integration step [s].
-        constant_forces : bool
-            Whether F is constant over a step instead of linear in time. Coulomb friction needs this: a set-valued force
-            that is linear in time would oscillate about rest.
+        halvings : int, optional
+            How often the step of Coulomb's law is halved: kinds of steps with F constant or linear in time
+            (`StepMatrices`). A set-valued force that is linear in time would oscillate about rest. Default: one kind.
 
         Returns
         -------
         StepMatrices
         """
+        if halvings is None:
+            return StepMatrices(*(part[None] for part in self._of_size(dampers, step, [(True, True)])[0]))
+        holds = [(False, False), (True, False), (False, True), (True, True)]
+        kinds = [kind for k in range(halvings + 1) for kind in self._of_size(dampers, 0.5**k * step, holds)]
+        return StepMatrices(*(np.stack(parts) for parts in zip(*kinds, strict=True)))
+
+    def _of_size(
+        self, dampers: Sequence[Damper], step: float, linear: Sequence[tuple[bool, bool]]
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """The arrays of `StepMatrices` for one size of step; each of `linear` says which forces are linear in time."""
         a, inputs = self._with_dampers(dampers), self.inputs
         n, m = inputs.shape
         augmented = np.zeros((n + 2 * m, n + 2 * m))
@@ -128,16 +138,44 @@ class BridgeStateSpace(NamedTuple):
         matrix_exponential(augmented / units[:, None] * units, exponential, np.empty((2, *augmented.shape)))
         exponential *= units[:, None] / units
         phi, whole, second = exponential[:n, :n], exponential[:n, n : n + m], exponential[:n, n + m :]
-        first = whole - second
-        if constant_forces:
-            first[:, 1:], second[:, 1:] = 0.0, whole[:, 1:]
-        ends = second[:, 1:]
-        advance = np.column_stack([phi, first[:, 0], second[:, 0], phi @ ends + first[:, 1:]])
-        q = np.zeros((4, n))
-        q[:2, :5] = q[2:, 5:10] = self.kinematics
-        return StepMatrices(
-            np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends
-        )
+        found = []
+        for each in linear:
+            at_end = second.copy()
+            for bearing in range(2):
+                if not each[bearing]:
+                    at_end[:, 1 + bearing] = whole[:, 1 + bearing]
+            at_start, ends = whole - at_end, at_end[:, 1:]
+            advance = np.column_stack([phi, at_start[:, 0], at_end[:, 0], phi @ ends + at_start[:, 1:]])
+            q = np.zeros((4, n))
+            q[:2, :5] = q[2:, 5:10] = self.kinematics
+            found.append(
+                (np.ascontiguousarray(np.vstack([advance, q @ advance]).T), np.ascontiguousarray(ends), q @ ends)
+            )
+        return found
+
+    def hold_stuck_bearings(self, dampers: Sequence[Damper], ground: np.ndarray, values: np.ndarray) -> None:
+        """Replace the forces of bearings that stick, in place, by the forces that keep them at rest at each sample.
+
+        The kernel computes their mean over a step.
+
+        Parameters
+        ----------
+        dampers : sequence of Damper
+        ground : ndarray[n_steps]
+            Table acceleration [m/s²].
+        values : ndarray[n_steps, 16]
+            State, F and Z (`fe_likelihoods.kernels.isolated_bridge.N_OUT`).
+        """
+        b, inputs = self.kinematics, self.inputs[5:10]
+        acceleration = values[:, :12] @ (b @ self._with_dampers(dampers)[5:10]).T + np.outer(ground, b @ inputs[:, 0])
+        by_force, force = b @ inputs[:, 1:], values[:, 12:14]
+        stuck = np.abs(values[:, 14:16]) < 1.0
+        for first, second in ((0, 1), (1, 0)):
+            alone = stuck[:, first] & ~stuck[:, second]
+            rest = acceleration[alone, first] + by_force[first, second] * force[alone, second]
+            force[alone, first] = -rest / by_force[first, first]
+        both = stuck.all(axis=1)
+        force[both] = -np.linalg.solve(by_force, acceleration[both].T).T
 
     def _with_dampers(self, dampers: Sequence[Damper]) -> np.ndarray:
         """A (12, 12) with the dampers."""

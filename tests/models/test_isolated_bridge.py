@@ -108,14 +108,13 @@ def test_a_block_on_a_sliding_table():
     )
     displacement, acceleration, _ = model.simulate([1.0])
     time = model.record.time
-    late = model.integration_step / time[-1]  # the force is constant over a step, so it is one step late
-    np.testing.assert_allclose(displacement, -0.5 * (3.0 - mu * G) * time**2, atol=2.0 * late * abs(displacement[-1]))
+    late = 0.3e-3 / time[-1]  # the piers bend for a quarter of their period before the bearings slide
+    np.testing.assert_allclose(displacement, -0.5 * (3.0 - mu * G) * time**2, atol=late * abs(displacement[-1]))
     np.testing.assert_allclose(acceleration[1:], mu * G, rtol=1e-6)
     gentle = model.with_record(Record("gentle", 0.01, 0.9 * mu * G * np.sin(np.linspace(0.0, 12.0, 101))))
     _, acceleration, bearing_displacement = gentle.simulate([1.0])
     assert np.abs(bearing_displacement).max() < 1e-7  # at rest at every step; the table reverses in between
-    steepest = np.abs(np.diff(gentle.record.acceleration)).max() / gentle.dt
-    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=3.0 * model.integration_step * steepest)
+    np.testing.assert_allclose(acceleration, gentle.record.acceleration, atol=0.01 * mu * G)  # corners shake the piers
 
 
 def test_without_hysteresis_the_bridge_is_linear(rng):
@@ -165,9 +164,9 @@ def test_the_deck_is_in_equilibrium(rng):
 # ------------------------------------------------------------------ convergence and energy
 
 
-@pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 0.9)])
+@pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 1.7)])
 def test_order_of_convergence(rng, friction, order):
-    """Second order for the smooth law; corners reduce it by up to one for elastic-plastic; first order for Coulomb."""
+    """Second order for the smooth law; corners reduce it by up to one for elastic-plastic; Coulomb's instants are located."""
     record = shaking(rng, duration=2.0)
     model = IsolatedBridge(record, friction=friction, outputs=("Ub_1", "Ub_2", "Ud"), tolerance=1e-8)
     steps = 1e-3 / 2.0 ** np.arange(5)
@@ -190,6 +189,35 @@ def test_elastic_plastic_converges_to_coulomb_with_the_yield_displacement(rng):
         distance.append(worst(model.simulate(np.ones(10)), exact, peak))
     print("largest distance to Coulomb's law, as fractions of the peak:", distance)
     assert distance[1] < 0.3 * distance[0] < 0.02
+
+
+def test_the_instants_of_stick_and_slip_do_not_depend_on_the_step(rng):
+    """Every sample of every channel agrees with a much smaller step: no sample is on the wrong side of a jump."""
+    for scale in (0.1, 1.0):
+        model = IsolatedBridge(shaking(rng, duration=4.0).scale(scale), friction="coulomb")
+        fine = replace(model, step=5e-6).simulate(np.ones(10))
+        peak = np.abs(fine).max(axis=1, keepdims=True)
+        assert np.abs((model.simulate(np.ones(10)) - fine) / peak).max() < 1e-3
+        # control: steps of a sample leave the oscillation of the stuck piers out
+        assert np.abs((replace(model, step=model.record.dt).simulate(np.ones(10)) - fine) / peak).max() > 1e-3
+
+
+def test_a_bridge_with_coulombs_law_continues_with_the_same_bits(rng):
+    model = IsolatedBridge(shaking(rng, duration=2.0), friction="coulomb")
+    whole, start = model.simulate(np.ones(10)), model.first(1.0).simulate_from(np.ones(10))
+    rest = model.simulate_from(np.ones(10), start.state)
+    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
+
+
+def test_bearings_that_stick_have_the_force_that_keeps_them_at_rest(rng):
+    """The deck and both piers move together, so that the bearings have no acceleration."""
+    model = IsolatedBridge(shaking(rng, duration=1.0).scale(0.01), friction="coulomb", outputs=("Ud", "acc_d", "Ub_1"))
+    displacement, acceleration, bearing = model.simulate(np.ones(10))
+    assert np.abs(bearing).max() < 1e-4 * np.abs(displacement).max()
+    h = model.record.dt
+    by_difference = (displacement[2:] - 2.0 * displacement[1:-1] + displacement[:-2]) / h**2
+    expected = by_difference + model.record.acceleration[1:-1]
+    assert np.corrcoef(acceleration[1:-1], expected)[0, 1] > 0.9
 
 
 @pytest.mark.parametrize("friction", ["bouc-wen", "elastic-plastic"])
@@ -351,7 +379,7 @@ def test_wrong_arguments_are_rejected(rng, changes, message):
         replace(IsolatedBridge(shaking(rng, duration=1.0)), **changes)
 
 
-@pytest.mark.parametrize(("friction", "longest"), [("bouc-wen", 0.25), ("elastic-plastic", 0.05), ("coulomb", 0.025)])
+@pytest.mark.parametrize(("friction", "longest"), [("bouc-wen", 0.25), ("elastic-plastic", 0.05), ("coulomb", 0.25)])
 def test_default_step_divides_any_step_of_a_record(friction, longest):
     for dt in (1e-5, 1e-3, 1.0 / 256.0, 5e-3, 0.02 / 3.0):
         model = IsolatedBridge(Record("flat", dt, np.zeros(5)), friction=friction)
