@@ -166,7 +166,7 @@ def test_the_deck_is_in_equilibrium(rng):
 
 @pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 1.7)])
 def test_order_of_convergence(rng, friction, order):
-    """Second order for the smooth law; corners reduce it by up to one for elastic-plastic; Coulomb's instants are located."""
+    """Second order for the smooth law, and for Coulomb's between its instants; corners cost up to one order."""
     record = shaking(rng, duration=2.0)
     model = IsolatedBridge(record, friction=friction, outputs=("Ub_1", "Ub_2", "Ud"), tolerance=1e-8)
     steps = 1e-3 / 2.0 ** np.arange(5)
