@@ -87,8 +87,12 @@ READ = {
 }
 """Texts that are read as `ACCELERATION` with `STEP`."""
 
-COLUMNS = {"Campbell TOA5": "Top", "missing channel beside": "acc_g", "LabVIEW with times for each channel": "acc"}
-COLUMNS["LabVIEW, different times"] = "Top"
+COLUMNS = {
+    "Campbell TOA5": "Top",
+    "missing channel beside": "acc_g",
+    "LabVIEW with times for each channel": "acc",
+    "LabVIEW, different times": "Top",
+}
 """Columns of the styles with several ones."""
 
 REFUSED = {
