@@ -50,6 +50,7 @@ from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
 from .reporting.advice import check_result
 from .reporting.fit_gate import check_fit
+from .reporting.rehearsal import rehearse
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
@@ -155,6 +156,7 @@ __all__ = [
     "read_columns",
     "read_imposed_test",
     "read_record",
+    "rehearse",
     "report",
     "residual_checks",
     "rms",

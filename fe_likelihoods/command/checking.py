@@ -1,18 +1,21 @@
 """What the command ``check`` does: read everything, simulate a few times, estimate the cost, draw the picture."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..reporting.fit_gate import compare, draws_to_compare, fit_gate
+from ..cache.simulation_cache import SimulationCache
+from ..likelihood.posterior import Posterior
+from ..reporting.rehearsal import Rehearsal, rehearse
 from ..signals.error_measures import rrmse
+from ..signals.fit_gate import REMARK
 from ..units import from_si
-from .events import read_events
-from .job import read_job
+from .events import Event, read_events
+from .job import Job, read_job
 from .models import Problem, make_problem, noise_channels_of
-from .runs import default_folder
+from .runs import CACHE, default_folder, is_free
 from .sampling import is_emcee, make_sampler
 
 __all__ = ["check_job"]
@@ -21,7 +24,7 @@ PICTURE_SECONDS = 10.0
 FEWEST_DRAWS, MOST_DRAWS = 5, 40
 
 
-def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
+def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: bool = False) -> None:
     """Check a TOML file and its data, and say what a run will do.
 
     Parameters
@@ -32,6 +35,8 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
         PNG file of the prior predictive picture.
     say : callable
         Called with every line.
+    progress : bool
+        Whether to show progress bars.
 
     Raises
     ------
@@ -41,11 +46,11 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
     if not picture.resolve().parent.is_dir():
         raise ValueError(f"cannot write {picture}: there is no folder {picture.parent}; give another file with --out")
     job = read_job(file)
-    problem = make_problem(job)
+    problem = make_problem(job, _cache_of_the_run(job, default_folder(file)))
     sampler = make_sampler(job, problem)
     events = read_events(job, problem)
     _say_data(problem, say)
-    seconds = _say_simulation(problem, say)
+    rehearsal = _say_simulation(problem, events, say, progress)
     for event in events:
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
@@ -55,9 +60,14 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None]) -> None:
         simulations = sampler.nwalkers * (job.sampler["steps"] + 1)
         say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
     else:
-        _say_cost(problem, sampler, guided, job.budget, say)
-    _draw(problem, seconds, picture)
+        _say_cost(make_problem(job).posterior, sampler, guided, job.budget, rehearsal, say)
+    _draw(problem, rehearsal.seconds, picture)
     say(f"{picture}: the measurements should lie within the band of the simulations at draws of the prior")
+    made, cache = rehearsal.simulations, problem.posterior.likelihood.simulator.cache
+    stored = (
+        "" if cache is None else f", those of the calibrated model are stored in {default_folder(file)}/ for the run"
+    )
+    say(f"This check made {made} simulations besides those of the picture{stored}")
     say(f"Next: fe-likelihoods run {file} (writes to {default_folder(file)}/)")
 
 
@@ -90,8 +100,21 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
             )
 
 
-def _say_simulation(problem: Problem, say: Callable[[str], None]) -> float:
-    """Simulate at the mean of the prior; return the seconds of a second simulation, which compiles nothing."""
+def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
+    """The cache that a run in this folder will use; None if it uses none, or cannot use the folder."""
+    if not job.budget.get("cache", True) or not is_free(folder):
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # the run will say so
+        return None
+    return SimulationCache(folder / CACHE)
+
+
+def _say_simulation(
+    problem: Problem, events: tuple[Event, ...], say: Callable[[str], None], progress: bool
+) -> Rehearsal:
+    """Rehearse, and say what was found."""
     posterior = problem.posterior
     likelihood, mean = posterior.likelihood, posterior.prior.mean()
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
@@ -101,24 +124,33 @@ def _say_simulation(problem: Problem, say: Callable[[str], None]) -> float:
             f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
             "check [model] and [priors]"
         )
-    response = measured.values - likelihood.residuals(mean)
-    start = time.perf_counter()
-    likelihood.model.simulate(1.0001 * mean[:n])
-    seconds = time.perf_counter() - start
-    errors = rrmse(response, measured.values)
+    rehearsal = rehearse(posterior, {event.name: event.record for event in events}, progress=progress)
+    response = likelihood.simulate(mean[None, :n]).response[0]
+    errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
-    say(f"One simulation takes {seconds:.2g} s. At the mean of the prior the error of the response (RRMSE) is {fit}")
-    draws = draws_to_compare(posterior, seconds)
-    for finding in fit_gate(compare(likelihood, draws, False)):
-        say(f"CAUTION: {finding}")
-    return seconds
+    say(f"One simulation takes {rehearsal.seconds:.2g} s")
+    say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
+    for finding in rehearsal.findings:
+        say(f"{'Note' if finding.weight == REMARK else 'CAUTION'}: {finding}")
+    return rehearsal
 
 
-def _say_cost(problem: Problem, sampler: object, guided: bool, budget: dict, say: Callable[[str], None]) -> None:
+def _say_cost(
+    posterior: Posterior, sampler: Any, guided: bool, budget: dict, rehearsal: Rehearsal, say: Callable[[str], None]
+) -> None:
+    """Estimate the cost with a posterior whose simulations are not cached."""
     from samplers import estimate_cost
 
-    estimate = estimate_cost(problem.posterior, sampler.nwalkers, type(sampler), seed=1)
-    if guided:
+    estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
+    if guided and np.isfinite(rehearsal.searched):
+        # eight starts, of which later ones often join earlier ones, and draws until these are worth the walkers
+        low, high = 2.0 * rehearsal.searched + sampler.nwalkers, 8.0 * rehearsal.searched + 3.0 * sampler.nwalkers
+        say(
+            f"The run uses a guide: a search from one start took {rehearsal.searched:.0f} simulations, so that the run "
+            f"takes roughly {low:.0f} to {high:.0f}; {high:.0f} take {estimate.time_of(high)}, to which the guide adds "
+            "its own computations, half a minute for 7 parameters"
+        )
+    elif guided:
         say(
             f"The run uses a guide: how many simulations it needs is not predicted; 500 take "
             f"{estimate.time_of(500)}, to which the guide adds its own computations, half a minute for 7 parameters"

@@ -129,15 +129,17 @@ def _say_assumed(problem: Any) -> None:
 @main.command()
 @click.argument("file", type=_FILE)
 @click.option("--out", type=_FILE, help="PNG file of the prior predictive picture.", show_default="check-NAME.png")
-def check(file: Path, out: Path | None) -> None:
-    """Read FILE and its data, make a few simulations, and say what a run will do and cost.
+@click.option("--quiet", is_flag=True, help="Show no progress bars.")
+def check(file: Path, out: Path | None, quiet: bool) -> None:
+    """Read FILE and its data, rehearse with about 100 simulations, and say what a run will do and cost.
 
-    A picture compares the measurements with simulations at draws of the prior: the measurements should lie within
-    their band.
+    It tries whether the model is repeatable and follows its motion, whether units, signs, clocks and channels are
+    right, and whether step and mesh are fine enough for the data. A picture compares the measurements with simulations
+    at draws of the prior: the measurements should lie within their band.
     """
     from .checking import check_job
 
-    check_job(file, out or Path(f"check-{file.stem}.png"), click.echo)
+    check_job(file, out or Path(f"check-{file.stem}.png"), click.echo, progress=not quiet)
 
 
 @main.command()

@@ -22,6 +22,7 @@ from ..prediction.prediction import Prediction
 from ..reporting.advice import advise
 from ..reporting.failures import failures
 from ..reporting.fits import fit_data_sets
+from ..reporting.rehearsal import refuse_chance
 from ..reporting.run import FinishedRun, read_run
 from ..reporting.table import parameter_rows
 from ..signals.fit_gate import REMARK
@@ -36,13 +37,14 @@ from .events import (
     write_events,
 )
 from .job import Job, parse_job, read_job
-from .models import NotRun, Problem, make_problem
+from .models import USER_MODELS, NotRun, Problem, make_problem
 from .results import write_report, write_samples, write_tables
 from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
-__all__ = ["Outcome", "default_folder", "report_run", "run_job"]
+__all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_job"]
 
-SETTINGS, ORIGIN, CHAIN, CACHE = "settings.toml", "origin.json", "run.h5", "simulations.sqlite"
+SETTINGS, ORIGIN, CHAIN = "settings.toml", "origin.json", "run.h5"
+CACHE = "simulations.sqlite"
 WITHOUT_MODEL = "without-model"  # folder in the folder of a run
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
 DRAWS = 100  # of predictions
@@ -79,6 +81,13 @@ def default_folder(file: Path) -> Path:
     return Path(f"results-{file.stem}")
 
 
+def is_free(folder: Path) -> bool:
+    """Whether a run may use a folder: it is the folder of a run, or has nothing but simulations of a check."""
+    if (folder / SETTINGS).is_file() or not folder.exists():
+        return True
+    return folder.is_dir() and all(each.name.startswith(CACHE) for each in folder.iterdir())
+
+
 def run_job(
     file: Path, folder: Path | None = None, resume: bool = False, overwrite: bool = False, progress: bool = True
 ) -> Outcome:
@@ -104,7 +113,8 @@ def run_job(
     Raises
     ------
     ValueError
-        If anything in the file is wrong, or the folder contains the run of other settings.
+        If anything in the file is wrong, the folder contains the run of other settings, or a model of the user is not
+        repeatable.
     """
     job = read_job(file)
     folder = folder or default_folder(file)
@@ -113,6 +123,8 @@ def run_job(
     events = read_events(job, tried)
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
+    if job.kind in USER_MODELS and not (folder / CHAIN).exists():
+        refuse_chance(problem.posterior)
     sampler = _stored_sampler(job, problem, folder)
     run_sampler(job, problem, sampler, progress)
     return Outcome(folder, sampler, problem, *_write(folder, job, job.file, sampler, problem, events, progress))
@@ -304,7 +316,7 @@ def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, over
             )
     elif resume:
         raise ValueError(f"{folder} contains no run to resume; leave out --resume to start one")
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    elif not is_free(folder):
         raise ValueError(f"{folder} exists and is not the folder of a run; give another one with --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -209,7 +209,27 @@ def test_check_says_what_was_read_and_what_a_run_costs(folder):
     assert "Record: base, 301 samples at 0.02 s" in output
     assert "displacement: 301 samples" in output and "One simulation takes" in output
     assert (folder / "check-oscillator.png").stat().st_size > 10_000
-    assert not (folder / "results-oscillator").exists()
+    made = int(re.search(r"This check made (\d+) simulations", output)[1])
+    stored = SimulationCache(folder / "results-oscillator" / "simulations.sqlite").info().simulations
+    assert 20 < stored <= made
+    assert {path.name for path in (folder / "results-oscillator").iterdir()} == {"simulations.sqlite"}
+    call("run", "oscillator.toml", "--quiet")  # uses the folder and what it has
+    assert (folder / "results-oscillator" / "report.html").exists()
+    (folder / "other").mkdir()
+    (folder / "other" / "notes.txt").write_text("no run")
+    assert "is not the folder of a run" in call("run", "oscillator.toml", "--out", "other", code=1)
+
+
+def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fixed = "    motion = (0.1 * record.acceleration / abs(record.acceleration).max()).tolist()"
+    write_function(tmp_path, "unread", "    motion = record.acceleration.tolist()", fixed)
+    output = call("check", "unread.toml", "--quiet")
+    assert "CAUTION: The motion changes nothing: Twice the base motion gives the same response" in output
+    chance = "    return response * (1.0 + 1e-6 * np.random.default_rng().standard_normal())"
+    write_function(tmp_path, "chance", "    return response", chance)
+    assert "CAUTION: The model is not repeatable" in call("check", "chance.toml", "--quiet")
+    assert "for example with a fixed seed" in call("run", "chance.toml", "--quiet", code=1)
 
 
 def test_run_writes_its_files_and_is_not_repeated(folder, caplog):

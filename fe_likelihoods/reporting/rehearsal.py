@@ -1,0 +1,408 @@
+"""A rehearsal before a run: is the model what a sampler takes it for, and are its numerical errors small enough?
+
+A model that returns something else the second time, or the same under every motion, ends in numbers that look like a
+result. `rehearse` simulates a few times what a run would simulate thousands of times.
+
+The error of the time step, or of the mesh, is compared with the width of the posterior that the data will give. At the
+best fit, the response r changes by d with half the step. With the derivatives J of the response by the parameters,
+each in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
+
+    delta = (J^T W J + P)^-1 J^T W d
+
+is about the change of the parameters in their standard deviations, where P is the precision of the prior in this unit.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass, replace
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from ..emulation.modes import Mode, find_modes
+from ..emulation.target import ResponseTarget
+from ..likelihood.likelihood import FELikelihood
+from ..likelihood.posterior import Posterior
+from ..noise.gaussian import GaussianNoise
+from ..priors.distributions import HalfNormal
+from ..signals.channels import Measurements
+from ..signals.events import Events
+from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
+from ..signals.records import Record
+from ..simulation.model import simulate_batch
+from ..units import from_si
+from .fit_gate import Compared, compare, draws_to_compare, fit_gate
+
+__all__ = ["Rehearsal", "refuse_chance", "rehearse"]
+
+EQUAL = 1e-9  # difference of two responses, relative to their norm, up to which they are the same
+NOTHING = 1e-6  # the same, of responses to a motion and to twice this motion
+LATE_SHARE = 0.05  # of a motion, by which it is shifted
+SECONDS = 60.0  # of the search for the best fit
+MOST_SEARCHED = 150  # simulations of this search
+SHIFT, LARGE_SHIFT = 0.5, 2.0  # of a parameter by half a step, in standard deviations: a caution, and a wrong result
+LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
+SMALLEST_MOTION = 1e-6  # [g]
+
+
+class Rehearsal(NamedTuple):
+    """What a rehearsal has found.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        The most severe first.
+    simulations : int
+        Number of simulations made.
+    seconds : float
+        Duration of one simulation [s].
+    searched : float
+        Simulations that a search for the best fit took from one start; NaN where there was none.
+    """
+
+    findings: tuple[Finding, ...]
+    simulations: int
+    seconds: float
+    searched: float
+
+
+class _Stage:
+    """Runs, times and counts simulations of models other than the likelihood's."""
+
+    def __init__(self, bar: tqdm) -> None:
+        self.bar, self.made, self.seconds = bar, 0, np.inf
+
+    def count(self, n: int) -> None:
+        self.made += n
+        self.bar.update(n)
+
+    def run(self, model: Any, theta: np.ndarray) -> tuple[np.ndarray | None, str]:
+        """A response (n_channels, n_steps), None if the simulation fails, and the reason."""
+        self.bar.total = max(self.bar.total or 0, self.bar.n + 1)
+        start = perf_counter()
+        batch = simulate_batch(model, theta[None])
+        self.seconds = min(self.seconds, perf_counter() - start)  # the first one may compile
+        self.count(1)
+        return (None if batch.reasons[0] else batch.response[0]), batch.reasons[0]
+
+
+def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, progress: bool = False) -> Rehearsal:
+    """Try the model of a posterior before a run.
+
+    It simulates the mean of the prior twice, under twice the motion, a later motion and the motions of other events,
+    and draws of the prior, which are compared with the measurements as in `fe_likelihoods.check_fit`. Where time
+    permits (a minute), it searches for the best fit, and halves step and mesh there.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    events : mapping of str to Record, optional
+        Other motions that will be predicted, as for ``model.with_record``.
+    progress : bool
+        Whether to show a progress bar.
+
+    Returns
+    -------
+    Rehearsal
+
+    Raises
+    ------
+    ValueError
+        If the simulation at the mean of the prior fails.
+
+    Examples
+    --------
+    >>> for finding in rehearse(posterior).findings:
+    ...     print(finding.weight, finding)
+    """
+    found: list[Finding] = []
+    single = isinstance(posterior.likelihood, FELikelihood)
+    keys = getattr(posterior.likelihood, "likelihoods", {"": None})
+    mean = posterior.prior.mean()
+    with tqdm(total=0, disable=not progress, unit="simulation", desc="check") as bar, _announced(posterior, bar):
+        stage, before = _Stage(bar), _made(posterior)
+        seconds, searched = 0.0, np.nan
+        compared: list[Compared] = []
+        for key, (likelihood, columns) in zip(keys, posterior.likelihood.parts(), strict=True):
+            model = likelihood.model
+            theta = mean[columns][: len(model.parameter_names)]
+            batch = likelihood.simulate(theta[None])
+            if batch.reasons[0]:
+                raise ValueError(
+                    f"the simulation at the mean of the prior has failed: {batch.reasons[0]}; check model and priors"
+                )
+            response = batch.response[0]
+            stage.seconds = np.inf
+            again, reason = stage.run(model, theta)
+            chance = _of_chance(response, again, reason)
+            draws = draws_to_compare(posterior, stage.seconds)[:, columns]
+            compared += compare(likelihood, draws, False, key)
+            if not chance:  # generators of workers have moved on meanwhile
+                later = simulate_batch(model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
+                stage.count(2)
+                for again, reason in zip(later.response, later.reasons, strict=True):
+                    chance = chance or _of_chance(response, None if reason else again, reason)
+            # where responses differ by chance, other differences say nothing
+            found += chance or _of_motions(stage, model, theta, response, events or {})
+            found += _of_sizes(likelihood.measurements, model)
+            seconds += stage.seconds
+        if single and not any(each.weight == WRONG for each in found):
+            refined, searched = _of_discretisation(stage, posterior, seconds)
+            found += refined
+        found += fit_gate(compared)
+        simulations = stage.made + _made(posterior) - before
+    order = (WRONG, CARE, REMARK)
+    return Rehearsal(tuple(sorted(found, key=lambda each: order.index(each.weight))), simulations, seconds, searched)
+
+
+def _made(posterior: Posterior) -> int:
+    """Simulations that a posterior has made, also for verification and with first parts of its records."""
+    parts = [part for part, _ in posterior.likelihood.parts()]
+    return sum(each.simulations + each.verifications for part in parts for each in (part, *part.shortened))
+
+
+def refuse_chance(posterior: Posterior) -> None:
+    """Simulate the mean of the prior again; ValueError if the responses differ. A failed simulation is no such case."""
+    mean = posterior.prior.mean()
+    for likelihood, columns in posterior.likelihood.parts():
+        theta = mean[columns][: len(likelihood.model.parameter_names)]
+        first = likelihood.simulate(theta[None])
+        later = simulate_batch(likelihood.model, np.tile(theta, (2, 1)), likelihood.simulator.pool)
+        for response, reason in zip(later.response, later.reasons, strict=True):
+            for finding in [] if first.reasons[0] or reason else _of_chance(first.response[0], response, ""):
+                raise ValueError(str(finding))
+
+
+@contextmanager
+def _announced(posterior: Posterior, bar: tqdm) -> Any:
+    """Count the simulations of the posterior in the bar."""
+
+    def update(n: float) -> None:
+        bar.total = max(bar.total or 0, bar.n + n)
+        bar.update(n)
+
+    posterior.when_simulated(update)
+    try:
+        yield
+    finally:
+        posterior.when_simulated(None)
+
+
+def _relative(difference: np.ndarray, reference: np.ndarray) -> float:
+    norm = float(np.linalg.norm(reference))
+    return float(np.linalg.norm(difference)) / norm if norm > 0.0 else float(np.any(difference))
+
+
+def _of_chance(response: np.ndarray, again: np.ndarray | None, reason: str) -> list[Finding]:
+    """Whether a second simulation of the same parameters gives the same response."""
+    action = (
+        "Set the seeds of the model, give each simulation a folder of its own, and read no results of earlier runs."
+    )
+    if again is None:
+        text = f"The first simulation at the mean of the prior succeeded, the second one failed: {reason}."
+        return [Finding("The model is not repeatable", WRONG, text, action)]
+    share = _relative(again - response, response)
+    if share <= EQUAL:
+        return []
+    text = (
+        f"Two simulations of the same parameters differ by {100.0 * share:.2g} % of the response: the likelihood of a "
+        "point is another one each time, no sampler converges, and stored simulations are refused."
+    )
+    return [Finding("The model is not repeatable", WRONG, text, action)]
+
+
+def _motions_of(model: Any) -> tuple[Record, ...]:
+    """The records that excite a model; empty where they cannot be replaced."""
+    if not hasattr(model, "with_record"):
+        return ()
+    supports = getattr(model, "supports", ())
+    given = supports if supports else [getattr(model, name, None) for name in ("record", "loading")]
+    found = tuple(each for each in given if isinstance(each, Record))
+    return found if supports and len(found) == len(supports) else found[:1]
+
+
+def _under(model: Any, change: Callable[[Record], Record]) -> Any:
+    """The model under its motions, each of which is changed."""
+    motions = tuple(change(each) for each in _motions_of(model))
+    vertical = getattr(model, "vertical", None)
+    if isinstance(vertical, Record):
+        return model.with_record((motions[0], change(vertical)))
+    return model.with_record(motions if getattr(model, "supports", ()) else motions[0])
+
+
+def _later(record: Record, steps: int) -> Record:
+    """The record after a number of zeros, with its length."""
+    zeros = np.zeros(steps)
+    return Record(record.name, record.dt, np.concatenate([zeros, record.acceleration[:-steps]]), record.source)
+
+
+def _of_motions(
+    stage: _Stage, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
+) -> list[Finding]:
+    """Whether the response follows the motion: twice the motion, a later motion, and other events."""
+    motions = _motions_of(model)
+    if not motions:
+        return []
+    unread = "Check that the model reads the motion that it is given, and not one file that is always the same."
+    strong, reason = stage.run(_under(model, lambda each: each.scale(2.0)), theta)
+    if strong is not None and _relative(strong - response, response) <= NOTHING:
+        text = "Twice the base motion gives the same response: the model does not use the motion that it is given."
+        return [Finding("The motion changes nothing", WRONG, f"{text} Predictions of other events repeat it.", unread)]
+    found = []
+    if strong is None:
+        text = f"Under twice the base motion the simulation at the mean of the prior fails: {reason}."
+        found.append(Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well."))
+    dt = motions[0].dt
+    every = max(1, round(model.dt / dt))
+    steps = every * max(1, round(LATE_SHARE * motions[0].n_steps / every))
+    if not isinstance(motions[0], Events) and steps < motions[0].n_steps // 2:
+        late, _ = stage.run(_under(model, lambda each: _later(each, steps)), theta)
+        k = steps // every
+        if late is not None and late.shape == response.shape and k < response.shape[1]:
+            moved = _relative(late[:, k:] - response[:, :-k], response[:, :-k])
+            stayed = _relative(late - response, response)
+            if moved > stayed:
+                text = (
+                    f"Under a motion that begins {steps * dt:.3g} s later, the response does not move with it "
+                    f"(difference {100.0 * moved:.2g} %, and {100.0 * stayed:.2g} % to the response that stays)."
+                )
+                found.append(Finding("The response does not follow the motion", WRONG, text, unread))
+    for name, record in events.items():
+        other = model.with_record(record)
+        result, reason = stage.run(other, theta)
+        if result is None:
+            text = f"Event {name}: the simulation at the mean of the prior fails: {reason}."
+            found.append(Finding("An event fails", CARE, text, "Check its motion and the steps of the model."))
+            continue
+        n = min(result.shape[1], response.shape[1])
+        same = _relative(result[:, :n] - response[:, :n], response[:, :n]) <= NOTHING
+        if same and other.fingerprint != model.fingerprint:
+            text = f"Event {name} gives the same response as the motion of the calibration."
+            found.append(Finding("An event changes nothing", WRONG, text, unread))
+        break  # one event suffices: they are all read in the same way
+    return found
+
+
+def _of_sizes(measured: Measurements, model: Any) -> list[Finding]:
+    """Motions and measurements whose size is not plausible in SI units."""
+    sizes = [(f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in _motions_of(model)]
+    for channel, values in zip(measured.channels, measured.values, strict=True):
+        if np.isfinite(values).any():
+            sizes.append((f"channel {channel.name}", channel.dimension, float(np.nanmax(np.abs(values)))))
+    found = []
+    for name, kind, peak in sizes:
+        largest, unit = LARGEST_PEAKS.get(kind, (np.inf, ""))
+        shown = from_si(peak, unit).item() if unit else 0.0
+        if shown > largest or (kind == "motion" and shown < SMALLEST_MOTION):
+            text = f"The peak of {name} is {shown:.3g} {unit}."
+            action = "Check the unit of its file. A number without a unit is in SI units (m, m/s²)."
+            found.append(Finding("A size is not plausible", CARE, text, action))
+    return found
+
+
+def _finer(model: Any) -> list[tuple[str, Any, int]]:
+    """What is halved, the finer model, and its response samples per sample of the model."""
+    names = {each.name for each in fields(model)} if is_dataclass(model) else set()
+    found = []
+    if "substeps" in names:
+        found.append(("the integration step", replace(model, substeps=2 * model.substeps), 1))
+    elif "step" in names and hasattr(model, "integration_step"):
+        found.append(("the integration step", replace(model, step=0.5 * model.integration_step), 1))
+    elif _motions_of(model):
+        finer = _under(model, lambda each: each.resample(0.5 * each.dt))
+        if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
+            found.append(("the time step", finer, 2))
+    if "mesh" in names and isinstance(model.mesh, int):
+        found.append(("the fibers of the section", replace(model, mesh=2 * model.mesh), 1))
+    return found
+
+
+def _of_discretisation(stage: _Stage, posterior: Posterior, seconds: float) -> tuple[list[Finding], float]:
+    """Shift of the parameters by half the step and a finer mesh, in their standard deviations; simulations searched."""
+    likelihood = posterior.likelihood
+    finer = _finer(likelihood.model)
+    if not finer:
+        text = "The model takes neither a motion nor a step that could be halved."
+        return (
+            [Finding("The time step was not tested", REMARK, text, "Halve it in the model, and compare.")],
+            np.nan,
+            None,
+        )
+    n = len(likelihood.model.parameter_names)
+    limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
+    if limit < 10 * (n + 1):
+        text = f"The test takes about {15 * (n + 1)} simulations of {seconds:.2g} s."
+        action = "Halve the step and the mesh at one point, and compare the responses with the noise."
+        return [Finding("Step and mesh were not tested", REMARK, text, action)], np.nan
+    try:
+        target, mode, searched = _search(stage, posterior, limit)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return [Finding("Step and mesh were not tested", REMARK, f"No fit was found: {error}.")], np.nan
+    if mode is None:
+        return [Finding("Step and mesh were not tested", REMARK, "No fit was found.")], searched
+    theta = mode.parameters[:n]
+    factor = np.linalg.cholesky(mode.covariance)
+    around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
+    sd = around[:, :n].std(axis=0)
+    response, reason = stage.run(likelihood.model, theta)
+    columns = [stage.run(likelihood.model, theta + sd * row)[0] for row in np.eye(n)]
+    if response is None or any(each is None for each in columns):
+        return [Finding("Step and mesh were not tested", REMARK, f"A simulation failed: {reason}.")], searched
+    residuals = likelihood.residuals_of(response, mode.parameters)
+    sigma = np.sqrt(np.nanmean(np.square(residuals), axis=1))
+    prior_sd = np.array([posterior.prior.table()[1][i][3] for i in range(n)])
+    found = []
+    for what, model, every in finer:
+        fine, reason = stage.run(model, theta)
+        if fine is None:
+            text = f"With half of {what} the simulation at the best fit fails: {reason}."
+            found.append(Finding("A finer model fails", CARE, text, "Check the convergence of the model."))
+            continue
+        change = fine[:, ::every] - response
+        shift = _shift(change, np.stack([each - response for each in columns]), sigma, sd / prior_sd)
+        worst = int(np.argmax(np.abs(shift)))
+        if abs(shift[worst]) < SHIFT:
+            continue
+        names = ", ".join(
+            f"{name} by {abs(value):.2g}"
+            for name, value in zip(likelihood.model.parameter_names, shift, strict=True)
+            if abs(value) >= SHIFT
+        )
+        text = (
+            f"Half of {what} changes the response by {100.0 * _relative(change, response):.2g} %, which moves {names} "
+            "posterior standard deviations: intervals that are narrower than the error of the model miss the truth."
+        )
+        weight = WRONG if abs(shift[worst]) > LARGE_SHIFT else CARE
+        found.append(
+            Finding("The model is too coarse for its data", weight, text, f"Halve {what} until this is small.")
+        )
+    return found, searched
+
+
+def _search(stage: _Stage, posterior: Posterior, limit: float) -> tuple[ResponseTarget, Mode | None, float]:
+    """The best fit from the median of the prior, under white noise where the level follows the response."""
+    likelihood, given = posterior.likelihood, posterior
+    try:
+        target = ResponseTarget(posterior)
+    except ValueError:
+        measured = likelihood.measurements
+        likelihood = likelihood.with_noise(GaussianNoise(measured.channels))
+        levels = dict(zip(likelihood.noise.parameter_names, measured.root_mean_squares, strict=True))
+        known = posterior.prior.subset(likelihood.model.parameter_names).distributions
+        posterior = Posterior(likelihood, known | {name: HalfNormal(float(rms)) for name, rms in levels.items()})
+        target = ResponseTarget(posterior)
+    search = find_modes(posterior, starts=1, max_simulations=limit)
+    if posterior is not given:
+        stage.count(_made(posterior))
+    return target, search.modes[0] if search.modes else None, search.simulations
+
+
+def _shift(change: np.ndarray, slopes: np.ndarray, sigma: np.ndarray, widths: Sequence[float]) -> np.ndarray:
+    """Change of the parameters (n,) in standard deviations, for a change of the response (n_channels, n_steps)."""
+    used = sigma > 0.0
+    jacobian = (slopes[:, used] / sigma[used, None]).reshape(len(slopes), -1)
+    wanted = (change[used] / sigma[used, None]).ravel()
+    precision = jacobian @ jacobian.T + np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
+    return np.linalg.lstsq(precision, jacobian @ wanted)[0]

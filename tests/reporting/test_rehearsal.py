@@ -1,0 +1,113 @@
+"""A rehearsal names models that are not repeatable, do not read their motion, or are too coarse for their data."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Record,
+    SimulationFailed,
+    TruncatedNormal,
+    rehearse,
+)
+from fe_likelihoods.problems import table_motion
+from fe_likelihoods.reporting.rehearsal import refuse_chance
+
+MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
+TOP = (Channel("top", "relative displacement", "mm"),)
+TRUE = np.array([1.1, 0.9])
+
+
+def central_differences(theta, record, substeps=1):
+    """Displacement of an oscillator of 0.4 s, with errors of the second order in the step."""
+    omega, step = 2.0 * np.pi / 0.4 * np.sqrt(theta[0]), record.dt / substeps
+    factor = 0.03 * theta[1] * omega * step
+    motion = np.interp(
+        np.arange((record.n_steps - 1) * substeps + 1) / substeps, np.arange(record.n_steps), record.acceleration
+    )
+    u = np.zeros(len(motion) + 1)
+    for i in range(1, len(motion)):
+        u[i + 1] = (2.0 * u[i] - (1.0 - factor) * u[i - 1] - step**2 * (motion[i] + omega**2 * u[i])) / (1.0 + factor)
+    return u[None, :-1][:, ::substeps]
+
+
+def posterior_of(function, noise=0.02):
+    clean = central_differences(TRUE, MOTION, 8)
+    errors = np.random.default_rng(1).standard_normal(clean.shape)
+    measured = Measurements(TOP, MOTION.dt, clean + noise * clean.std() * errors)
+    model = FunctionModel(function, ("stiffness", "damping"), TOP, record=MOTION)
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    return Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.01)})
+
+
+def names(rehearsal):
+    return [finding.name for finding in rehearsal.findings if finding.weight != "remark"]
+
+
+def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
+    made = []
+
+    def fine(theta, record):
+        made.append(1)
+        return central_differences(theta, record, 8)
+
+    found = rehearse(posterior_of(fine), {"weaker": MOTION.scale(0.5)})
+    assert names(found) == [] and found.simulations == len(made) and found.seconds > 0.0
+    assert found.searched > 3.0
+
+
+@pytest.mark.parametrize(("noise", "weight"), [(0.003, "wrong"), (1.5, None)])
+def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise, weight):
+    """The same step is too coarse for precise data, and fine enough for noisy ones."""
+    found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.name]
+    assert [each.weight for each in found] == ([weight] if weight else [])
+    if found:
+        assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
+
+
+def test_a_random_model_is_named_and_a_run_refuses_it():
+    rng = np.random.default_rng(3)
+    posterior = posterior_of(lambda theta, record: central_differences(theta, record) * (1.0 + 0.02 * rng.normal()))
+    assert names(rehearse(posterior)) == ["The model is not repeatable"]
+    with pytest.raises(ValueError, match="not repeatable: Two simulations of the same parameters differ by"):
+        refuse_chance(posterior)
+    refuse_chance(posterior_of(central_differences))
+
+
+def test_a_motion_that_is_not_read_is_named():
+    unread = posterior_of(lambda theta, record: central_differences(theta, MOTION)[:, : record.n_steps])
+    assert names(rehearse(unread, {"double": MOTION.scale(2.0)})) == ["The motion changes nothing"]
+
+    def amplitude_alone(theta, record):
+        scale = np.abs(record.acceleration).max() / np.abs(MOTION.acceleration).max()
+        return scale * central_differences(theta, MOTION)
+
+    found = names(
+        rehearse(posterior_of(amplitude_alone), {"shifted": Record("shifted", 0.01, np.roll(MOTION.acceleration, 40))})
+    )
+    assert "The response does not follow the motion" in found and "An event changes nothing" in found
+
+
+def test_failures_and_sizes_are_named():
+    def weak(theta, record):
+        if np.abs(record.acceleration).max() > 10.0:
+            raise SimulationFailed("no convergence")
+        return central_differences(theta, record, 4)
+
+    assert "A stronger motion fails" in names(rehearse(posterior_of(weak)))
+    model = LinearOscillator(MOTION.scale(9.80665), 0.4)  # a motion in g, taken for m/s², and then for g again
+    values = LinearOscillator(MOTION, 0.4).simulate(TRUE)
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
+    likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values))
+    prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
+    found = names(rehearse(Posterior(likelihood, prior)))
+    assert "A size is not plausible" in found and "A unit may be wrong" in found
+    failing = posterior_of(lambda theta, record: 1 / 0)
+    with pytest.raises(ValueError, match="mean of the prior has failed"):
+        rehearse(failing)
