@@ -212,7 +212,7 @@ def test_check_says_what_was_read_and_what_a_run_costs(folder):
     made = int(re.search(r"This check made (\d+) simulations", output)[1])
     stored = SimulationCache(folder / "results-oscillator" / "simulations.sqlite").info().simulations
     assert 20 < stored <= made
-    assert {path.name for path in (folder / "results-oscillator").iterdir()} == {"simulations.sqlite"}
+    assert all(path.name.startswith("simulations.sqlite") for path in (folder / "results-oscillator").iterdir())
     call("run", "oscillator.toml", "--quiet")  # uses the folder and what it has
     assert (folder / "results-oscillator" / "report.html").exists()
     (folder / "other").mkdir()
