@@ -302,8 +302,8 @@ def read_v2(
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
         raise ValueError(
-            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; choose "
-            f"with channel= and member= among\n  {listing}"
+            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
+            f"choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  {listing}"
         )
     series = at2_v2_formats.parse_v2(chosen[0])
     record = _record(series, None, chosen[0].file, series.title, resample)
