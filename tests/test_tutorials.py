@@ -352,12 +352,14 @@ def test_isolated_bridge_writes_its_tables(bridge):
 
 
 def test_isolated_bridge_draws_the_figures_of_the_paper(bridge):
+    assert (bridge / "fig2_scheme_and_channels.png").is_file()
     summary = json.loads((bridge / "summary.json").read_text())
     truth = list(summary["truth"].values())
     parameters, misfit = read_figure(bridge, "fig5_parameters_and_fit").axes
     position, values = line(parameters, "truth (synthetic)")
     assert list(values) == truth and all(inside(parameters, x, y) for x, y in zip(position, values, strict=True))
-    assert len(parameters.get_xticklabels()) == 10 and len(misfit.get_xticklabels()) == 6
+    assert [label.get_text() for label in parameters.get_xticklabels()][-1] == "sigma"
+    assert len(parameters.get_xticklabels()) == 11 and len(misfit.get_xticklabels()) == 6
     assert misfit.get_yscale() == "log" and misfit.get_ylabel() == "misfit J [-]"
 
     marginals = read_figure(bridge, "fig6_marginals").axes

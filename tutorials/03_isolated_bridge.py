@@ -6,8 +6,8 @@ The second system is a rigid deck on two flexible piers on a shake table. Betwee
 with velocity-dependent friction, rubber devices and fluid dampers. Ten multiples of nominal values of friction and
 dampers and one noise level are sampled by TMCMC (Ching & Chen, 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)) with
 1000 samples per stage. The script follows a published study of the shake-table tests of Tsopelas et al. (1994, report
-NCEER-94-0002) and draws its Figures 5 to 7. It also propagates the uncertainty to motions that were not used, and
-compares two model classes by their evidence.
+NCEER-94-0002) and draws its Figures 2, 3 and 5 to 7. It also propagates the uncertainty to motions that were not used,
+and compares two model classes by their evidence.
 
 **The data are synthetic and the nominal values are assumed**: neither the measurements nor most of the values of the
 tested bridge are public. The data are responses of the model at parameters that differ from the nominal ones, under a
@@ -107,6 +107,8 @@ names, n_structural = posterior.parameter_names, len(model.parameter_names)
 truth = np.array([problems.ISOLATED_BRIDGE_TRUTH[args.data][name] for name in model.parameter_names])
 print(measured.description)
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
+figure = model.plot_scheme().figure  # Figures 2 and 3 of the study: the bridge and its instrumentation
+figure.savefig(args.out / "fig2_scheme_and_channels.png", dpi=150)
 if args.preset == "fast":
     print("REDUCED SETTING (fast): few samples and long time steps; these numbers are not results")
 
@@ -167,7 +169,9 @@ plot_run(sampler).savefig(args.out / "run.png", dpi=150)
 # Figure 5: parameters, and fit of every sample
 # ---------------------------------------------
 #
-# J is the sum of squared residuals of a channel divided by the sum of squares of the measured channel.
+# J is the sum of squared residuals of a channel divided by the sum of squares of the measured channel. Sigma, the level
+# of the noise, is drawn as a multiple of its true value; with ``--noise channel`` every channel has one, in its own
+# unit, and they are in the table only.
 
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 rng = np.random.default_rng(args.seed)
@@ -176,12 +180,15 @@ nominal_fit = fit_measures(posterior, np.ones((1, n_structural)))[0]
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.6), layout="constrained")
 few = samples[rng.choice(len(samples), min(500, len(samples)), replace=False)]
-for i in range(n_structural):
-    left.plot(i + rng.uniform(-0.16, 0.16, len(few)), few[:, i], ".", color=BLUE, alpha=0.15, markersize=3)
+shown = n_structural + ("sigma" in names)
+nominal = np.ones(shown)
+nominal[n_structural:] = problems.ISOLATED_BRIDGE_NOISE[args.data]
+for i in range(shown):
+    left.plot(i + rng.uniform(-0.16, 0.16, len(few)), few[:, i] / nominal[i], ".", color=BLUE, alpha=0.15, markersize=3)
 left.errorbar(
-    range(n_structural),
-    moments.mean[:n_structural],
-    moments.sd[:n_structural],
+    range(shown),
+    moments.mean[:shown] / nominal,
+    moments.sd[:shown] / nominal,
     fmt="_",
     color="k",
     capsize=5,
@@ -190,7 +197,7 @@ left.errorbar(
 )
 left.plot(range(n_structural), truth, "x", color=ORANGE, markersize=8, label="truth (synthetic)")
 left.axhline(1.0, color=GREY, linewidth=0.8, linestyle="--", label="nominal (assumed)")
-left.set_xticks(range(n_structural), names[:n_structural], rotation=30)
+left.set_xticks(range(shown), names[:shown], rotation=30)
 left.set(ylabel="multiple of the nominal value [-]", title="Calibrated model parameters")
 left.legend(frameon=False, fontsize="small")
 for j in range(fit.shape[1]):

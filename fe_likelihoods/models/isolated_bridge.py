@@ -46,6 +46,7 @@ from .validation import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
@@ -372,6 +373,12 @@ class IsolatedBridge(ThreadedModel):
         nominal = np.array(list(self.nominal.values()))
         physical = np.asarray(thetas, dtype=float) * nominal
         return physical[..., _EXCHANGED] / nominal
+
+    def plot_scheme(self, axes: Axes | None = None) -> Axes:
+        """Plot the bridge and its channels (`fe_likelihoods.plots.structures.plot_bridge`)."""
+        from ..plots.structures import plot_bridge
+
+        return plot_bridge(self, axes)
 
     def plot_hysteresis(self, theta: np.ndarray) -> Figure:
         """Plot isolator force against bearing displacement of both piers at `theta`."""

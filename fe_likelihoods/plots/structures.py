@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..models.base import History
+    from ..models.isolated_bridge import IsolatedBridge
     from ..models.rc_column import RCColumn
     from ..models.rc_column_parts import Patches
 
-__all__ = ["plot_bearing_loops", "plot_column_loops", "plot_section", "plot_sensors"]
+__all__ = ["plot_bearing_loops", "plot_bridge", "plot_column_loops", "plot_section", "plot_sensors"]
 
 _CORE = "#b9cfe4"
 
@@ -192,6 +193,66 @@ def plot_column_loops(column: RCColumn, history: History) -> Figure:
     left.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3))
     figure.suptitle(column.loading.name, fontsize="small")
     return figure
+
+
+def plot_bridge(bridge: IsolatedBridge, axes: Axes | None = None) -> Axes:
+    """Plot the scheme of the isolated bridge with its channels: deck, bearings, blocks, piers and table.
+
+    Widths are not to scale; heights are.
+
+    Parameters
+    ----------
+    bridge : IsolatedBridge
+        The bridge, such as `fe_likelihoods.IsolatedBridge`.
+    axes : matplotlib Axes, optional
+        Where to draw. Default: a new figure.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes with the figure; heights in metres.
+    """
+    from matplotlib.patches import Rectangle
+
+    axes = new_axes(axes, (8.4, 4.6))
+    length, block = (max(getattr(pier, name) for pier in bridge.piers) for name in ("length", "height"))
+    gap, deck = 0.12 * length, 0.25 * length
+    under = length + block + gap
+    positions = (-1.0, 1.0)
+    axes.add_patch(Rectangle((-1.8, -0.08 * length), 3.6, 0.08 * length, facecolor="0.6"))
+    axes.add_patch(Rectangle((-1.6, under), 3.2, deck, facecolor="0.8", edgecolor="0.5"))
+    for x, pier in zip(positions, bridge.piers, strict=True):
+        top = pier.length + pier.height
+        axes.plot([x, x], [0.0, pier.length], color="0.4", linewidth=4.0, zorder=1)
+        axes.add_patch(Rectangle((x - 0.3, pier.length), 0.6, pier.height, facecolor="#e9ebee", edgecolor="0.5"))
+        axes.add_patch(Rectangle((x - 0.12, top), 0.1, under - top, facecolor=BLUE))  # slider
+        axes.add_patch(Rectangle((x + 0.02, top), 0.1, under - top, facecolor=ORANGE))  # rubber and damper
+    above, at_top, at_foot = under + 0.5 * gap, length + 0.5 * block, 0.25 * length
+    places = {"Ud": (0.0, under + 0.7 * deck), "acc_d": (0.0, under + 0.3 * deck)}
+    heights = {
+        "Ub": above,
+        "Fb": above - gap,
+        "drift": at_top - 0.2 * gap,
+        "acc_p": at_top - 1.2 * gap,
+        "shear": at_foot,
+    }
+    for kind, height in heights.items():
+        places[f"mean_{kind}"] = (0.0, height)
+        for i, x in enumerate(positions, 1):
+            name = f"{kind}{i}" if kind == "acc_p" else f"{kind}_{i}"
+            places[name] = (x + (0.36 if kind != "shear" else 0.08), height)
+    for channel in bridge.channels:
+        x, height = places[channel.name]
+        align = "center" if x == 0.0 else "left"
+        axes.text(x, height, f"{channel.name} [{channel.unit}]", ha=align, va="center", fontsize="small")
+    axes.annotate("", (0.5, -0.16 * length), (-0.5, -0.16 * length), arrowprops={"arrowstyle": "<->", "color": GREY})
+    axes.text(0.6, -0.16 * length, "table acceleration", va="center", fontsize="small")
+    axes.set(xlim=(-2.0, 2.0), ylim=(-0.25 * length, 1.05 * (under + deck)), ylabel="height above the table [m]")
+    axes.set_title("blue: sliding bearings; orange: rubber devices and dampers", fontsize="small")
+    axes.set_xticks(positions, ["pier 1", "pier 2"])
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    return axes
 
 
 def plot_bearing_loops(history: History) -> Figure:

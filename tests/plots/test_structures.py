@@ -7,6 +7,7 @@ import pytest
 
 from fe_likelihoods import Bars, plot_sensors
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
+from fe_likelihoods.models.isolated_bridge_channels import CHANNELS
 from fe_likelihoods.models.rc_column import Patches, RCColumn
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.records import DisplacementHistory
@@ -119,3 +120,15 @@ def test_labels_are_beside_their_sensors():
     foot = plot_sensors(RCColumn.lhpost(record, outputs=("base_moment", "base_shear", "strain@0.3:0.5")))
     heights = sorted(text.get_position()[1] for text in foot.texts)
     assert heights[0] == 0.0 and heights[-1] < 0.11 * 7.3152
+
+
+def test_the_scheme_of_the_bridge_names_every_channel_at_its_pier():
+    names, record = tuple(CHANNELS), isolated_bridge_data().record
+    axes = IsolatedBridge(record, outputs=names).plot_scheme()
+    places = {text.get_text().split(" [")[0]: text.get_position() for text in axes.texts}
+    assert set(names) <= set(places)
+    assert places["Ub_1"][0] < 0.0 < places["Ub_2"][0]
+    assert places["shear_1"][1] < places["drift_1"][1] < places["Ub_1"][1] < places["acc_d"][1]
+    assert places["mean_Ub"][0] == 0.0
+    few = IsolatedBridge(record, outputs=5).plot_scheme()
+    assert "Ub_2" not in " ".join(text.get_text() for text in few.texts)
