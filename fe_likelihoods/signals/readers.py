@@ -303,7 +303,8 @@ def read_v2(
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
         raise ValueError(
             f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
-            f"choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  {listing}"
+            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
+            f"{listing}"
         )
     series = at2_v2_formats.parse_v2(chosen[0])
     record = _record(series, None, chosen[0].file, series.title, resample)
