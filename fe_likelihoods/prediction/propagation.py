@@ -58,6 +58,7 @@ from .transfer_checks import (
     is_first_warning,
     remark_on_level,
     remark_on_peaks,
+    remark_on_same_response,
     remark_on_white_peaks,
     remarks_on_calibration,
     sample_to_check,
@@ -244,6 +245,7 @@ def propagate(
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     calibration = source = read_source(posterior_or_model, pool)
     complete, assumed, other = samples, "", record is not None or model is not None
+    moved = record is not None and model is None  # the calibrated model under another motion
     if model is not None:
         source, samples, assumed = predict_channels_of(model, source, samples, noise)
     thetas, sample_noise = split_samples(source, samples, noise, record is not None)
@@ -299,14 +301,17 @@ def propagate(
         stored = StoredResponses(model, source.executor, cache)
     peaks = Peaks()
     checked = sample_to_check(calibration, complete) if check else None
-    own_response = None  # of the checked sample to the excitation of the calibration
+    own_response = other_response = None  # of the checked sample to the excitation of the calibration, and to another
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor, stored)
             for accumulator in accumulators.values():
                 accumulator.add(start, responses, reasons)
-            if checked is not None and not other and 0 <= (row := row_of_sample[checked] - start) < len(responses):
-                own_response = None if reasons[row] else responses[row].copy()
+            if checked is not None and 0 <= (row := row_of_sample[checked] - start) < len(responses):
+                if not reasons[row] and not other:
+                    own_response = responses[row].copy()
+                elif not reasons[row] and moved and state == "virgin":
+                    other_response = responses[row].copy()
             if other or noise is True:
                 peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
@@ -326,7 +331,9 @@ def propagate(
         remarks.append(remark_on_white_peaks(predictions.values(), peaks, source))
     if checked is not None and (other or own_response is not None):
         names = (*calibration.model.parameter_names, *calibration.noise.parameter_names)
-        of_calibration = remarks_on_calibration(calibration, as_points(complete, names)[checked], own_response)
+        point = as_points(complete, names)[checked]
+        of_calibration = remarks_on_calibration(calibration, point, own_response)
+        remarks.append(remark_on_same_response(calibration, excitation.model, point, other_response))
     of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
     known_already = [of_gaps]  # the likelihood has warned of gaps, and an earlier prediction of the residuals
     if of_calibration and not is_first_warning(source.likelihood):

@@ -23,6 +23,7 @@ from ..noise.residuals import effective_samples, innovations, residual_checks
 from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.events import find_events
+from ..signals.records import Record
 from ..simulation.faults import ChangedModel
 from .inputs import PredictionSource
 from .prediction import Prediction
@@ -36,6 +37,7 @@ __all__ = [
     "is_first_warning",
     "remark_on_level",
     "remark_on_peaks",
+    "remark_on_same_response",
     "remark_on_white_peaks",
     "remarks_on_calibration",
 ]
@@ -50,6 +52,7 @@ _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and 
 _LARGEST_ADDED_PEAK = 1.1  # median peak with white errors, as a multiple of the median response peak
 _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the response is too large
 _WORSE = 1.1  # RRMSE of the response divided by the RRMSE of its best multiple, beyond which this is said
+_SAME = 1e-6  # difference of two responses, relative to their norm, up to which a motion changes nothing
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
 # remarks on the residuals of each likelihood, and the likelihoods for which a warning was given
@@ -278,6 +281,51 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
     )
     _FOUND[likelihood] = tuple(filter(None, remarks))
     return _FOUND[likelihood]
+
+
+def remark_on_same_response(
+    source: PredictionSource, other: Any, point: np.ndarray, response: np.ndarray | None
+) -> str:
+    """Remark if the response to another motion equals the one to the motion of the calibration; empty if not.
+
+    The first samples of both are compared, unless the motions have the same first samples.
+
+    Parameters
+    ----------
+    source : PredictionSource
+        The calibration, with a likelihood.
+    other : Model
+        The model under the other motion, from its virgin state.
+    point : (ndim,) ndarray
+        A sample of all parameters.
+    response : (n_channels, n_steps) ndarray, or None
+        Its response to the other motion [SI]. None: nothing is compared.
+    """
+    if response is None or other.fingerprint == source.model.fingerprint:
+        return ""
+    motions = [_motion(model) for model in (source.model, other)]
+    if all(each is not None for each in motions):
+        n = min(len(each) for each in motions)
+        if np.array_equal(motions[0][:n], motions[1][:n]):  # a part of the calibration, or more of it
+            return ""
+    known = _response(source.likelihood, point[: len(source.model.parameter_names)])
+    if known is None:
+        return ""
+    n = min(known.shape[1], response.shape[1])
+    if np.linalg.norm(known[:, :n] - response[:, :n]) > _SAME * np.linalg.norm(known[:, :n]):
+        return ""
+    return (
+        "this motion changes nothing: the response equals the response to the motion of the calibration, so that the "
+        "prediction repeats the calibration. Check that the model reads the motion that it is given, not one file that "
+        "is always the same (rehearse, or `fe-likelihoods check`, finds this before a run)"
+    )
+
+
+def _motion(model: Any) -> np.ndarray | None:
+    """Accelerations (n_steps, ...) of the motion of a model; None where they are not known."""
+    supports = getattr(model, "supports", ()) or [getattr(model, name, None) for name in ("record", "loading")]
+    found = [each.acceleration for each in supports if isinstance(each, Record)]
+    return np.stack(found, axis=-1) if found else None
 
 
 def is_first_warning(likelihood: Any) -> bool:

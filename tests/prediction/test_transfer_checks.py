@@ -10,6 +10,7 @@ from fe_likelihoods import (
     AutoregressiveNoise,
     Channel,
     FELikelihood,
+    FunctionModel,
     GaussianNoise,
     HalfNormal,
     HierarchicalPosterior,
@@ -18,6 +19,7 @@ from fe_likelihoods import (
     LogNormal,
     Measurements,
     Posterior,
+    Record,
     StoredPosterior,
     Uniform,
     Varying,
@@ -155,6 +157,29 @@ def test_correlated_residuals_under_white_noise_are_said_once(rng):
     other, _ = calibrated(np.random.default_rng(5), rho=0.9)
     assert not said(propagate, other, samples[:, :1])  # nothing is known of the noise
     assert not said(propagate, other, other.sample_prior(100, 1), noise=True)  # draws of the prior do not fit
+
+
+def test_a_motion_that_changes_nothing_is_said(rng):
+    """As of a program that reads one file, whatever motion it is given."""
+    motion = Record("calibration", DT, excitation(rng))
+    noise = SIGMA * rng.standard_normal((1, N))
+
+    def predicted(unread, record):
+        def respond(theta, given):
+            read = motion if unread else given
+            return theta[0] * lfilter([0.01], [1.0, -1.9, 0.98], read.acceleration)[None, : given.n_steps]
+
+        model = FunctionModel(respond, ("gain",), (TOP,), record=motion)
+        likelihood = FELikelihood(model, Measurements([TOP], DT, respond([1.0], motion) + noise))
+        samples = np.column_stack([rng.normal(1.0, 0.01, 20), np.full(20, SIGMA)])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return propagate(likelihood, samples, record=record, from_state="virgin", progress=False).remarks
+
+    said = [any("changes nothing" in each for each in predicted(unread, motion.scale(1.2))) for unread in (True, False)]
+    assert said == [True, False]
+    for same in (motion, motion.trim(0.0, 6.0)):  # the calibration again, and a part of it
+        assert not any("changes nothing" in each for each in predicted(False, same))
 
 
 @pytest.mark.parametrize("kind", ("effective samples", "autoregressive"))
