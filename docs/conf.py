@@ -45,7 +45,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
-    "filename_pattern": r"/(0[1-5]|1[01])_",  # executed
+    "filename_pattern": r"/(0[1-5]|1[0-9])_",  # executed
     "ignore_pattern": r"^[a-z_]+\.py$",  # modules that tutorials share
     "within_subsection_order": "FileNameSortKey",
     "reset_argv": "building.tutorial_arguments",

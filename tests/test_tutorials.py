@@ -634,6 +634,29 @@ def test_many_events_predict_new_ones(tmp_path):
         assert len(read_figure(tmp_path, name).axes) >= 2
 
 
+# 13
+
+
+def test_damaged_storeys_are_found_and_a_colder_building_causes_no_alarm(tmp_path):
+    """The storey, its loss and the temperature are found; two calibrations alone have wrong intervals for others."""
+    output = run_tutorial("13_stiffness_loss.py", "--out", str(tmp_path))
+    assert "REDUCED SETTING" in output and "P(any loss above 10 %)" in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert max(summary["simulations"].values()) < 150, "both states together below 800"
+    assert summary["presence"]["after"] > 0.95 and summary["presence"]["control"] < 0.1
+    assert np.argmax(summary["probability"]) == np.argmax(summary["location"]) == 2
+    assert np.delete(summary["probability"], 2).max() < 0.1
+    assert summary["median"][2] == pytest.approx(summary["truth"][2], abs=0.04)
+    assert summary["common"] == pytest.approx(0.97, abs=0.02) and summary["error"] > 1.0
+    losses = read_figure(tmp_path, "losses").axes
+    assert [axes.get_title().split(":")[0] for axes in losses] == ["after"] * 2 + ["colder, no damage"] * 2
+    assert losses[0].get_ylabel() == "stiffness loss [%]"
+    np.testing.assert_allclose(line(losses[0], "truth")[1], 100.0 * np.array(summary["truth"]))
+    (probabilities,) = read_figure(tmp_path, "probabilities").axes
+    heights = [bar.get_height() for bar in probabilities.patches]
+    np.testing.assert_allclose(heights[: len(heights) // 2], summary["probability"])
+
+
 # the data, and the form of the scripts
 
 
