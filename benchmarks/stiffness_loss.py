@@ -46,6 +46,7 @@ _NAMES = tuple(f"k_{k + 1}" for k in range(STOREYS))
 _NOISE, _SCATTER, _COMMON = 0.05, 0.01, 0.03
 _MASSES, _RATIOS, _DAMPING, _SOFT = 0.03, 0.15, 0.03, 0.02
 _PRIOR_SD = 0.2
+_MOST = 400  # simulations of a calibration
 _DRAWS = 5000  # of a Laplace approximation
 _BINS = np.array([0.0, 0.02, 0.05, 0.15, 0.35, 0.65, 0.85, 0.95, 1.001])
 
@@ -123,7 +124,7 @@ def posterior_of(values: np.ndarray, motion: int) -> Posterior:
 def calibrate(values: np.ndarray, motion: int, seed: int) -> dict:
     """Mean and covariance of the logarithms at the highest mode, simulations and concerns."""
     posterior = posterior_of(values, motion)
-    search = find_modes(posterior, starts=4, seed=seed)
+    search = find_modes(posterior, starts=4, seed=seed, max_simulations=_MOST)
     found = StoredPosterior.from_search(search, posterior, _DRAWS)
     logs = np.log(found.samples[:, :STOREYS])
     return {
@@ -226,6 +227,7 @@ class LossRow(NamedTuple):
 
     case: str
     simulations: float
+    most_simulations: float
     brier: float
     brier_of_base_rate: float
     brier_presence: float
@@ -239,7 +241,7 @@ class LossRow(NamedTuple):
     concerned: int
 
 
-def _row(case: str, simulations: float, found: Findings) -> LossRow:
+def _row(case: str, simulations: list[float], found: Findings) -> LossRow:
     true, alarm = found.loss > LIMIT, found.presence > 0.5
     level = 0.1 * (np.arange(len(true)) % 4)
     damaged = alarm & (level > 0.0)
@@ -249,7 +251,8 @@ def _row(case: str, simulations: float, found: Findings) -> LossRow:
     base = float(true.mean())
     return LossRow(
         case,
-        simulations,
+        float(np.mean(simulations)),
+        float(np.max(simulations)),
         float(np.mean((found.probability - true) ** 2)),
         base * (1.0 - base),
         float(np.mean((found.presence - true.any(axis=1)) ** 2)),
@@ -277,7 +280,7 @@ def stiffness_losses(
     found = calibrations(twins, Path(file))
     drawn = {}
     for after in ("same", "other"):
-        simulations = float(np.mean([each["before"]["simulations"] + each[after]["simulations"] for each in found]))
+        simulations = [each["before"]["simulations"] + each[after]["simulations"] for each in found]
         for what, options in (("", {}), (", errors as stated", {"error": 1.0}), (", calibrations alone", None)):
             case = f"{after} motion{what}"
             drawn[case] = without_structure(found, after) if options is None else find_losses(found, after, **options)
@@ -298,6 +301,7 @@ def draw_reliability(found: dict[str, Findings]) -> "Figure":
         for x, y, count in zip(mean, share, n, strict=True):
             axes.annotate(f"{count:.0f}", (x, y), xytext=(4.0, -10.0), textcoords="offset points", fontsize=7.0)
         axes.set_title(case, fontsize=9.0)
+        axes.set_ylim(-0.05, 1.05)
     picture.supxlabel("stated probability of a loss above 10 %")
     picture.supylabel("share of storeys with such a loss")
     return picture

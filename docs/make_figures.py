@@ -44,6 +44,7 @@ FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
         "fig7_predictions": "bridge_prediction",
     },
     "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
+    "13_stiffness_loss.py": {"losses": "stiffness_losses"},
 }
 WIDEST = 1100  # pixels
 LARGEST = 145 * 1024  # bytes

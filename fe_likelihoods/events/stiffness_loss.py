@@ -156,8 +156,8 @@ def stiffness_loss(
     Raises
     ------
     ValueError
-        If a stiffness is unknown, not positive or constant, has a joint prior with other parameters, or an argument is
-        out of range.
+        If a stiffness is unknown, not positive or constant, has a joint prior with other parameters, an argument is out
+        of range, or there are fewer effective samples than stiffnesses and three more.
 
     Examples
     --------
@@ -217,9 +217,11 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     if constant := [name for name, each in zip(names, np.diag(covariance), strict=True) if not each > 0.0]:
         raise ValueError(f"stiffness_loss: all samples have the same value of {', '.join(constant)}")
     doubts = list(stored.concerns)
-    if n < max(_FEWEST_SAMPLES * d, d + 3):
+    if n < d + 3:
+        raise ValueError(f"stiffness_loss: {d} stiffnesses need at least {d + 3} effective samples; got {n:.0f}")
+    if n < _FEWEST_SAMPLES * d:
         doubts.append(f"the covariance of {d} stiffnesses is estimated from {n:.0f} effective samples")
-    covariance *= (n - 1.0) / max(n - d - 2.0, 1.0)  # so that its inverse is right on average
+    covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average
     center, prior_covariance = _prior_moments(prior)
     factor = np.linalg.cholesky(prior_covariance)
     whitened = np.linalg.solve(factor, np.linalg.solve(factor, covariance).T)

@@ -288,6 +288,8 @@ def test_few_samples_and_shapes_that_are_not_normal_are_concerns():
     few = StoredPosterior(after.samples[:25], after.prior)
     (text,) = stiffness_loss(before, few, NAMES, **KNOWN).concerns
     assert "6 stiffnesses is estimated from 25 effective samples" in text
+    with pytest.raises(ValueError, match="6 stiffnesses need at least 9 effective samples; got 8"):
+        stiffness_loss(before, StoredPosterior(after.samples[:8], after.prior), NAMES)
     split = after.samples.copy()
     split[::2, 0] *= 1.5
     (text,) = stiffness_loss(before, StoredPosterior(split, after.prior), NAMES, **KNOWN).concerns
