@@ -113,6 +113,8 @@ class StoredPosterior:
     def from_search(cls, search: "ModeSearch", posterior: Any, n: int = 5000, seed: int = 0) -> "StoredPosterior":
         """Draws of the Laplace approximation at the highest mode of a search: few simulations, and no check of it.
 
+        Variances along a curved ridge are too small, and nothing in the search shows it (``docs/stiffness_loss.rst``).
+
         Parameters
         ----------
         search : ModeSearch
