@@ -33,6 +33,7 @@ NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, as a shar
 FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
 SMALL_PROBABILITY = 0.01
 USELESS_ERROR = 1.2  # RRMSE of a fit that is clearly worse than a response of zero
+MISSED = 0.7  # error of another response, as a share of the error of the fit, from which the fit is not the best one
 FAR_ERROR = 0.9  # RRMSE of the best of several draws of the prior, from which the prior does not reach the data
 MOST_DRAWS, FEWEST_DRAWS = 100, 5
 SECONDS = 10.0  # of simulations of these draws
@@ -317,17 +318,27 @@ def _of_a_fault(compared: Compared, fault: Fault) -> Finding:
 
 def _of_the_errors(compared: Sequence[Compared], explained: bool) -> list[Finding]:
     """Channels that the fit, or the best of several draws of the prior, does not reproduce."""
+    found: list[Finding] = []
     useless, poor, far = [], [], []
     for each in compared:
         errors = _errors_of(each)
-        best = errors[0] if each.fitted else errors[int(np.argmin(np.log(np.maximum(errors, 1e-3)).mean(axis=1)))]
+        levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
+        closest = int(np.argmin(levels))
+        best = errors[0 if each.fitted else closest]
+        if each.fitted and levels[closest] < MISSED * levels[0] and (errors[0] > LARGE_ERROR).any():
+            where = f" ({each.title})" if each.title else ""
+            text = (
+                f"Another response that was simulated fits much better{where}: its error (RRMSE) is "
+                f"{_percent(levels[closest])}, and {_percent(levels[0])} at the fit (geometric means of the channels)."
+            )
+            action = "The sampler or the search may have missed the best fit, or the noise prefers another one."
+            found.append(Finding("The fit is not the best one known", CARE, text, action))
         for channel, error in zip(each.measurements.channels, best, strict=True):
             text = f"{channel.name}{f' ({each.title})' if each.title else ''} ({_percent(error)})"
             if not each.fitted:
                 far += [text] if error > FAR_ERROR else []
             elif error > LARGE_ERROR:
                 (useless if error > USELESS_ERROR else poor).append(text)
-    found = []
     action = (
         "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
         "the model before you interpret the parameters."

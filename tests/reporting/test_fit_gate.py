@@ -106,6 +106,22 @@ def test_the_fault_of_one_event_is_named_with_it():
     assert "(EQ2)" in found.sentence and "m and mm" in found.sentence
 
 
+def test_a_fit_that_another_response_beats_is_named():
+    posterior = Posterior(FELikelihood(LinearOscillator(MOTION), _oscillation()), _prior())
+    points = draws_to_compare(posterior)[:20]
+    good = np.array([1.05, 1.0, *points[0, 2:]])
+    (compared,) = compare(posterior.likelihood, np.stack([good, *points]), True)
+    assert fit_gate([compared]) == ()
+    poor = np.array([1.9, 0.4, *points[0, 2:]])
+    (compared,) = compare(posterior.likelihood, np.stack([poor, good, *points]), True)
+    found = {each.name: each for each in fit_gate([compared])}
+    assert "its error (RRMSE) is 5" in found["The fit is not the best one known"].sentence
+    assert "The model does not follow the measurements" in found and not {
+        "A unit may be wrong",
+        "Clocks may differ",
+    } & {*found}
+
+
 def test_what_a_guide_has_simulated_is_compared_as_well():
     model, measured = deck()
     posterior = Posterior(FELikelihood(model, measured), DECK | {"sigma_deck": HalfNormal(1.0)})
