@@ -143,12 +143,13 @@ def _say_cost(
 
     estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
     if guided and np.isfinite(rehearsal.searched):
-        # eight starts, of which later ones often join earlier ones, and draws until these are worth the walkers
-        low, high = 2.0 * rehearsal.searched + sampler.nwalkers, 8.0 * rehearsal.searched + 3.0 * sampler.nwalkers
+        # later starts often join earlier ones; rough responses take several rounds of draws
+        fewest = 2.0 * rehearsal.searched + sampler.nwalkers
         say(
             f"The run uses a guide: a search from one start took {rehearsal.searched:.0f} simulations, so that the run "
-            f"takes roughly {low:.0f} to {high:.0f}; {high:.0f} take {estimate.time_of(high)}, to which the guide adds "
-            "its own computations, half a minute for 7 parameters"
+            f"needs at least about {fewest:.0f}, and up to several times as many if the response is rough; "
+            f"{5.0 * fewest:.0f} take {estimate.time_of(5.0 * fewest)}, to which the guide adds its own computations, "
+            "half a minute for 7 parameters"
         )
     elif guided:
         say(
