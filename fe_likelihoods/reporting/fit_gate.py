@@ -235,7 +235,7 @@ def fit_gate(compared: Sequence[Compared], rows: Sequence[ParameterRow] = ()) ->
     """
     found: list[Finding] = []
     for each in compared:
-        faults = find_faults(each.measurements, each.responses, each.parts)
+        faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
         found += [_of_a_fault(each, fault) for fault in faults]
     found += _of_the_errors(compared, bool(found))
     return (*found, *_of_the_prior(rows), *_of_the_truth(rows))

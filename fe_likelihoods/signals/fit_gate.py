@@ -9,7 +9,7 @@ errors relative to y are, with the correlation rho of y and r about zero, ::
     e = |y - r| / |y|,    e(factor) = sqrt(1 - rho^2),    e(sign) = |y + r| / |y|,    e(lag) = |y(t) - r(t - lag)| / |y|
 
 and a hypothesis is named where it reduces the errors of the channels that it concerns to less than 0.6, in their
-geometric mean, of the errors of the best response.
+geometric mean, of the errors of the best response, and to less than 0.7 if the fit is among the responses.
 """
 
 import math
@@ -29,6 +29,7 @@ WRONG = "wrong"
 
 LARGE_ERROR = 0.5  # RRMSE above which a channel is hardly reproduced
 _BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
+_BETTER_THAN_A_FIT = 0.7  # the same, where one of the responses is the fit
 _EXPLAINED = 0.85  # error above which a response explains nothing
 _FLOOR = 0.02  # error below which smaller ones count as equal
 _FACTOR = 1.5  # from which a factor may be one between units
@@ -113,7 +114,11 @@ class _Hypothesis(NamedTuple):
 
 
 def find_faults(
-    measurements: Measurements, responses: np.ndarray, parts: Mapping[str, np.ndarray] | None = None
+    measurements: Measurements,
+    responses: np.ndarray,
+    parts: Mapping[str, np.ndarray] | None = None,
+    *,
+    fitted: bool = False,
 ) -> tuple[Fault, ...]:
     """Faults that explain measurements better than any of the responses does without them.
 
@@ -126,6 +131,8 @@ def find_faults(
     parts : mapping of str to (n, n_channels, n_samples) float, optional
         Part of each response that the motion of one support causes, by the name of the support; the parts of a linear
         structure add up to its response.
+    fitted : bool
+        Whether one of the responses is the fit. Its error is small if there is no fault, so that a smaller gain counts.
 
     Returns
     -------
@@ -153,6 +160,7 @@ def find_faults(
     pieces = {name: of_channels(np.asarray(each, dtype=float)) for name, each in (parts or {}).items()}
     chosen = _closest(measured, current)
     current, pieces = current[chosen], {name: each[chosen] for name, each in pieces.items()}
+    better = _BETTER_THAN_A_FIT if fitted else _BETTER
     found: list[Fault] = []
     while len(found) < _MOST_FAULTS:
         errors = _errors(measured, current)
@@ -167,7 +175,7 @@ def find_faults(
                 for e in (errors[best], each.errors[row])
             )
             gain = float(_score(errors)[best] - _score(each.errors)[row])
-            clear = after < min(_BETTER * before, _EXPLAINED) and gain > -math.log(_BETTER) * len(channels)
+            clear = after < min(better * before, _EXPLAINED) and gain > -math.log(better) * len(channels)
             if clear and _SIMPLE[each.kind] * gain > most and _is_large(each, row, steps):
                 most, explained = _SIMPLE[each.kind] * gain, (each, row, before, after)
         if explained is None:
