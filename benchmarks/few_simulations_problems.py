@@ -26,7 +26,7 @@ from tests import opensees_frame
 from . import many_stiffnesses, tested_column
 from .targets import SHARED
 
-__all__ = ["PROBLEMS", "Problem"]
+__all__ = ["PROBLEMS", "Problem", "oscillator"]
 
 REAL_RECORD = SHARED / "records" / "loma_prieta_1989_apeel2_redwood_city_43.csv"
 
@@ -72,10 +72,10 @@ class Problem(NamedTuple):
     exact: Callable[[Posterior], Any] | None = None
 
 
-def oscillator(seed: int) -> Posterior:
+def oscillator(seed: int, truth: tuple[float, float] = (1.15, 0.8)) -> Posterior:
     """Linear oscillator under the table motion of the isolated bridge, noise of 10 % of the root mean square."""
     model = LinearOscillator(problems.isolated_bridge_data().record, period=0.5)
-    clean = model.simulate(np.array([1.15, 0.8]))
+    clean = model.simulate(np.array(truth))
     rms = np.sqrt(np.square(clean).mean(axis=1, keepdims=True))
     values = clean + 0.1 * rms * np.random.default_rng(seed).standard_normal(clean.shape)
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.5)}
