@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
+from .starts import SEED, compare_with_draws, draws_to_compare, log_integral, spread_by_metropolis
 
 __all__ = ["OptionalAttributes", "UserFunctions"]
 
 logger = logging.getLogger(__name__)
+
+# An integral of the prior that differs from 1 by a factor of less than this, or by less than this many standard errors,
+# is taken as 1; with larger errors, nothing is known.
+FACTOR, ERRORS, LARGEST_ERROR = 1.1, 5.0, 0.3
 
 
 class OptionalAttributes(NamedTuple):
@@ -210,6 +214,22 @@ class UserFunctions(NamedTuple):
         raise ValueError(
             f"initial_state must consist of draws of {density}; got points that cannot be: {compared}{reason}. "
             f"The evidence would be wrong. {remedy}"
+        )
+
+    def check_integral(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> str:
+        """Why the evidence is wrong if the density of the start is not normalised; empty if it is, or if unknown.
+
+        Parameters as for `check_start`.
+        """
+        value, error = log_integral(coords, log_base)
+        if not error < LARGEST_ERROR or abs(value) < max(np.log(FACTOR), ERRORS * error):
+            return ""
+        density = "the log-prior" if self.start_density is None else "start_density"
+        return (
+            f"{density} is not normalised: its density integrates to exp({value:.2f} +- {error:.2f}) over its support, "
+            "in place of 1, and log_evidence may be wrong by as much. The posterior is right. Subtract "
+            f"{value:.4g} from {density} (for a constant in a box, exactly the logarithm of the volume), or do not use "
+            "the evidence"
         )
 
     def _fresh_draws(self, n: int, ndim: int) -> np.ndarray | None:
