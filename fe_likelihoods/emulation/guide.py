@@ -351,7 +351,12 @@ class ResponseGuide:
             )
 
     def _follow_curves(self, session: Any) -> Iterator[None]:
-        """Simulate beyond the ends of a curved posterior until it ends there."""
+        """Simulate beyond the ends of a curved posterior until it ends there.
+
+        It is not begun while the emulator is inaccurate: of a rough response, the emulated posterior is rough as well.
+        """
+        if not self._curves and not self._left_out_error() < _SMOOTH:
+            return
         while self._emulated is not None and self._emulated.curved:
             points = self._emulated.beyond(_ENDS, np.concatenate([self._plausible(), self._beyond]))
             if not len(points):
