@@ -37,6 +37,9 @@ _APART = 0.25  # prior standard deviations in one coordinate from which ends on 
 _APART_OF_ALL = 2.0  # the same, times the number of starts
 _FEW = 6  # parameters whose differences cost about as much as two steps
 UNSEEN = 0.05  # share of starts alone in a mode above which further starts follow
+_FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
+_ENDED = 0.75  # ascents that reached a mode, as a share of the first starts, below which further starts follow as well
+_MOST_FOR_ENDS = 2  # times the number of the first starts, up to which they follow for this reason
 _MOST_STARTS = 4  # times the number of the first ones
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
@@ -125,13 +128,22 @@ def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -
     hessian = np.empty((target.ndim, target.ndim))
     for (i, j), value in zip(pairs, mixed, strict=True):
         hessian[i, j] = hessian[j, i] = value / (steps[i] * steps[j])
+    finite = bool(np.isfinite(hessian).all())
+    if not finite:  # an exact fit, or a likelihood beyond the range of numbers
+        hessian = np.eye(target.ndim)
+        hessian[:d, :d] = np.where(np.isfinite(end.hessian), end.hessian, np.eye(d))
     values, vectors = np.linalg.eigh(hessian)
     values = np.maximum(values, _FLATTEST)
     covariance = (vectors / values) @ vectors.T
     top = float(log_density(at[None])[0])
     log_evidence = top + 0.5 * target.ndim * float(np.log(2.0 * np.pi)) - 0.5 * float(np.log(values).sum())
     parameters = target.parameters(at[None])[0]
-    return Mode(parameters, at, covariance, top, log_evidence, starts, end.converged)
+    return Mode(parameters, at, covariance, top, log_evidence, starts, finite and end.converged)
+
+
+def _leaves_a_direction(search: ModeSearch) -> bool:
+    """Whether the data leave a direction to the prior at the highest mode, as on a ridge."""
+    return bool(search.modes) and np.linalg.eigvalsh(search.modes[0].covariance)[-1] > _FREE
 
 
 class _Part(NamedTuple):
@@ -154,8 +166,10 @@ def search_modes(
 ) -> Generator[float, None, ModeSearch]:
     """Search from given starts, on growing parts of the record where the model offers them.
 
-    Further starts follow the first ones while `unseen_share` is large: while modes that one start alone led to say that
-    others may have been missed.
+    Further starts follow the first ones while `unseen_share` is large (modes that one start alone led to say that
+    others may have been missed). Up to twice as many starts follow while the ascents that have reached a mode are fewer
+    than three quarters of the first starts: ascents that are given up may have been on their way to another mode. Where
+    the data leave a direction to the prior, most are given up because they advance slowly along it.
 
     Parameters
     ----------
@@ -190,7 +204,10 @@ def search_modes(
 
     begins = (0, *range(first, len(starts), _further(first)))
     for begin, following in zip(begins, (*begins[1:], len(starts)), strict=True):
-        if begin and (unseen_share(search) <= UNSEEN or not remember("starts", affordable)[0]):
+        ended = sum(end >= 0 for end in search.ends)
+        few = 0 < ended < _ENDED * first and begin < _MOST_FOR_ENDS * first and not _leaves_a_direction(search)
+        enough = unseen_share(search) <= UNSEEN and not few
+        if begin and (enough or not remember("starts", affordable)[0]):
             break
         fresh = range(begin, following)
         standing_for.extend(fresh)

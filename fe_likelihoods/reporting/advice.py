@@ -14,7 +14,7 @@ from .table import ParameterRow, parameter_rows
 
 __all__ = ["Judgement", "advise", "check_result", "judge", "residual_sentence"]
 
-FEW_SAMPLES = 100.0  # effective, below which the ends of a 90 % interval rest on fewer than five samples each
+FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
 LARGE_FAILURE_SHARE = 0.05
 WEIGHTS = WRONG, CARE, REMARK
