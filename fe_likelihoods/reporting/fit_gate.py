@@ -280,7 +280,9 @@ def _of_a_fault(compared: Compared, fault: Fault) -> Finding:
     better = f"the error (RRMSE) is {_percent(fault.after)} in place of {_percent(fault.before)}"
     which = "measurements" if len(fault.names) > 1 else "measurement"
     if fault.kind == "factor":
-        unit = describe_unit(fault.value)
+        dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
+        units = dict.fromkeys(describe_unit(fault.value, each) for each in dimensions)
+        unit = " or ".join(each for each in units if each)
         ratio = f", about the ratio of {unit}" if unit else ""
         text = (
             f"Responses times {fault.value:.3g} fit the {which} of {names}{where} much better: {better}. The "

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..units import DIMENSIONS, UNITS
 from .channels import Measurements
 
 __all__ = ["CARE", "LARGE_ERROR", "REMARK", "WRONG", "Fault", "Finding", "describe_unit", "find_faults"]
@@ -40,21 +41,7 @@ _MOST_FAULTS = 4
 # share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
 _SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
 _SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-_UNITS = {
-    9.80665: "m/s² and g",
-    980.665: "cm/s² and g",
-    386.09: "in/s² and g",
-    1000.0: "m and mm, or N and kN",
-    100.0: "m and cm",
-    10.0: "cm and mm",
-    25.4: "in and mm",
-    39.37: "m and in",
-    57.296: "rad and degrees",
-    4448.2: "N and kip",
-    6.8948e6: "Pa and ksi",
-    1e6: "Pa and MPa",
-    1e9: "Pa and GPa",
-}
+_EQUALLY_NEAR = 0.01  # difference of logarithms of ratios that are named together
 
 
 class Finding(NamedTuple):
@@ -193,11 +180,23 @@ def find_faults(
     return tuple(found)
 
 
-def describe_unit(factor: float) -> str:
-    """Units whose ratio is about a factor or its inverse, in words; empty if there are none."""
-    ratio = max(factor, 1.0 / factor)
-    nearest = min(_UNITS, key=lambda each: abs(math.log(each / ratio)))
-    return _UNITS[nearest] if abs(math.log(nearest / ratio)) < math.log(_SAME_UNITS) else ""
+def describe_unit(factor: float, dimension: str) -> str:
+    """Units whose ratio is about a factor or its inverse, in words; empty if there are none.
+
+    Those of the channel's dimension come first, then those of accelerations, in which the base motion may be wrong.
+    """
+    for each in (dimension, "acceleration"):
+        units = {unit.name: unit.factor for unit in UNITS.values() if unit.dimension == each}
+        bases = [name for name in (DIMENSIONS[each], "g") if name in units]
+        pairs = {
+            f"{base} and {name}": units[base] / units[name] for base in bases for name in units if name not in bases
+        }
+        pairs |= {f"{bases[0]} and {name}": units[bases[0]] / units[name] for name in bases[1:]}
+        apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in pairs.items()}
+        least = min(apart.values(), default=math.inf)
+        if least < math.log(_SAME_UNITS):
+            return " or ".join(names for names, value in apart.items() if value < least + _EQUALLY_NEAR)
+    return ""
 
 
 def _is_factor(value: float) -> bool:

@@ -500,7 +500,7 @@ def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_function(tmp_path, "in_mm", "    return response", "    return 1000.0 * response")
     output = call("check", "in_mm.toml")
-    assert "CAUTION: A unit may be wrong: Responses times 0.00" in output and "the ratio of m and mm" in output
+    assert "CAUTION: A unit may be wrong: Responses times 0.00" in output and " m and mm" in output
     assert "returns SI units" in output
 
 

@@ -42,7 +42,26 @@ def test_units_of_all_and_of_one_channel_are_named(factor):
     assert fault.value == pytest.approx(factor, rel=0.1) and fault.after < 0.3
     (fault,) = find_faults(measured(TRUE * [[factor], [1.0]]), RESPONSES)
     assert (fault.kind, fault.names) == ("factor", ("acceleration",))
-    assert describe_unit(fault.value)
+    assert describe_unit(fault.value, "acceleration")
+
+
+@pytest.mark.parametrize(
+    ("factor", "dimension", "expected"),
+    [
+        (947.0, "displacement", "m and mm"),
+        (1.0 / 1020.0, "displacement", "m and mm"),
+        (9.95, "acceleration", "m/s2 and g"),
+        (1000.0, "acceleration", "m/s2 and mm/s2 or g and mg"),
+        (980.0, "acceleration", "g and cm/s2 or g and gal"),
+        (980.0, "displacement", "m and mm"),
+        (9.6, "displacement", "m/s2 and g"),  # of the base motion
+        (1000.0, "force", "N and kN"),
+        (3.0, "strain", "m/s2 and ft/s2"),
+        (2.0, "force", ""),
+    ],
+)
+def test_a_factor_is_named_after_units_of_the_channel(factor, dimension, expected):
+    assert describe_unit(factor, dimension) == expected
 
 
 def test_signs_lags_and_exchanged_channels_are_named():
