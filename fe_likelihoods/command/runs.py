@@ -19,13 +19,13 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
-from ..reporting.advice import advise
+from ..reporting.advice import advise, judge
 from ..reporting.failures import failures
 from ..reporting.fits import fit_data_sets
 from ..reporting.rehearsal import refuse_chance
 from ..reporting.run import FinishedRun, read_run
 from ..reporting.table import parameter_rows
-from ..signals.fit_gate import REMARK
+from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -282,7 +282,6 @@ def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tup
     """As `_write`, without anything that needs a simulation."""
     from ..reporting.report import report
 
-    samples = write_samples(folder, run, None, 0)
     report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
     caution = (
         "the model is a Python file or program that the settings name, which was not run: the report has no "
@@ -290,7 +289,9 @@ def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tup
         "not changed. `fe-likelihoods report FOLDER --run-code` runs the model and makes that report again; do that "
         "only with code that you trust"
     )
-    return ("report.html", *write_tables(folder, run), samples), (caution,), not run.is_inconclusive
+    judgement = judge([Finding("The model was not run", WRONG if run.is_inconclusive else CARE, caution)])
+    files = ("report.html", *write_tables(folder, run, judgement), write_samples(folder, run, None, 0, judgement))
+    return files, (caution,), not run.is_inconclusive
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:

@@ -324,6 +324,8 @@ class EmulatedPosterior:
         count = np.concatenate(
             [np.unique(rows, return_counts=True)[1], np.full(len(missed), _KERNELS / max(len(missed), 1))]
         )
+        if len(centres) < ndim + 2 or not np.all(np.ptp(centres, axis=0) > 0.0):  # they span no volume
+            return self._ellipsoids
         # in whitened coordinates
         factor = factor_of(np.cov(centres, rowvar=False).reshape(ndim, ndim))
         white = np.linalg.solve(factor, (centres - centres.mean(axis=0)).T).T

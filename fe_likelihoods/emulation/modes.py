@@ -39,7 +39,7 @@ _FEW = 6  # parameters whose differences cost about as much as two steps
 UNSEEN = 0.05  # share of starts alone in a mode above which further starts follow
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
 _ENDED = 0.75  # ascents that reached a mode, as a share of the first starts, below which further starts follow as well
-_MOST_FOR_ENDS = 2  # times the number of the first starts, up to which they follow for this reason
+_MOST_FOR_ENDS = 1.5  # times the number of the first starts, up to which they follow for this reason
 _MOST_STARTS = 4  # times the number of the first ones
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
@@ -167,7 +167,7 @@ def search_modes(
     """Search from given starts, on growing parts of the record where the model offers them.
 
     Further starts follow the first ones while `unseen_share` is large (modes that one start alone led to say that
-    others may have been missed). Up to twice as many starts follow while the ascents that have reached a mode are fewer
+    others may have been missed). Half as many starts follow while the ascents that have reached a mode are fewer
     than three quarters of the first starts: ascents that are given up may have been on their way to another mode. Where
     the data leave a direction to the prior, most are given up because they advance slowly along it.
 

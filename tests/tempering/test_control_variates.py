@@ -155,7 +155,7 @@ def two_modes(shares, n=POOL):
 
 
 @pytest.mark.parametrize(
-    "earlier, latest, share", [(1.0, 0.5, 0.5), (0.02, 0.3, 0.3), (0.5, 1.0, 0.0), (0.5, 0.5, 0.0)]
+    "earlier, latest, share", [(1.0, 0.5, 0.5), (2e-4, 0.3, 0.3), (0.5, 1.0, 0.0), (0.5, 0.5, 0.0)]
 )
 def test_the_share_that_an_earlier_density_hardly_reaches(earlier, latest, share):
     found = unreached_share(two_modes([earlier, 1.0 - earlier]), two_modes([latest, 1.0 - latest]))
