@@ -66,7 +66,7 @@ def names(findings):
     return {finding.name for finding in findings if finding.weight == "wrong"}
 
 
-@pytest.mark.parametrize("noise", [{}, {"level": "measured"}])
+@pytest.mark.parametrize("noise", [{}, pytest.param({"level": "measured"}, marks=pytest.mark.slow)])
 def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
     """A frequency makes up for a part of the factor."""
     model, measured = deck()
@@ -93,6 +93,7 @@ def test_parameters_at_bounds_and_far_from_their_prior_are_named():
     assert "At the edge of the prior" in {each.name for each in check_fit(posterior, samples)}
 
 
+@pytest.mark.slow
 def test_the_fault_of_one_event_is_named_with_it():
     events = Events([MOTION, MOTION.scale(0.5)], rest=2.0, names=("EQ1", "EQ2"))
     model = LinearOscillator(events, 0.8)
@@ -122,6 +123,7 @@ def test_a_fit_that_another_response_beats_is_named():
     } & {*found}
 
 
+@pytest.mark.slow
 def test_what_a_guide_has_simulated_is_compared_as_well():
     model, measured = deck()
     posterior = Posterior(FELikelihood(model, measured), DECK | {"sigma_deck": HalfNormal(1.0)})

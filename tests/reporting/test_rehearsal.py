@@ -62,7 +62,7 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
     assert found.searched > 3.0
 
 
-@pytest.mark.parametrize(("noise", "weight"), [(0.003, "wrong"), (1.5, None)])
+@pytest.mark.parametrize(("noise", "weight"), [(0.003, "wrong"), pytest.param(1.5, None, marks=pytest.mark.slow)])
 def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise, weight):
     """The same step is too coarse for precise data, and fine enough for noisy ones."""
     found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.name]

@@ -73,6 +73,7 @@ KNOWN = {  # reference(CASES[name], 1)
 }
 
 
+@pytest.mark.slow  # a minute and more
 @pytest.mark.parametrize(
     "name",
     [
