@@ -2,7 +2,6 @@
 
 import csv
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,10 @@ from ..prediction.prediction import Prediction
 from ..reporting.advice import Judgement
 from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
-from ..signals.channels import Measurements
 from ..signals.error_measures import rrmse
-from ..simulation.model import SimulationFailed
 from .models import NotRun
 
-__all__ = ["write_csv", "write_report", "write_samples", "write_tables"]
+__all__ = ["write_csv", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[str, ...]:
@@ -154,20 +151,3 @@ def write_samples(
     data.posterior.attrs["judgement"] = str(judgement)
     data.to_netcdf(str(folder / "posterior.nc"))
     return "posterior.nc"
-
-
-def write_report(
-    path: Path,
-    run: FinishedRun,
-    prediction: Prediction | None,
-    again: str,
-    truth: Mapping[str, float] | None,
-    events: Mapping[str, Mapping[str, Prediction] | SimulationFailed],
-    measured: Mapping[str, Measurements],
-) -> str:
-    """Write the report in HTML, with the command that makes it again; return the name of the file."""
-    from ..reporting.report import report
-
-    options = {"truth": truth, "events": events, "measured": measured, "discard": run.discard, "repeat": again}
-    report(run.sampler, run.posterior, prediction, path, **options)
-    return path.name

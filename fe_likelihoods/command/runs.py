@@ -19,12 +19,9 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
-from ..reporting.advice import advise, judge
-from ..reporting.failures import failures
-from ..reporting.fits import fit_data_sets
+from ..reporting.advice import judge, judge_run
 from ..reporting.rehearsal import refuse_chance
 from ..reporting.run import FinishedRun, read_run
-from ..reporting.table import parameter_rows
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
 from ..signals.hdf5_files import DAMAGE
 from .events import (
@@ -38,7 +35,7 @@ from .events import (
 )
 from .job import Job, parse_job, read_job
 from .models import USER_MODELS, NotRun, Problem, make_problem
-from .results import write_report, write_samples, write_tables
+from .results import write_samples, write_tables
 from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
 __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_job"]
@@ -243,23 +240,26 @@ def _write(
 
     Predictions are made here; their responses are in the cache if they were made before.
     """
+    from ..reporting.report import write_page
+
     run = read_run(sampler, problem.posterior, truth=problem.truth, discard=discarded(job))
-    judgement = advise(run, parameter_rows(run), fit_data_sets(run), failures(run))
     drawn = _drawn(job, problem, sampler)
     prediction = _predict(job, problem, drawn, progress)
-    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS), judgement)
     predicted = predict_events(job, events, problem, drawn, progress)
     described = describe_events(events, predicted)
     pictures = write_events(folder, events, described)
     measured = {event.name: event.measured for event in events if event.name in predicted and event.measured}
-    page, truth = folder / "report.html", problem.truth
-    report = write_report(page, run, prediction, _command(file, folder), truth, predicted, measured)
+    judged = judge_run(run)
+    judgement = judged.judgement
+    samples = write_samples(folder, run, prediction, job.prediction.get("draws", DRAWS), judgement)
+    page = folder / "report.html"
+    write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
     tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
     cautions = [str(finding) for finding in judgement.findings if finding.weight != REMARK]
     cautions += [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for each in described:
         cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
-    return (report, *tables, samples, *pictures), tuple(cautions), judgement.status != "do not use"
+    return (page.name, *tables, samples, *pictures), tuple(cautions), judgement.status != "do not use"
 
 
 def _chain_only(folder: Path, problem: Problem) -> Any:

@@ -44,9 +44,7 @@ _STEPS = 6  # independence Metropolis steps of a draw
 _RIDGE = 1e-9
 _SMALLEST_SLOPE = 1e-9
 _COMPARED = 1000  # points of the pool among which ends are found
-_ONE_SIDED = (
-    0.4  # distance to the mean of the nearest points, as a share of their distance, from which a point is an end
-)
+_ONE_SIDED = 0.4  # distance to the mean of the nearest points, as a share of theirs, from which a point is an end
 _STRIDE, _APART = 0.5, 0.5  # prior standard deviations beyond an end; as a share, away from all runs
 
 

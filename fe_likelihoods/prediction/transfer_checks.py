@@ -22,8 +22,7 @@ from ..noise.protocol import follows_response
 from ..noise.residuals import effective_samples, innovations, residual_checks
 from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
-from ..signals.events import find_events
-from ..signals.records import Record
+from ..signals.events import find_events, motions_of
 from ..simulation.faults import ChangedModel
 from .inputs import PredictionSource
 from .prediction import Prediction
@@ -323,8 +322,7 @@ def remark_on_same_response(
 
 def _motion(model: Any) -> np.ndarray | None:
     """Accelerations (n_steps, ...) of the motion of a model; None where they are not known."""
-    supports = getattr(model, "supports", ()) or [getattr(model, name, None) for name in ("record", "loading")]
-    found = [each.acceleration for each in supports if isinstance(each, Record)]
+    found = [each.acceleration for each in motions_of(model)]
     return np.stack(found, axis=-1) if found else None
 
 

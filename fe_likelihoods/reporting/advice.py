@@ -5,19 +5,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
+from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from .failures import Failures, failures
-from .fit_gate import fit_gate
+from .fit_gate import fit_gate, listed
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
 from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
 from .table import ParameterRow, parameter_rows
 
-__all__ = ["Judgement", "advise", "check_result", "judge", "residual_sentence"]
+__all__ = ["JudgedRun", "Judgement", "advise", "check_result", "judge", "judge_run", "residual_sentence"]
 
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
 LARGE_FAILURE_SHARE = 0.05
-WEIGHTS = WRONG, CARE, REMARK
 STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
 STATUS = {WRONG: "do not use", CARE: "use with care", REMARK: "use"}
 
@@ -43,9 +42,18 @@ class Judgement(NamedTuple):
         return f"{text}: {'; '.join(f'{name[0].lower()}{name[1:]}' for name in reasons)}." if reasons else f"{text}."
 
 
+class JudgedRun(NamedTuple):
+    """A judgement of a run, and what it is made from."""
+
+    rows: list[ParameterRow]
+    fits: Fits
+    failures: Failures
+    judgement: Judgement
+
+
 def judge(findings: list[Finding]) -> Judgement:
     """The judgement that follows from findings: the most severe one decides."""
-    ordered = tuple(sorted(findings, key=lambda each: WEIGHTS.index(each.weight)))
+    ordered = by_weight(findings)
     return Judgement(STATUS[ordered[0].weight] if ordered else "use", ordered)
 
 
@@ -80,8 +88,14 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     >>> for finding in judgement.findings:
     ...     print(finding)
     """
-    run = read_run(sampler, posterior, discard=discard)
-    return advise(run, parameter_rows(run), fit_data_sets(run), failures(run))
+    return judge_run(read_run(sampler, posterior, discard=discard)).judgement
+
+
+def judge_run(run: FinishedRun) -> JudgedRun:
+    """Judge a run; simulates the points that `check_result` names, where they are not cached."""
+    rows, fits = parameter_rows(run), fit_data_sets(run)
+    failed = failures(run)  # those of the fits included
+    return JudgedRun(rows, fits, failed, advise(run, rows, fits, failed))
 
 
 def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> Judgement:
@@ -227,7 +241,7 @@ def _of_the_noise(fits: Fits) -> list[Finding]:
     white = [_place(fit, each) for fit, each in doubtful if _is_correlated(each) and fit.noise == "white"]
     if white:
         text = (
-            f"Successive residuals are correlated in {_listed(white)}. The likelihood takes the errors as independent "
+            f"Successive residuals are correlated in {listed(white)}. The likelihood takes the errors as independent "
             "from sample to sample, so the data count as more than they are, and the intervals are too narrow."
         )
         action = (
@@ -241,7 +255,7 @@ def _of_the_noise(fits: Fits) -> list[Finding]:
     if left:
         text = (
             "What the noise model does not predict (the innovations, or the whitened residuals) is still correlated "
-            f"in {_listed(left)}: the errors have another correlation than the noise model states."
+            f"in {listed(left)}: the errors have another correlation than the noise model states."
         )
         action = (
             "Compare with GaussianNoise with bands of frequency (in a TOML file: groups = [1.0, 5.0] in [noise]) or "
@@ -250,7 +264,7 @@ def _of_the_noise(fits: Fits) -> list[Finding]:
         found.append(Finding("The noise model does not fit the errors", CARE, text, action))
     strange = [_place(fit, each) for fit, each in doubtful if each.checks.normal[0] < SMALL_PROBABILITY]
     if strange:
-        text = f"The residuals of {_listed(strange)} have heavier tails, or are more skew, than a normal distribution."
+        text = f"The residuals of {listed(strange)} have heavier tails, or are more skew, than a normal distribution."
         action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
         found.append(Finding("The errors are not normal", REMARK, text, action))
     return found
@@ -308,7 +322,3 @@ def residual_sentence(fit: Fit, each: ChannelFit) -> str:
 
 def _place(fit: Fit, each: ChannelFit) -> str:
     return f"{each.channel.name} ({fit.title})" if fit.title else each.channel.name
-
-
-def _listed(texts: list[str]) -> str:
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"

@@ -24,7 +24,7 @@ from ..simulation.faults import ChangedModel
 from ..simulation.model import simulate_batch
 from .table import ParameterRow, rows_of
 
-__all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "windows_of"]
+__all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "listed", "windows_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -276,7 +276,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
 
 
 def _of_a_fault(compared: Compared, fault: Fault) -> Finding:
-    names, where = _listed(list(fault.names)), f" ({compared.title})" if compared.title else ""
+    names, where = listed(list(fault.names)), f" ({compared.title})" if compared.title else ""
     better = f"the error (RRMSE) is {_percent(fault.after)} in place of {_percent(fault.before)}"
     which = "measurements" if len(fault.names) > 1 else "measurement"
     if fault.kind == "factor":
@@ -346,13 +346,13 @@ def _of_the_errors(compared: Sequence[Compared], explained: bool) -> list[Findin
         "the model before you interpret the parameters."
     )
     if useless:
-        text = f"After the update, the error (RRMSE) is larger than that of a response of zero: {_listed(useless)}."
+        text = f"After the update, the error (RRMSE) is larger than that of a response of zero: {listed(useless)}."
         found.append(Finding("The model does not follow the measurements", WRONG, text, action))
     if poor:
-        text = f"After the update, the relative error (RRMSE) is still large: {_listed(poor)}."
+        text = f"After the update, the relative error (RRMSE) is still large: {listed(poor)}."
         found.append(Finding("A channel is hardly reproduced", CARE, text, action))
     if far and not explained:
-        text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {_listed(far)}."
+        text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {listed(far)}."
         action = (
             "Check the model and the priors. A model of your own must return SI units (m, m/s², N, Pa, rad), whatever "
             "the units in [model.channels], and zero in [measurements] is the time at which the base motion begins."
@@ -379,21 +379,21 @@ def _of_the_prior(rows: Sequence[ParameterRow]) -> list[Finding]:
         if width > 0.0 and row.upper - row.high < NEAR_BOUND * width:
             edges.append(f"{row.label} at {row.upper:.4g}")
     if edges:
-        text = f"The posterior reaches the edge of its prior: {_listed(edges)}. The bound, not the data, ends it there."
+        text = f"The posterior reaches the edge of its prior: {listed(edges)}. The bound, not the data, ends it there."
         action = (
             "If the bound is physical, nothing is wrong. Otherwise widen the prior, and ask what the parameter makes "
             "up for in the model."
         )
         found.append(Finding("At the edge of the prior", CARE, text, action))
     if flat:
-        names = _listed([row.label for row in flat])
+        names = listed([row.label for row in flat])
         text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", REMARK, text, action))
     far = [row.label for row in rows if abs(row.mean - row.prior_mean) > FAR_FROM_PRIOR * row.prior_sd]
     if far:
         text = (
-            f"The posterior mean of {_listed(far)} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the prior "
+            f"The posterior mean of {listed(far)} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the prior "
             "away from the mean of the prior: prior and data disagree."
         )
         action = (
@@ -412,7 +412,7 @@ def _of_the_truth(rows: Sequence[ParameterRow]) -> list[Finding]:
     if not k or sum(comb(n, j) * 0.1**j * 0.9 ** (n - j) for j in range(k, n + 1)) >= SMALL_PROBABILITY:
         return []
     text = (
-        f"The true values of {_listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
+        f"The true values of {listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
         "usual. The model that was updated is not the one that made the data."
     )
     action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
@@ -423,5 +423,6 @@ def _percent(error: float) -> str:
     return f"{100.0 * error:.3g} %"
 
 
-def _listed(texts: list[str]) -> str:
+def listed(texts: list[str]) -> str:
+    """Texts as a list in a sentence."""
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"

@@ -28,8 +28,8 @@ from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import HalfNormal
 from ..signals.channels import Measurements
-from ..signals.events import Events
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
+from ..signals.events import Events, motions_of
+from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.records import Record
 from ..simulation.model import simulate_batch
 from ..units import from_si
@@ -153,8 +153,7 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
             found += refined
         found += fit_gate(compared)
         simulations = stage.made + _made(posterior) - before
-    order = (WRONG, CARE, REMARK)
-    return Rehearsal(tuple(sorted(found, key=lambda each: order.index(each.weight))), simulations, seconds, searched)
+    return Rehearsal(by_weight(found), simulations, seconds, searched)
 
 
 def _made(posterior: Posterior) -> int:
@@ -217,9 +216,7 @@ def _motions_of(model: Any) -> tuple[Record, ...]:
     """The records that excite a model; empty where they cannot be replaced."""
     if not hasattr(model, "with_record"):
         return ()
-    supports = getattr(model, "supports", ())
-    given = supports if supports else [getattr(model, name, None) for name in ("record", "loading")]
-    found = tuple(each for each in given if isinstance(each, Record))
+    supports, found = getattr(model, "supports", ()), motions_of(model)
     return found if supports and len(found) == len(supports) else found[:1]
 
 

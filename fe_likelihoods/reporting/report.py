@@ -15,7 +15,7 @@ from ..signals.channels import Measurements
 from ..signals.fit_gate import Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
-from .advice import advise
+from .advice import JudgedRun, judge_run
 from .contents import (
     DataSet,
     PredictedValue,
@@ -27,8 +27,8 @@ from .contents import (
     summary_sentences,
     verdict_sentences,
 )
-from .failures import Failures, failures
-from .fits import Fits, fit_data_sets
+from .failures import Failures
+from .fits import Fits
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (
@@ -43,9 +43,9 @@ from .pictures import (
     draw_scores_of_events,
 )
 from .run import FinishedRun, read_run
-from .table import ParameterRow, parameter_rows
+from .table import ParameterRow
 
-__all__ = ["Contents", "Predicted", "report"]
+__all__ = ["Contents", "Predicted", "report", "write_page"]
 
 
 class Predicted(NamedTuple):
@@ -163,6 +163,21 @@ def report(
     >>> report(sampler, posterior, events={"second shaking": second}, measured={"second shaking": measurements})
     """
     run = read_run(sampler, posterior, names=names, truth=truth, discard=discard, thin=thin)
+    return write_page(Path(out), run, prediction, title=title, measured=measured, events=events, repeat=repeat)
+
+
+def write_page(
+    path: Path,
+    run: FinishedRun,
+    prediction: Prediction | Mapping[str, Prediction] | None = None,
+    judged: JudgedRun | None = None,
+    *,
+    title: str = "",
+    measured: Measurements | Mapping[str, Measurements] | None = None,
+    events: Mapping[str, Prediction | EventPredictions | SimulationFailed] | None = None,
+    repeat: str = "",
+) -> Path:
+    """Write the report of a run that was read, and perhaps `judged`; other parameters as for `report`."""
     of_events = as_events({} if events is None else events)
     known = measured
     if isinstance(measured, Mapping):
@@ -170,11 +185,10 @@ def report(
     elif measured is not None and prediction is None and of_events:
         raise ValueError("measured must be a mapping of the names of events to their measurements")
     predictions = _predictions(prediction, known)
-    path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     measurements = measured if isinstance(measured, Mapping) else {}
     described = [describe_event(name, each, measurements.get(name)) for name, each in of_events.items()]
-    page = render(gather(run, predictions, described, title, repeat))
+    page = render(gather(run, predictions, described, title, repeat, judged))
     path.write_text(page, encoding="utf-8")
     return path
 
@@ -185,12 +199,12 @@ def gather(
     events: Sequence[OtherEvent] = (),
     title: str = "",
     repeat: str = "",
+    judged: JudgedRun | None = None,
 ) -> Contents:
-    """Make the contents of a report; simulates the response at two points where it is not cached."""
-    fits, rows, sets = fit_data_sets(run), parameter_rows(run), data_sets(run)
-    failed = failures(run)  # those of the fits included
+    """Make the contents of a report; a run that was not judged is judged, which simulates where nothing is cached."""
+    rows, fits, failed, judgement = judge_run(run) if judged is None else judged
+    sets = data_sets(run)
     models = " and ".join(dict.fromkeys(each.model for each in sets)) or "a log-density"
-    judgement = advise(run, rows, fits, failed)
     return Contents(
         title=title or f"Bayesian updating of {models}",
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),

@@ -18,7 +18,7 @@ from .channels import Channel, Measurements
 from .records import Record
 from .sampling import rest_samples, same_step
 
-__all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measurements"]
+__all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measurements", "motions_of"]
 
 
 class EventWindow(NamedTuple):
@@ -306,6 +306,12 @@ def find_events(model: Any) -> Events | None:
             if isinstance(each, Events):
                 return each
     return None
+
+
+def motions_of(model: Any) -> tuple[Record, ...]:
+    """The records that excite a model, one for each support that has one; empty for a model of another kind."""
+    given = getattr(model, "supports", ()) or [getattr(model, name, None) for name in ("record", "loading")]
+    return tuple(each for each in given if isinstance(each, Record))
 
 
 def events_of(model: Any) -> Events:

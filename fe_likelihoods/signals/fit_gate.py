@@ -13,7 +13,7 @@ geometric mean, of the errors of the best response, and to less than 0.7 if the 
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..units import DIMENSIONS, UNITS
 from .channels import Measurements
 
-__all__ = ["CARE", "LARGE_ERROR", "REMARK", "WRONG", "Fault", "Finding", "describe_unit", "find_faults"]
+__all__ = ["CARE", "LARGE_ERROR", "REMARK", "WRONG", "Fault", "Finding", "by_weight", "describe_unit", "find_faults"]
 
 REMARK = "remark"
 CARE = "care"
@@ -66,6 +66,11 @@ class Finding(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.name}: {self.sentence} {self.action}".rstrip()
+
+
+def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Findings with the most severe first, otherwise in their order."""
+    return tuple(sorted(findings, key=lambda each: (WRONG, CARE, REMARK).index(each.weight)))
 
 
 class Fault(NamedTuple):

@@ -110,6 +110,7 @@ def _clock_zero(table: Table, place: int | None, text: str) -> float:
 
 
 def time_column(table: Table) -> int | None:
+    """Number of the column with the times: by its name, else a clock, or the first one of a table without names."""
     clock = min(table.clocks, default=None)
     if not table.names:
         return 0 if table.time_unit is not None and table.values.shape[1] > 1 else clock

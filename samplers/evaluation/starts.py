@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import special, stats
 
+from ..estimates.weights import log_mean_weight
+
 __all__ = ["SEED", "compare_with_draws", "draws_to_compare", "log_integral", "spread_by_metropolis"]
 
 LEVEL = 1e-4  # probability of a false alarm in a run
@@ -169,14 +171,12 @@ def _bridge(of_draws: np.ndarray, of_proposed: np.ndarray) -> tuple[float, float
     for _ in range(BRIDGE_STEPS):
         at_draws = -np.logaddexp(share[0] + below, share[1] + value)
         at_proposed = above - np.logaddexp(share[0] + above, share[1] + value)
-        old, value = value, float(_log_mean(at_proposed) - _log_mean(at_draws))
+        old, value = value, log_mean_weight(at_proposed) - log_mean_weight(at_draws)
         if not np.isfinite(value) or abs(value - old) < 1e-6:
             break
     if not np.isfinite(value):
         return float("nan"), float("inf")
-    variances = [np.expm1(_log_mean(2.0 * x) - 2.0 * _log_mean(x)) / len(x) for x in (at_draws, at_proposed)]
+    variances = [
+        np.expm1(log_mean_weight(2.0 * x) - 2.0 * log_mean_weight(x)) / len(x) for x in (at_draws, at_proposed)
+    ]
     return value + centre, float(np.sqrt(sum(variances)))
-
-
-def _log_mean(values: np.ndarray) -> float:
-    return float(special.logsumexp(values) - np.log(len(values)))
