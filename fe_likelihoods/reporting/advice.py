@@ -1,11 +1,14 @@
 """What a reader has to know before trusting a result: one judgement, and each doubt with what to do about it."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
+from ..simulation.model import SimulationBatch, simulate_batch
+from .discretisation import find_discretisation_error, simulations_of_the_test
 from .failures import Failures, failures
 from .fit_gate import fit_gate, listed
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
@@ -17,6 +20,8 @@ __all__ = ["JudgedRun", "Judgement", "advise", "check_result", "judge", "judge_r
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
 LARGE_FAILURE_SHARE = 0.05
+LARGEST_TEST = 0.05  # of step and mesh, as a share of the simulations of the run
+TEST_SECONDS = 10.0
 STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
 STATUS = {WRONG: "do not use", CARE: "use with care", REMARK: "use"}
 
@@ -94,11 +99,46 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
 def judge_run(run: FinishedRun) -> JudgedRun:
     """Judge a run; simulates the points that `check_result` names, where they are not cached."""
     rows, fits = parameter_rows(run), fit_data_sets(run)
+    coarse, made = discretisation_of(run)
     failed = failures(run)  # those of the fits included
-    return JudgedRun(rows, fits, failed, advise(run, rows, fits, failed))
+    fits = fits._replace(simulations=fits.simulations + made)
+    return JudgedRun(rows, fits, failed, advise(run, rows, fits, failed, coarse))
 
 
-def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures) -> Judgement:
+def discretisation_of(run: FinishedRun) -> tuple[list[Finding], int]:
+    """The error of step and mesh at the centre of the samples, and the number of simulations that it took.
+
+    The derivatives take one simulation per parameter. Where these are more than a twentieth of the run's simulations
+    and take longer than ten seconds, nothing is simulated, and a remark says so.
+    """
+    if run.likelihood is None or run.prior is None or run.is_inconclusive:
+        return [], 0
+    if run.n_modes > 1:
+        text = "The samples have several modes, which have no common standard deviation."
+        return [Finding("Step and mesh were not tested", REMARK, text, "Halve them, and run again.")], 0
+    needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
+    seconds = report["seconds"] / max(report["simulations"], 1)
+    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
+        text = f"The test takes {needed} simulations of {seconds:.2g} s."
+        action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
+        return [Finding("Step and mesh were not tested", REMARK, text, action)], 0
+    known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
+    before, finer = run.likelihood.simulations, 0
+
+    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
+        nonlocal finer
+        if model.fingerprint in known:
+            return known[model.fingerprint].simulate(points)
+        finer += len(points)
+        return simulate_batch(model, points)
+
+    found = find_discretisation_error(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+    return found, run.likelihood.simulations - before + finer
+
+
+def advise(
+    run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures, coarse: Sequence[Finding] = ()
+) -> Judgement:
     """The judgement of a run, with all that a reader has to know.
 
     A run that says nothing about the parameters gets no notes that compare its samples with prior, truth or noise.
@@ -109,6 +149,8 @@ def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failu
     rows : list of ParameterRow
     fits : Fits
     failed : Failures
+    coarse : sequence of Finding
+        About step and mesh.
     """
     found = [
         *_of_the_verdict(run),
@@ -119,6 +161,7 @@ def advise(run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failu
             for text in fits.failures
         ),
         *fit_gate(fits.compared, () if run.is_inconclusive else rows),
+        *coarse,
         *_of_the_model(run),
         *_of_the_data(fits),
     ]

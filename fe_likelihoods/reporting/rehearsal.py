@@ -2,19 +2,10 @@
 
 A model that returns something else the second time, or the same under every motion, ends in numbers that look like a
 result. `rehearse` simulates a few times what a run would simulate thousands of times.
-
-The error of the time step, or of the mesh, is compared with the width of the posterior that the data will give. At the
-best fit, the response r changes by d with half the step. With the derivatives J of the response by the parameters,
-each in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
-
-    delta = (J^T W J + P)^-1 J^T W d
-
-is about the change of the parameters in their standard deviations, where P is the precision of the prior in this unit.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass, replace
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -28,11 +19,12 @@ from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import HalfNormal
 from ..signals.channels import Measurements
-from ..signals.events import Events, motions_of
+from ..signals.events import Events
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.records import Record
-from ..simulation.model import simulate_batch
+from ..simulation.model import SimulationBatch, simulate_batch
 from ..units import from_si
+from .discretisation import find_discretisation_error, motions_to_replace, under
 from .fit_gate import Compared, compare, draws_to_compare, fit_gate
 
 __all__ = ["Rehearsal", "refuse_chance", "rehearse"]
@@ -42,7 +34,6 @@ NOTHING = 1e-6  # the same, of responses to a motion and to twice this motion
 LATE_SHARE = 0.05  # of a motion, by which it is shifted
 SECONDS = 60.0  # of the search for the best fit
 MOST_SEARCHED = 150  # simulations of this search
-SHIFT, LARGE_SHIFT = 0.5, 2.0  # of a parameter by half a step, in standard deviations: a caution, and a wrong result
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
 SMALLEST_MOTION = 1e-6  # [g]
 
@@ -78,13 +69,18 @@ class _Stage:
         self.made += n
         self.bar.update(n)
 
+    def simulate(self, model: Any, points: np.ndarray) -> SimulationBatch:
+        """Responses at points (n, n_parameters)."""
+        self.bar.total = max(self.bar.total or 0, self.bar.n + len(points))
+        start = perf_counter()
+        batch = simulate_batch(model, points)
+        self.seconds = min(self.seconds, (perf_counter() - start) / len(points))  # the first one may compile
+        self.count(len(points))
+        return batch
+
     def run(self, model: Any, theta: np.ndarray) -> tuple[np.ndarray | None, str]:
         """A response (n_channels, n_steps), None if the simulation fails, and the reason."""
-        self.bar.total = max(self.bar.total or 0, self.bar.n + 1)
-        start = perf_counter()
-        batch = simulate_batch(model, theta[None])
-        self.seconds = min(self.seconds, perf_counter() - start)  # the first one may compile
-        self.count(1)
+        batch = self.simulate(model, theta[None])
         return (None if batch.reasons[0] else batch.response[0]), batch.reasons[0]
 
 
@@ -212,23 +208,6 @@ def _of_chance(response: np.ndarray, again: np.ndarray | None, reason: str) -> l
     return [Finding("The model is not repeatable", WRONG, text, action)]
 
 
-def _motions_of(model: Any) -> tuple[Record, ...]:
-    """The records that excite a model; empty where they cannot be replaced."""
-    if not hasattr(model, "with_record"):
-        return ()
-    supports, found = getattr(model, "supports", ()), motions_of(model)
-    return found if supports and len(found) == len(supports) else found[:1]
-
-
-def _under(model: Any, change: Callable[[Record], Record]) -> Any:
-    """The model under its motions, each of which is changed."""
-    motions = tuple(change(each) for each in _motions_of(model))
-    vertical = getattr(model, "vertical", None)
-    if isinstance(vertical, Record):
-        return model.with_record((motions[0], change(vertical)))
-    return model.with_record(motions if getattr(model, "supports", ()) else motions[0])
-
-
 def _later(record: Record, steps: int) -> Record:
     """The record after a number of zeros, with its length."""
     zeros = np.zeros(steps)
@@ -239,11 +218,11 @@ def _of_motions(
     stage: _Stage, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
 ) -> list[Finding]:
     """Whether the response follows the motion: twice the motion, a later motion, and other events."""
-    motions = _motions_of(model)
+    motions = motions_to_replace(model)
     if not motions:
         return []
     unread = "Check that the model reads the motion that it is given, and not one file that is always the same."
-    strong, reason = stage.run(_under(model, lambda each: each.scale(2.0)), theta)
+    strong, reason = stage.run(under(model, lambda each: each.scale(2.0)), theta)
     if strong is not None and _relative(strong - response, response) <= NOTHING:
         text = "Twice the base motion gives the same response: the model does not use the motion that it is given."
         return [Finding("The motion changes nothing", WRONG, f"{text} Predictions of other events repeat it.", unread)]
@@ -255,7 +234,7 @@ def _of_motions(
     every = max(1, round(model.dt / dt))
     steps = every * max(1, round(LATE_SHARE * motions[0].n_steps / every))
     if not isinstance(motions[0], Events) and steps < motions[0].n_steps // 2:
-        late, _ = stage.run(_under(model, lambda each: _later(each, steps)), theta)
+        late, _ = stage.run(under(model, lambda each: _later(each, steps)), theta)
         k = steps // every
         if late is not None and late.shape == response.shape and k < response.shape[1]:
             moved = _relative(late[:, k:] - response[:, :-k], response[:, :-k])
@@ -284,7 +263,9 @@ def _of_motions(
 
 def _of_sizes(measured: Measurements, model: Any) -> list[Finding]:
     """Motions and measurements whose size is not plausible in SI units."""
-    sizes = [(f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in _motions_of(model)]
+    sizes = [
+        (f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in motions_to_replace(model)
+    ]
     for channel, values in zip(measured.channels, measured.values, strict=True):
         if np.isfinite(values).any():
             sizes.append((f"channel {channel.name}", channel.dimension, float(np.nanmax(np.abs(values)))))
@@ -299,39 +280,13 @@ def _of_sizes(measured: Measurements, model: Any) -> list[Finding]:
     return found
 
 
-def _finer(model: Any) -> list[tuple[str, Any, int]]:
-    """What is halved, the finer model, and its response samples per sample of the model."""
-    names = {each.name for each in fields(model)} if is_dataclass(model) else set()
-    found = []
-    if "substeps" in names:
-        found.append(("the integration step", replace(model, substeps=2 * model.substeps), 1))
-    elif "step" in names and hasattr(model, "integration_step"):
-        found.append(("the integration step", replace(model, step=0.5 * model.integration_step), 1))
-    elif _motions_of(model):
-        finer = _under(model, lambda each: each.resample(0.5 * each.dt))
-        if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
-            found.append(("the time step", finer, 2))
-    if "mesh" in names and isinstance(model.mesh, int):
-        found.append(("the fibers of the section", replace(model, mesh=2 * model.mesh), 1))
-    return found
-
-
 def _of_discretisation(stage: _Stage, posterior: Posterior, seconds: float) -> tuple[list[Finding], float]:
-    """Shift of the parameters by half the step and a finer mesh, in their standard deviations; simulations searched."""
-    likelihood = posterior.likelihood
-    finer = _finer(likelihood.model)
-    if not finer:
-        text = "The model takes neither a motion nor a step that could be halved."
-        return (
-            [Finding("The time step was not tested", REMARK, text, "Halve it in the model, and compare.")],
-            np.nan,
-            None,
-        )
-    n = len(likelihood.model.parameter_names)
+    """The error of step and mesh at the best fit, and the simulations of the search for it."""
+    n = len(posterior.likelihood.model.parameter_names)
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
     if limit < 10 * (n + 1):
         text = f"The test takes about {15 * (n + 1)} simulations of {seconds:.2g} s."
-        action = "Halve the step and the mesh at one point, and compare the responses with the noise."
+        action = "The run makes it at its end. It costs less to know now: halve the step and the mesh at one point."
         return [Finding("Step and mesh were not tested", REMARK, text, action)], np.nan
     try:
         target, mode, searched = _search(stage, posterior, limit)
@@ -339,43 +294,9 @@ def _of_discretisation(stage: _Stage, posterior: Posterior, seconds: float) -> t
         return [Finding("Step and mesh were not tested", REMARK, f"No fit was found: {error}.")], np.nan
     if mode is None:
         return [Finding("Step and mesh were not tested", REMARK, "No fit was found.")], searched
-    theta = mode.parameters[:n]
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
-    sd = around[:, :n].std(axis=0)
-    response, reason = stage.run(likelihood.model, theta)
-    columns = [stage.run(likelihood.model, theta + sd * row)[0] for row in np.eye(n)]
-    if response is None or any(each is None for each in columns):
-        return [Finding("Step and mesh were not tested", REMARK, f"A simulation failed: {reason}.")], searched
-    residuals = likelihood.residuals_of(response, mode.parameters)
-    sigma = np.sqrt(np.nanmean(np.square(residuals), axis=1))
-    prior_sd = np.array([posterior.prior.table()[1][i][3] for i in range(n)])
-    found = []
-    for what, model, every in finer:
-        fine, reason = stage.run(model, theta)
-        if fine is None:
-            text = f"With half of {what} the simulation at the best fit fails: {reason}."
-            found.append(Finding("A finer model fails", CARE, text, "Check the convergence of the model."))
-            continue
-        change = fine[:, ::every] - response
-        shift = _shift(change, np.stack([each - response for each in columns]), sigma, sd / prior_sd)
-        worst = int(np.argmax(np.abs(shift)))
-        if abs(shift[worst]) < SHIFT:
-            continue
-        names = ", ".join(
-            f"{name} by {abs(value):.2g}"
-            for name, value in zip(likelihood.model.parameter_names, shift, strict=True)
-            if abs(value) >= SHIFT
-        )
-        text = (
-            f"Half of {what} changes the response by {100.0 * _relative(change, response):.2g} %, which moves {names} "
-            "posterior standard deviations: intervals that are narrower than the error of the model miss the truth."
-        )
-        weight = WRONG if abs(shift[worst]) > LARGE_SHIFT else CARE
-        found.append(
-            Finding("The model is too coarse for its data", weight, text, f"Halve {what} until this is small.")
-        )
-    return found, searched
+    return find_discretisation_error(target.posterior, mode.parameters, around.std(axis=0), stage.simulate), searched
 
 
 def _search(stage: _Stage, posterior: Posterior, limit: float) -> tuple[ResponseTarget, Mode | None, float]:
@@ -394,12 +315,3 @@ def _search(stage: _Stage, posterior: Posterior, limit: float) -> tuple[Response
     if posterior is not given:
         stage.count(_made(posterior))
     return target, search.modes[0] if search.modes else None, search.simulations
-
-
-def _shift(change: np.ndarray, slopes: np.ndarray, sigma: np.ndarray, widths: Sequence[float]) -> np.ndarray:
-    """Change of the parameters (n,) in standard deviations, for a change of the response (n_channels, n_steps)."""
-    used = sigma > 0.0
-    jacobian = (slopes[:, used] / sigma[used, None]).reshape(len(slopes), -1)
-    wanted = (change[used] / sigma[used, None]).ravel()
-    precision = jacobian @ jacobian.T + np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
-    return np.linalg.lstsq(precision, jacobian @ wanted)[0]

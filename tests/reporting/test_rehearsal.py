@@ -8,16 +8,19 @@ from fe_likelihoods import (
     FELikelihood,
     FunctionModel,
     HalfNormal,
+    JointLikelihood,
     LinearOscillator,
     Measurements,
     Posterior,
     Record,
     SimulationFailed,
     TruncatedNormal,
+    check_result,
     rehearse,
 )
 from fe_likelihoods.problems import table_motion
 from fe_likelihoods.reporting.rehearsal import refuse_chance
+from samplers import SMCSampler
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
 TOP = (Channel("top", "relative displacement", "mm"),)
@@ -62,13 +65,45 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
     assert found.searched > 3.0
 
 
-@pytest.mark.parametrize(("noise", "weight"), [(0.003, "wrong"), pytest.param(1.5, None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("noise", "weight"), [(0.003, "care"), pytest.param(1.5, None, marks=pytest.mark.slow)])
 def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise, weight):
     """The same step is too coarse for precise data, and fine enough for noisy ones."""
     found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.name]
     assert [each.weight for each in found] == ([weight] if weight else [])
     if found:
         assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_coarse_step_limits_the_result_of_a_run(joint):
+    """Also where only one of two data sets is computed with the coarse step."""
+
+    def judged(function):
+        posterior = posterior_of(function, 0.02)
+        if joint:
+            second = posterior_of(lambda theta, record: central_differences(theta, record, 8), 0.02).likelihood
+            likelihood = JointLikelihood({"a": posterior.likelihood, "b": second})
+            posterior = Posterior(likelihood, posterior.prior)
+        sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
+        sampler.run_mcmc(None, 1)
+        before = posterior.likelihood.simulations
+        judgement = check_result(sampler)
+        return judgement, posterior.likelihood.simulations - before
+
+    judgement, made = judged(central_differences)
+    assert judgement.status == "use with care"
+    found = next(each for each in judgement.findings if each.name == "The model is too coarse for its data")
+    assert "stiffness by" in found.sentence and made <= 2 * (100 + 2 + 4)
+    fine, _ = judged(lambda theta, record: central_differences(theta, record, 6))
+    assert not [each for each in fine.findings if "coarse" in each.name or "tested" in each.name], str(fine)
+
+
+def test_a_model_without_a_step_that_could_be_halved_is_told():
+    model = FunctionModel(lambda theta: central_differences(theta, MOTION, 8), ("stiffness", "damping"), TOP, 0.01, MOTION.n_steps)
+    fitted = posterior_of(lambda theta, record: central_differences(theta, record, 8))
+    posterior = Posterior(FELikelihood(model, fitted.likelihood.measurements), fitted.prior)
+    found = rehearse(posterior).findings
+    assert [(each.name, each.weight) for each in found] == [("The time step was not tested", "remark")]
 
 
 def test_a_random_model_is_named_and_a_run_refuses_it():
