@@ -21,7 +21,7 @@ $(READY): pyproject.toml .ci/setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $(READY)
 
-update: $(READY) ## update the bridge column on the bundled data (reduced setting); writes report.html and tables to results/
+update: $(READY) ## update the bridge column on bundled data; writes report.html and tables to results/
 	$(BIN)/fe-likelihoods run data/templates/column.toml --out results
 
 test: $(READY)   ## run the quick tests on all cores
@@ -69,6 +69,7 @@ format: $(READY) ## format and fix with ruff
 data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_bridge_column_eq1.py
 	$(BIN)/python data/make_bridge_column_events.py
+	$(BIN)/python data/make_bridge_column_short.py
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environments, the built documentation and the results

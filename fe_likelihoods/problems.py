@@ -3,8 +3,8 @@
 `bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five
 multiples of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The
 measured record and responses are not public. The bundled data are **synthetic** (``data/README.md``): EQ1, and a set
-of EQ1 and a stronger EQ2 (``events=2``) that informs every parameter. `bridge_column_measurements` makes such data for
-any other base motion.
+of EQ1 and a stronger EQ2 (``data="eq1-eq2"``) that informs every parameter, and a short test for first examples
+(``data="short"``). `bridge_column_measurements` makes such data for any other base motion.
 
 `isolated_bridge` is a bridge on sliding bearings with fluid dampers, after the shake-table tests of Tsopelas et al.
 (1994): ten multiples of nominal values of friction and dampers. Its data are **synthetic** and most nominal values are
@@ -74,6 +74,14 @@ BRIDGE_COLUMN_SENSOR_NOISE = MappingProxyType({name: 0.25 * level for name, leve
 """Noise levels of the bundled set of two events [SI], **assumed**: a quarter of those of the paper, which also contain
 the error of its model. 0.005 g and 0.57 mm."""
 
+SHORT_SUBSTEPS = 2
+"""Integration steps per sample of the short record."""
+
+_COLUMN_FILES = {
+    "eq1": "bridge_column_eq1.h5",
+    "eq1-eq2": "bridge_column_events.h5",
+    "short": "bridge_column_short.h5",
+}
 _COARSE_SHARE = 0.75  # part of the Arias intensity that the coarse column sees
 _COARSE_TOLERANCES = {"tolerance": 1e-3, "element_tolerance": 1e-3}
 
@@ -83,14 +91,15 @@ def _bundled(name: str) -> Dataset:
         return read_dataset(path)
 
 
-def bridge_column_data(events: int = 1) -> Dataset:
+def bridge_column_data(data: str = "eq1") -> Dataset:
     """Read the bundled synthetic data of the bridge column: base motion, channels and truth (``data/README.md``).
 
     Parameters
     ----------
-    events : {1, 2}
-        1 is earthquake EQ1. 2 is EQ1, a pause of 10 s and a stronger EQ2: the record is an `Events`, and the
-        measurements are NaN in the pause. Both have the same truth, but other noise levels.
+    data : {"eq1", "eq1-eq2", "short"}
+        "eq1" is earthquake EQ1. "eq1-eq2" is EQ1, a pause of 10 s and a stronger EQ2: the record is an `Events`, and
+        the measurements are NaN in the pause. Both have the truth of the paper, but other noise levels. "short" is ten
+        seconds of another motion, with a truth within the priors.
 
     Returns
     -------
@@ -102,16 +111,15 @@ def bridge_column_data(events: int = 1) -> Dataset:
     ValueError
         If there is no such set.
     """
-    if events == 1:
-        return _bundled("bridge_column_eq1.h5")
-    if events != 2:
-        raise ValueError(f"expected events=1 (EQ1) or events=2 (EQ1 and EQ2); got {events!r}")
-    return _bundled("bridge_column_events.h5")
+    if data not in _COLUMN_FILES:
+        raise ValueError(f"expected data={', '.join(map(repr, _COLUMN_FILES))}; got {data!r}")
+    return _bundled(_COLUMN_FILES[data])
 
 
 def bridge_column_measurements(
     record: Record,
     *,
+    theta: Mapping[str, float] = BRIDGE_COLUMN_MEANS,
     seed: int = 1,
     n_strips: int = 200,
     substeps: int = 4,
@@ -125,6 +133,8 @@ def bridge_column_measurements(
     ----------
     record : Record
         Base acceleration. In the pauses of `Events` nothing is measured (NaN).
+    theta : mapping of str to float
+        Multiples of the nominal values. Default: posterior means of the paper.
     seed : int
         Seed of the noise.
     n_strips : int
@@ -146,7 +156,7 @@ def bridge_column_measurements(
     from .models.rc_column import RCColumn
 
     model = RCColumn.lhpost(record, mesh=n_strips, substeps=substeps, **changes)
-    values = model.simulate([BRIDGE_COLUMN_MEANS[name] for name in model.parameter_names])
+    values = model.simulate([theta[name] for name in model.parameter_names])
     if noise:
         rng = np.random.default_rng(seed)
         if missing := [channel.name for channel in model.channels if channel.name not in levels]:
@@ -160,7 +170,8 @@ def bridge_column_measurements(
         values = np.where(record.in_events, values, np.nan)
     description = (
         f"SYNTHETIC: response of RCColumn.lhpost ({n_strips} strips, {substeps} integration steps per sample) to "
-        f"{record.name} at the paper's posterior means" + (f", plus white noise (seed {seed})" if noise else "")
+        f"{record.name} at {'the posterior means of the paper' if theta is BRIDGE_COLUMN_MEANS else 'an assumed truth'}"
+        + (f", plus white noise (seed {seed})" if noise else "")
     )
     return Measurements(model.channels, record.dt, values, description)
 
@@ -183,7 +194,7 @@ def _make_noise(noise: Any, channels: Sequence[Channel]) -> Any:
 
 def bridge_column(
     *,
-    events: int = 1,
+    data: str = "eq1",
     record: Record | None = None,
     measurements: Measurements | None = None,
     every: int = 1,
@@ -199,9 +210,10 @@ def bridge_column(
 
     Parameters
     ----------
-    events : {1, 2}
-        Bundled data: 1 is EQ1, during which the bars stay elastic and the data say nothing about a1. 2 is EQ1 and a
-        stronger EQ2, which inform every parameter (`bridge_column_data`).
+    data : {"eq1", "eq1-eq2", "short"}
+        Bundled data (`bridge_column_data`). "eq1" is EQ1, during which the bars stay elastic and the data say nothing
+        about a1. "eq1-eq2" is EQ1 and a stronger EQ2, which inform every parameter. "short" is a test of ten seconds
+        for first examples.
     record : Record, optional
         Base motion. Default: that of the bundled data.
     measurements : Measurements, optional
@@ -249,10 +261,12 @@ def bridge_column(
     if record is None:
         if measurements is not None:
             raise ValueError("measurements need the record under which they were measured: give record= too")
-        data = bridge_column_data(events)
-        record, measurements = data.record, data.measurements
-    elif events != 1:
-        raise ValueError("events= chooses bundled data; leave it out with a record of your own, which may be Events")
+        bundled = bridge_column_data(data)
+        record, measurements = bundled.record, bundled.measurements
+        if data == "short":
+            changes = {"substeps": SHORT_SUBSTEPS} | changes
+    elif data != "eq1":
+        raise ValueError("data= chooses bundled data; leave it out with a record of your own, which may be Events")
     elif measurements is None:
         measurements = bridge_column_measurements(record, seed=seed)
     if duration is not None:

@@ -193,6 +193,12 @@ class RunResults:
         return self._budget.simulations
 
     @property
+    def simulations_of_guides(self) -> float:
+        """The part of `simulations` that guides have made for their search; simulations of first parts of a record
+        count as fractions."""
+        return self._budget.of_guides
+
+    @property
     def seed(self) -> int | list[int] | None:
         """The seed that this object was given; None if it was given none."""
         return self._seed[0] if self._seed is not None and len(self._seed) == 1 else self._seed

@@ -9,7 +9,7 @@ import pytest
 from fe_likelihoods.data import make_bridge_column_eq1, make_bridge_column_events, make_isolated_bridge
 from scipy import stats
 
-from fe_likelihoods import problems, rrmse
+from fe_likelihoods import check_result, problems, rrmse
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.priors.distributions import HalfNormal
 from fe_likelihoods.problems import (
@@ -26,6 +26,7 @@ from fe_likelihoods.signals.datasets import read_dataset, write_dataset
 from fe_likelihoods.signals.readers import read_csv
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0, to_si
+from samplers import SMCSampler
 
 INCH = to_si(1.0, "in").item()
 TRUTH = np.array(list(BRIDGE_COLUMN_MEANS.values()))
@@ -130,7 +131,7 @@ def test_synthetic_measurements(strong):
 
 
 def test_the_set_of_two_events_has_the_noise_of_sensors_on_the_response_of_a_column_that_yields(data):
-    record, measurements, attributes = bridge_column_data(events=2)
+    record, measurements, attributes = bridge_column_data("eq1-eq2")
     assert record.names == ("EQ1", "EQ2") and record.rests == (10.0,) and "NOT measured" in attributes["title"]
     np.testing.assert_array_equal(record.records[0].acceleration, data.record.acceleration)
     second = make_bridge_column_events.second_motion()
@@ -145,20 +146,20 @@ def test_the_set_of_two_events_has_the_noise_of_sensors_on_the_response_of_a_col
     sigma = np.array(list(BRIDGE_COLUMN_SENSOR_NOISE.values()))
     np.testing.assert_allclose(noise.std(axis=1), sigma, rtol=4.5 / np.sqrt(2 * noise.shape[1]))
     assert attributes["truth"]["sigma_displacement"] == sigma[1]
-    with pytest.raises(ValueError, match="events=1 .EQ1. or events=2"):
-        bridge_column_data(events=3)
-    with pytest.raises(ValueError, match="events= chooses bundled data"):
-        bridge_column(events=2, record=data.record)
+    with pytest.raises(ValueError, match="expected data='eq1', 'eq1-eq2', 'short'"):
+        bridge_column_data("eq3")
+    with pytest.raises(ValueError, match="data= chooses bundled data"):
+        bridge_column(data="eq1-eq2", record=data.record)
 
 
 @pytest.mark.slow
 def test_two_events_inform_every_parameter_and_one_does_not():
     """Standard deviations of the normal approximation at the truth, divided by those of the prior."""
     shares = {}
-    for events, sigma in ((1, NOISE), (2, np.array(list(BRIDGE_COLUMN_SENSOR_NOISE.values())))):
+    for events, sigma in (("eq1", NOISE), ("eq1-eq2", np.array(list(BRIDGE_COLUMN_SENSOR_NOISE.values())))):
         record = bridge_column_data(events).record
         column = RCColumn.lhpost(record)
-        inside = record.in_events if events == 2 else slice(None)
+        inside = record.in_events if events == "eq1-eq2" else slice(None)
         rows = [
             (column.simulate(TRUTH + step) - column.simulate(TRUTH - step))[:, inside] / (2.0 * step.max())
             for step in 1e-3 * np.diag(TRUTH)
@@ -167,11 +168,11 @@ def test_two_events_inform_every_parameter_and_one_does_not():
         prior = np.array([0.30, 0.20, 0.60, 0.60, 0.40])
         covariance = np.linalg.inv(jacobian @ jacobian.T + np.diag(prior**-2))
         shares[events] = np.sqrt(np.diag(covariance)) / prior
-    assert shares[1][3] > 0.8 and shares[2].max() < 0.1 and (shares[2] < 0.1 * shares[1]).all()
+    assert shares["eq1"][3] > 0.8 and shares["eq1-eq2"].max() < 0.1 and (shares["eq1-eq2"] < 0.1 * shares["eq1"]).all()
 
 
 def test_the_posterior_of_two_events():
-    posterior = bridge_column(events=2, every=16)
+    posterior = bridge_column(data="eq1-eq2", every=16)
     assert posterior.parameter_names == ["Ec", "Es", "a0", "a1", "ft", "sigma_acceleration", "sigma_displacement"]
     model, measured = posterior.likelihood.model, posterior.likelihood.measurements
     assert model.n_steps == measured.n_steps and model.loading.names == ("EQ1", "EQ2")
@@ -179,6 +180,18 @@ def test_the_posterior_of_two_events():
     inside = np.isfinite(measured.values).all(axis=0)
     np.testing.assert_array_equal(inside, model.loading.in_events)
     assert rrmse(simulated[:, inside], measured.values[:, inside]).max() < 0.5
+
+
+def test_the_first_example_finds_its_truth_and_can_be_used():
+    posterior = bridge_column(data="short")
+    truth = bridge_column_data("short").attributes["truth"]
+    sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    low, high = np.quantile(samples, [0.05, 0.95], axis=0)
+    known = np.array([truth[name] for name in posterior.parameter_names])
+    assert ((low < known) & (known < high)).sum() >= 6  # of seven 90 % intervals
+    assert check_result(sampler).status == "use"
 
 
 # --- prior and posterior ---------------------------------------------------------------------------------------------

@@ -70,7 +70,7 @@ if fast:
 # 1.6 times as strong, EQ3 in the other direction. Six multiples of nominal values are unknown, among them the yield
 # strength of the bars, about which EQ1 says nothing.
 
-bundled = problems.bridge_column_data(events=2).record.records
+bundled = problems.bridge_column_data("eq1-eq2").record.records
 first, second = (
     record.trim(start, start + LENGTH).resample(DT) for record, start in zip(bundled, (5.0, 4.0), strict=True)
 )

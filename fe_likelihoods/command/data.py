@@ -27,8 +27,9 @@ from .schema import did_you_mean
 __all__ = ["BUNDLED", "FEWEST_SAMPLES", "is_dataset", "read_base_motion", "read_bundled", "read_measured", "within"]
 
 BUNDLED = {
-    "column-eq1": ("bridge_column_data", (1,)),
-    "column-eq1-eq2": ("bridge_column_data", (2,)),
+    "column-short": ("bridge_column_data", ("short",)),
+    "column-eq1": ("bridge_column_data", ("eq1",)),
+    "column-eq1-eq2": ("bridge_column_data", ("eq1-eq2",)),
     "bridge-twin": ("isolated_bridge_data", ("twin",)),
     "bridge-means": ("isolated_bridge_data", ("means",)),
 }

@@ -213,33 +213,32 @@ def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:
     """Numbers of simulations, cache hits and wall times."""
     rows, of_posterior = [], _report_of(run)
     if run.tempered:
+        sampler = run.sampler
+        rows.append(("simulations of the run", f"{sampler.simulations:.0f}"))
+        if sampler.simulations_of_guides > 0.0:
+            rows += [
+                ("of these, for the search of the guide", f"{sampler.simulations_of_guides:.0f}{_of_parts(run)}"),
+                ("of these, draws and moves", f"{sampler.simulations - sampler.simulations_of_guides:.0f}"),
+            ]
         rows += [
-            ("simulations of the run", _count(run)),
-            ("evaluations of the log-density", f"{run.sampler.evaluations}"),
-            ("wall time of the sampler", _duration(run.sampler.seconds)),
+            ("evaluations of the log-density, also of known responses", f"{sampler.evaluations}"),
+            ("wall time of the sampler", _duration(sampler.seconds)),
         ]
     if of_posterior:
         rows += [
-            ("simulations by this posterior in this process, without predictions", f"{of_posterior['simulations']}"),
+            ("further simulations for fit and judgement", f"{fits.simulations}"),
+            ("simulations in this process, without predictions", f"{of_posterior['simulations']}"),
             ("wall time of these simulations", _duration(of_posterior["seconds"])),
             ("answers from the cache", f"{of_posterior['cache_hits']}, {of_posterior['disk_hits']} of them from disk"),
         ]
-        rows.append(("simulations for this report", f"{fits.simulations}"))
     return rows
 
 
-def _count(run: FinishedRun) -> str:
-    """Number of simulations; simulations with short parts of the record count as fractions."""
-    text = f"{run.sampler.simulations:.0f}"
+def _of_parts(run: FinishedRun) -> str:
+    """How many simulations of this process were short parts of the record, which count as fractions."""
     likelihoods = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
     parts = sum(part.simulations for likelihood in likelihoods for part in likelihood.shortened)
-    if not parts:
-        return text
-    whole = sum(likelihood.simulations for likelihood in likelihoods)
-    return (
-        f"{whole + parts} runs of the model in this process, {parts} of them with short parts of the record, with "
-        f"which the guide starts; the run counts those as fractions, so it took {text} full simulations"
-    )
+    return f"; {parts} simulations of short parts of the record count as fractions" if parts else ""
 
 
 def _report_of(run: FinishedRun) -> dict[str, Any]:

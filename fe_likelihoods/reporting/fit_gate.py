@@ -29,7 +29,7 @@ __all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fi
 logger = logging.getLogger(__name__)
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior
-NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, as a share of the 90 % interval
+NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
 SMALL_PROBABILITY = 0.01
 USELESS_ERROR = 1.2  # RRMSE of a fit that is clearly worse than a response of zero
@@ -373,11 +373,9 @@ def _of_the_prior(rows: Sequence[ParameterRow]) -> list[Finding]:
     found, edges = [], []
     flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
     for row in (row for row in rows if row not in flat):  # where the data say little, the prior is at its own edge
-        width = row.high - row.low
-        if width > 0.0 and row.low - row.lower < NEAR_BOUND * width:
-            edges.append(f"{row.label} at {row.lower:.4g}")
-        if width > 0.0 and row.upper - row.high < NEAR_BOUND * width:
-            edges.append(f"{row.label} at {row.upper:.4g}")
+        near = NEAR_BOUND * np.nanmin([row.high - row.low, row.prior_sd])
+        edges += [f"{row.label} at {row.lower:.4g}"] if row.low - row.lower < near else []
+        edges += [f"{row.label} at {row.upper:.4g}"] if row.upper - row.high < near else []
     if edges:
         text = f"The posterior reaches the edge of its prior: {listed(edges)}. The bound, not the data, ends it there."
         action = (

@@ -20,7 +20,7 @@ __all__ = ["EXAMPLES", "make_report"]
 def column() -> tuple[Posterior, np.ndarray]:
     """The bridge column under two events, and the truth of its data."""
     truth = [*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_SENSOR_NOISE.values()]
-    return problems.bridge_column(events=2, every=4), np.array(truth)
+    return problems.bridge_column(data="eq1-eq2", every=4), np.array(truth)
 
 
 def bridge() -> tuple[Posterior, np.ndarray]:

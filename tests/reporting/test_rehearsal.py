@@ -99,7 +99,9 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
 
 
 def test_a_model_without_a_step_that_could_be_halved_is_told():
-    model = FunctionModel(lambda theta: central_differences(theta, MOTION, 8), ("stiffness", "damping"), TOP, 0.01, MOTION.n_steps)
+    model = FunctionModel(
+        lambda theta: central_differences(theta, MOTION, 8), ("stiffness", "damping"), TOP, 0.01, MOTION.n_steps
+    )
     fitted = posterior_of(lambda theta, record: central_differences(theta, record, 8))
     posterior = Posterior(FELikelihood(model, fitted.likelihood.measurements), fitted.prior)
     found = rehearse(posterior).findings

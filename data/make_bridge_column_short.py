@@ -1,0 +1,63 @@
+"""Make data/bridge_column_short.h5: ten seconds of synthetic data for the first examples of the bridge column.
+
+The truth is **assumed** and lies within the priors of Ramancha et al. (2022). Of the published means, one is six
+standard deviations away from its prior mean. The responses are those of the model that is updated, so that they differ
+from the model by the noise alone, and a run finds the truth.
+
+Run the script with ``make data``. It writes the same file every time.
+"""
+
+from pathlib import Path
+
+from fe_likelihoods.data.ground_motion import stochastic_motion
+from fe_likelihoods.data.make_bridge_column_eq1 import END_FREQUENCY, FILTER_DAMPING, HIGH_PASS, SHAPE, START_FREQUENCY
+
+from fe_likelihoods import Record
+from fe_likelihoods.problems import BRIDGE_COLUMN_NOISE, SHORT_SUBSTEPS, bridge_column_measurements
+from fe_likelihoods.signals.datasets import write_dataset
+from fe_likelihoods.units import G0
+
+SEED = 17
+NOISE_SEED = 1
+DURATION = 10.0  # s
+PEAK = 0.40 * G0  # m/s2
+PEAK_TIME = 5.0  # s
+DT = 1.0 / 64.0  # s
+TRUTH = {"Ec": 0.8, "Es": 1.05, "a0": 0.7, "a1": 1.5, "ft": 1.3}
+
+
+def short_motion() -> Record:
+    """Make the stochastic base motion, scaled to PEAK, with the spectral content of EQ1."""
+    motion = stochastic_motion(
+        SEED,
+        dt=DT / 4,
+        duration=DURATION,
+        peak=PEAK,
+        peak_time=PEAK_TIME,
+        shape=SHAPE,
+        frequencies=(START_FREQUENCY, END_FREQUENCY),
+        drift_time=40.0,
+        filter_damping=FILTER_DAMPING,
+        high_pass=HIGH_PASS,
+    )
+    source = "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters"
+    return Record("synthetic short motion", DT / 4, motion, source).resample(DT)
+
+
+def main() -> None:
+    """Write the file."""
+    record = short_motion()
+    measurements = bridge_column_measurements(
+        record, theta=TRUTH, seed=NOISE_SEED, n_strips=40, substeps=SHORT_SUBSTEPS
+    )
+    attributes = {
+        "title": "Synthetic short test of the bridge column: NOT measured data",
+        "truth": TRUTH | {f"sigma_{k}": v for k, v in BRIDGE_COLUMN_NOISE.items()},
+        "seed": SEED,
+        "made_by": "data/make_bridge_column_short.py",
+    }
+    write_dataset(Path(__file__).with_name("bridge_column_short.h5"), record, measurements, attributes)
+
+
+if __name__ == "__main__":
+    main()
