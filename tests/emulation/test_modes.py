@@ -108,7 +108,7 @@ def test_a_result_with_many_modes_of_one_start_is_refused():
     assert unseen_share(sampler.guide.search) > 0.3
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
     """Only a^2 + b^2 is identified: the posterior is a ring, and the Laplace approximation at one point is short."""
     time, channels = 0.02 * np.arange(200), [Channel("top", "displacement", "m")]

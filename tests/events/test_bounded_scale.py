@@ -66,7 +66,7 @@ def test_extreme_points_stay_between_the_bounds():
     assert not np.isnan(scales.log_jacobian(points)).any()
 
 
-@pytest.mark.parametrize("low, high", ((0.0, 1.0), (2.0, 6.0)))
+@pytest.mark.parametrize("low, high", [(0.0, 1.0), pytest.param(2.0, 6.0, marks=pytest.mark.slow)])
 def test_marginal_likelihood_is_the_closed_form(low, high, rng, monkeypatch):
     """Normal errors of the logit: the measured logit is normal with the sum of both variances."""
     data, sds = [-1.0, 0.5, 3.0], np.array([0.2, 0.6, 1.5])

@@ -41,7 +41,7 @@ def without_correction(posterior: HierarchicalPosterior) -> HierarchicalPosterio
     return posterior
 
 
-@pytest.mark.parametrize("n_flat", [0, 2, 5])
+@pytest.mark.parametrize("n_flat", [0, 2, pytest.param(5, marks=pytest.mark.slow)])
 def test_tests_that_say_nothing_do_not_move_a_common_parameter(n_flat, rng):
     """The standard error of the fits grows with the number of tests; the control is wrong by half a deviation."""
     posterior = HierarchicalPosterior(some_tests(n_flat, rng), {"k": LINEAR}, common={"c": Uniform(0.0, 1.0)})

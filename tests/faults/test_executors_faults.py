@@ -248,6 +248,7 @@ def test_dask_gives_up_every_worker_that_dies(tmp_path, monkeypatch):
         assert np.isfinite(values[:2]).all() and np.isneginf(values[2])
 
 
+@pytest.mark.slow
 @needs("dask")
 @needs("distributed")
 def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_path, monkeypatch):

@@ -96,7 +96,8 @@ def scores_of_forty_runs(mode, target, nwalkers, seed):
 @pytest.mark.parametrize(
     "mode, target, nwalkers, low",
     [
-        *((mode, Gaussian, 150, 0.6) for mode in ("default", "moves", "literal", "tmcmc")),
+        *((mode, Gaussian, 150, 0.6) for mode in ("default", "tmcmc")),
+        *(pytest.param(mode, Gaussian, 150, 0.6, marks=pytest.mark.slow) for mode in ("moves", "literal")),
         pytest.param("moves", TwoModes, 120, 0.6, marks=pytest.mark.slow),
         # recycling draws evenly from the modes: the error is smaller than stated, which is that of independent draws
         pytest.param("default", TwoModes, 250, 0.4, marks=pytest.mark.slow),
