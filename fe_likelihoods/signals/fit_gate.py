@@ -14,6 +14,7 @@ geometric mean, of the errors of the best response, and to less than 0.7 if the 
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -188,20 +189,28 @@ def find_faults(
 def describe_unit(factor: float, dimension: str) -> str:
     """Units whose ratio is about a factor or its inverse, in words; empty if there are none.
 
-    Those of the channel's dimension come first, then those of accelerations, in which the base motion may be wrong.
+    Ratios to the SI unit of the channel's dimension come first. Then come ratios of its other units, and units of
+    accelerations, in which the base motion may be wrong.
     """
-    for each in (dimension, "acceleration"):
-        units = {unit.name: unit.factor for unit in UNITS.values() if unit.dimension == each}
-        bases = [name for name in (DIMENSIONS[each], "g") if name in units]
-        pairs = {
-            f"{base} and {name}": units[base] / units[name] for base in bases for name in units if name not in bases
-        }
-        pairs |= {f"{bases[0]} and {name}": units[bases[0]] / units[name] for name in bases[1:]}
-        apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in pairs.items()}
+    own, motion = _ratios(dimension), _ratios("acceleration")
+    bases = {DIMENSIONS[dimension], "m/s2", "g"}
+    firsts, of_motion = (
+        {names: value for names, value in ratios.items() if bases & set(names.split(" and "))}
+        for ratios in (own, motion)
+    )
+    for ratios in (firsts, own | of_motion):
+        apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in ratios.items()}
         least = min(apart.values(), default=math.inf)
         if least < math.log(_SAME_UNITS):
             return " or ".join(names for names, value in apart.items() if value < least + _EQUALLY_NEAR)
     return ""
+
+
+def _ratios(dimension: str) -> dict[str, float]:
+    """Ratios of the units of a dimension, by their names; the SI unit, and g, come first in a pair."""
+    units = {unit.name: unit.factor for unit in UNITS.values() if unit.dimension == dimension}
+    order = sorted(units, key=lambda name: (name != DIMENSIONS[dimension], name != "g"))
+    return {f"{one} and {other}": units[one] / units[other] for one, other in combinations(order, 2)}
 
 
 def _is_factor(value: float) -> bool:
