@@ -1,16 +1,17 @@
-"""Reports of three systems, to be looked at: ``python -m tests.reporting.example_reports FOLDER [NAME ...]``.
+"""Reports of four systems, to be looked at: ``python -m tests.reporting.example_reports FOLDER [NAME ...]``.
 
-The bridge column (both events), the isolated bridge, and a steel frame in OpenSees; synthetic data, reduced settings, a
-guide, so that each takes a few minutes.
+The bridge column, once with displacements in a wrong unit, the isolated bridge, and a steel frame in OpenSees; synthetic
+data, a guide, so that each takes a few minutes.
 """
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from fe_likelihoods import Posterior, problems, propagate, report
+from fe_likelihoods import FELikelihood, Posterior, problems, propagate, report
 from samplers import SMCSampler
 from tests import opensees_frame
 
@@ -18,9 +19,19 @@ __all__ = ["EXAMPLES", "make_report"]
 
 
 def column() -> tuple[Posterior, np.ndarray]:
-    """The bridge column under two events, and the truth of its data."""
-    truth = [*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_SENSOR_NOISE.values()]
-    return problems.bridge_column(data="eq1-eq2", every=4), np.array(truth)
+    """The bridge column, and the truth of its data."""
+    posterior = problems.bridge_column(data="short")
+    truth = problems.bridge_column_data("short").attributes["truth"]
+    return posterior, np.array([truth[name] for name in posterior.parameter_names])
+
+
+def wrong_unit() -> tuple[Posterior, np.ndarray]:
+    """The bridge column with displacements in centimetres that were read as inches."""
+    right, truth = column()
+    likelihood = right.likelihood
+    values = likelihood.measurements.values * np.array([[1.0], [1.0 / 2.54]])
+    wrong = replace(likelihood.measurements, values=values)
+    return Posterior(FELikelihood(likelihood.model, wrong, likelihood.noise), right.prior), truth
 
 
 def bridge() -> tuple[Posterior, np.ndarray]:
@@ -35,7 +46,7 @@ def opensees() -> tuple[Posterior, np.ndarray]:
     return opensees_frame.posterior(1), np.array(opensees_frame.TRUTH)
 
 
-EXAMPLES: dict[str, Callable] = {"column": column, "bridge": bridge, "opensees": opensees}
+EXAMPLES: dict[str, Callable] = {"column": column, "wrong_unit": wrong_unit, "bridge": bridge, "opensees": opensees}
 
 
 def make_report(name: str, folder: Path, walkers: int = 100, steps: int = 2) -> Path:
