@@ -1,7 +1,7 @@
 """Reports of four systems, to be looked at: ``python -m tests.reporting.example_reports FOLDER [NAME ...]``.
 
-The bridge column, once with displacements in a wrong unit, the isolated bridge, and a steel frame in OpenSees; synthetic
-data, a guide, so that each takes a few minutes.
+The bridge column, once with displacements in a wrong unit, the isolated bridge, and a steel frame in OpenSees. The data
+are synthetic, and a guide is used, so that each takes a few minutes.
 """
 
 import argparse
@@ -26,7 +26,7 @@ def column() -> tuple[Posterior, np.ndarray]:
 
 
 def wrong_unit() -> tuple[Posterior, np.ndarray]:
-    """The bridge column with displacements in centimetres that were read as inches."""
+    """The bridge column with displacements in inches that were read as centimetres."""
     right, truth = column()
     likelihood = right.likelihood
     values = likelihood.measurements.values * np.array([[1.0], [1.0 / 2.54]])
