@@ -32,6 +32,7 @@ _IN_MODULES = {
     "emulation.modes": "Mode ModeSearch find_modes",
     "events.agreement": "Agreement",
     "events.stiffness_loss": "StiffnessLoss",
+    "information.identifiability": "Combination Identifiability",
     "likelihood.block_likelihood": "BlockLogLikelihood",
     "likelihood.failures": "TooManyFailures",
     "likelihood.parameters": "Parameter",

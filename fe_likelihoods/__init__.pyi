@@ -10,6 +10,7 @@ from .events.leave_one_out import leave_one_out
 from .events.ratios import EventRatios, LevelRatios
 from .events.stiffness_loss import stiffness_loss
 from .events.stored_posterior import StoredPosterior
+from .information.identifiability import identifiability
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -132,6 +133,7 @@ __all__ = [
     "fragility",
     "from_si",
     "growing_durations",
+    "identifiability",
     "interval_score",
     "leave_one_out",
     "limit_states",

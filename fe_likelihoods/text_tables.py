@@ -1,9 +1,9 @@
-"""Results as text: aligned tables for ``print``."""
+"""Results as text: aligned tables for ``print``, numbers, lists in sentences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["NamedResults", "number", "text_table"]
+__all__ = ["NamedResults", "listed", "number", "text_table"]
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
@@ -35,6 +35,11 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
 def number(value: float, digits: int = 3) -> str:
     """A number with some significant digits; "-" for NaN."""
     return "-" if value != value else f"{value:.{digits}g}"  # noqa: PLR0124 - NaN differs from itself
+
+
+def listed(texts: Sequence[str]) -> str:
+    """Texts as a list in a sentence: "a, b and c"."""
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
 
 
 class NamedResults(dict[str, Any]):

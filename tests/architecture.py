@@ -42,7 +42,7 @@ ORDER = {
         ("reporting",),
         ("problems",),
         ("adapters",),
-        ("column_damage",),
+        ("column_damage", "information"),
         ("prediction",),
         ("events", "models"),
         ("likelihood",),

@@ -132,6 +132,8 @@ def _say_simulation(
     say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for finding in rehearsal.findings:
         say(f"{'Note' if finding.weight == REMARK else 'CAUTION'}: {finding}")
+    if rehearsal.identifiability is not None:
+        say(f"{rehearsal.identifiability}")
     return rehearsal
 
 

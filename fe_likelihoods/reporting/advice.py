@@ -8,9 +8,10 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..simulation.model import SimulationBatch, simulate_batch
+from ..text_tables import listed
 from .discretisation import find_discretisation_error, simulations_of_the_test
 from .failures import Failures, failures
-from .fit_gate import fit_gate, listed
+from .fit_gate import fit_gate
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
 from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
 from .table import ParameterRow, parameter_rows

@@ -22,9 +22,10 @@ from ..signals.events import find_events
 from ..signals.fit_gate import CARE, LARGE_ERROR, REMARK, WRONG, Fault, Finding, describe_unit, find_faults
 from ..simulation.faults import ChangedModel
 from ..simulation.model import simulate_batch
+from ..text_tables import listed
 from .table import ParameterRow, rows_of
 
-__all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "listed", "windows_of"]
+__all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "windows_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -419,8 +420,3 @@ def _of_the_truth(rows: Sequence[ParameterRow]) -> list[Finding]:
 
 def _percent(error: float) -> str:
     return f"{100.0 * error:.3g} %"
-
-
-def listed(texts: list[str]) -> str:
-    """Texts as a list in a sentence."""
-    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"

@@ -1,11 +1,12 @@
 """A rehearsal before a run: is the model what a sampler takes it for, and are its numerical errors small enough?
 
 A model that returns something else the second time, or the same under every motion, ends in numbers that look like a
-result. `rehearse` simulates a few times what a run would simulate thousands of times.
+result. `rehearse` simulates a few times what a run would simulate thousands of times. The search for the best fit, at
+which it halves step and mesh, also says which parameters the data determine.
 """
 
 from collections.abc import Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from ..emulation.modes import Mode, find_modes
 from ..emulation.target import ResponseTarget
+from ..information.identifiability import Identifiability, of_mode
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
@@ -51,12 +53,16 @@ class Rehearsal(NamedTuple):
         Duration of one simulation [s].
     searched : float
         Simulations that a search for the best fit took from one start; NaN where there was none.
+    identifiability : Identifiability or None
+        What the data tell of the parameters, from this search; None where it found no fit, or where there are several
+        data sets.
     """
 
     findings: tuple[Finding, ...]
     simulations: int
     seconds: float
     searched: float
+    identifiability: Identifiability | None = None
 
 
 class _Stage:
@@ -119,7 +125,7 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
     mean = posterior.prior.mean()
     with tqdm(total=0, disable=not progress, unit="simulation", desc="check") as bar, _announced(posterior, bar):
         stage, before = _Stage(bar), _made(posterior)
-        seconds, searched = 0.0, np.nan
+        seconds, searched, told = 0.0, np.nan, None
         compared: list[Compared] = []
         for key, (likelihood, columns) in zip(keys, posterior.likelihood.parts(), strict=True):
             model = likelihood.model
@@ -145,11 +151,11 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
             found += _of_sizes(likelihood.measurements, model)
             seconds += stage.seconds
         if single and not any(each.weight == WRONG for each in found):
-            refined, searched = _of_discretisation(stage, posterior, seconds)
+            refined, searched, told = _at_best_fit(stage, posterior, seconds)
             found += refined
         found += fit_gate(compared)
         simulations = stage.made + _made(posterior) - before
-    return Rehearsal(by_weight(found), simulations, seconds, searched)
+    return Rehearsal(by_weight(found), simulations, seconds, searched, told)
 
 
 def _made(posterior: Posterior) -> int:
@@ -280,23 +286,29 @@ def _of_sizes(measured: Measurements, model: Any) -> list[Finding]:
     return found
 
 
-def _of_discretisation(stage: _Stage, posterior: Posterior, seconds: float) -> tuple[list[Finding], float]:
-    """The error of step and mesh at the best fit, and the simulations of the search for it."""
+def _at_best_fit(
+    stage: _Stage, posterior: Posterior, seconds: float
+) -> tuple[list[Finding], float, Identifiability | None]:
+    """The error of step and mesh at the best fit, the simulations of the search for it, and what the data tell."""
     n = len(posterior.likelihood.model.parameter_names)
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
     if limit < 10 * (n + 1):
         text = f"The test takes about {15 * (n + 1)} simulations of {seconds:.2g} s."
         action = "The run makes it at its end. It costs less to know now: halve the step and the mesh at one point."
-        return [Finding("Step and mesh were not tested", REMARK, text, action)], np.nan
+        return [Finding("Step and mesh were not tested", REMARK, text, action)], np.nan, None
     try:
         target, mode, searched = _search(stage, posterior, limit)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return [Finding("Step and mesh were not tested", REMARK, f"No fit was found: {error}.")], np.nan
+        return [Finding("Step and mesh were not tested", REMARK, f"No fit was found: {error}.")], np.nan, None
     if mode is None:
-        return [Finding("Step and mesh were not tested", REMARK, "No fit was found.")], searched
+        return [Finding("Step and mesh were not tested", REMARK, "No fit was found.")], searched, None
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
-    return find_discretisation_error(target.posterior, mode.parameters, around.std(axis=0), stage.simulate), searched
+    found = find_discretisation_error(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)
+    told = None
+    with suppress(ValueError):  # a parameter that its prior does not let vary there
+        told = of_mode(target.posterior, mode)
+    return found, searched, told
 
 
 def _search(stage: _Stage, posterior: Posterior, limit: float) -> tuple[ResponseTarget, Mode | None, float]:

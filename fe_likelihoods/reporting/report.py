@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
@@ -74,6 +75,7 @@ class Contents(NamedTuple):
     has_truth: bool
     evidence: list[str]
     fits: Fits
+    told: list[str]
     posterior_pictures: list[Picture]
     fit_pictures: list[tuple[str, list[Picture]]]
     run_pictures: list[Picture]
@@ -216,6 +218,7 @@ def gather(
         has_truth=bool(np.isfinite(run.truth).any()),
         evidence=evidence(run),
         fits=fits,
+        told=_told(run),
         posterior_pictures=draw_posterior(run),
         fit_pictures=[(fit.title, [*draw_fit(fit), *draw_residuals(fit)]) for fit in fits.fits],
         run_pictures=draw_run(run),
@@ -234,6 +237,16 @@ def gather(
         fingerprints=fingerprints(run),
         repeat=repeat or how_to_repeat(run),
     )
+
+
+def _told(run: FinishedRun) -> list[str]:
+    """Which parameters the data determine, in sentences; none where that is not known."""
+    if run.prior is None or run.is_inconclusive:
+        return []
+    try:
+        return list(of_samples(run.posterior, run.samples).sentences)
+    except ValueError:  # few samples, or a prior without standard normal coordinates
+        return []
 
 
 def render(contents: Contents) -> str:

@@ -63,6 +63,7 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
     found = rehearse(posterior_of(fine), {"weaker": MOTION.scale(0.5)})
     assert names(found) == [] and found.simulations == len(made) and found.seconds > 0.0
     assert found.searched > 3.0
+    assert str(found.identifiability).startswith("These data determine stiffness and damping (")
 
 
 @pytest.mark.parametrize(("noise", "weight"), [(0.003, "care"), pytest.param(1.5, None, marks=pytest.mark.slow)])

@@ -28,6 +28,7 @@ from fe_likelihoods import (
     SimulationFailed,
     TruncatedNormal,
     Uniform,
+    identifiability,
     peak,
     propagate,
     report,
@@ -104,6 +105,12 @@ def test_the_page_needs_nothing_from_elsewhere(page):
         assert png.startswith(b"\x89PNG") and alt
     assert len(page.images) >= 5
     assert sum(alt.startswith("Histogram of the probability integral") for _, alt in page.images) == 1  # not of peaks
+
+
+def test_the_page_says_what_the_data_determine(page, vibrating):
+    sampler, posterior = vibrating
+    assert str(identifiability(posterior, sampler.get_chain(flat=True))) in page.text
+    assert "These data determine" in page.text
 
 
 def test_texts_of_users_are_escaped_and_shown(page):

@@ -1,0 +1,1 @@
+"""What the data tell of the parameters, and which sensors would tell most."""
