@@ -44,7 +44,6 @@ from . import (
     storage,
     strain_penetration,
     transfer,
-    transfer_twins,
     truth,
     utilisation,
 )
@@ -89,10 +88,8 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "fit_gate": fit_gate.fit_gate,
     "level_ratios": decisions.level_ratios,
     "fragility_bands": decisions.fragility_bands,
-    "transfer_twins": transfer_twins.transfer_twins,
     "noises": noises.noises,
     "transfer": transfer.transfer,
-    "transfer_median": transfer.transfer_median,
     "measured_peaks": measured_peaks.measured_peaks,
     "transfer_coupon": measured_tests.coupon,
     "transfer_frame": measured_tests.frame,
@@ -119,11 +116,10 @@ QUICK: dict[str, dict[str, Any]] = {
     "sequential": {"walkers": 100},
     "hierarchy_ranks": {"data_sets": 3},
     "hierarchy_warnings": {"problems": 3},
-    "new_event": {"data_sets": 2},
+    "new_event": {"data_sets": 2, "subsets": 2},
     "fit_gate": {"cases": 1, "events": 1},
     "level_ratios": {"data_sets": 2},
     "fragility_bands": {"data_sets": 2},
-    "transfer_twins": {"data_sets": 2},
     "stiffness_loss": {"twins": 4, "file": "results/stiffness_loss_quick.jsonl"},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""

@@ -1,24 +1,12 @@
 """Peaks of the eleven earthquakes of `benchmarks.transfer`, with the error of the model in three forms.
 
 The peak of each event is predicted by its own posterior, without an error of the model, with white noise and with
-``noise="model"``; and by the ten other events, with constant and with level-dependent ratios. The measurements are real
-and no part of the project, see `benchmarks.transfer`.
+``noise="model"``. The measurements are real and no part of the project, see `benchmarks.transfer`.
 """
-
-import warnings
 
 import numpy as np
 
-from fe_likelihoods import (
-    EventRatios,
-    Hierarchy,
-    LevelRatios,
-    event_level,
-    event_ratio,
-    predict_new_event,
-    propagate,
-    share_within,
-)
+from fe_likelihoods import propagate, share_within
 from fe_likelihoods.prediction.score_tables import QuantityScores
 
 from . import transfer
@@ -37,30 +25,6 @@ def measured_peaks(repeats: int = 1) -> list[Row]:
         for name, kind in (("parameters alone", False), ("white noise", True), ('noise="model"', "model")):
             own = [_own_peak(fit, kind, seed) for fit in fits.values()]
             rows += _peak_rows(f"own event, {name}, seed {seed}", own)
-        ratios = {name: event_ratio(fit.posterior, fit.samples[::6], transfer._PEAK) for name, fit in fits.items()}
-        levels = {name: event_level(fit.posterior, fit.samples[::6], transfer._PEAK) for name, fit in fits.items()}
-        scores: dict[str, list[QuantityScores]] = {"EventRatios": [], "LevelRatios": []}
-        for name, fit in fits.items():
-            others = [other for other in fits if other != name]
-            posterior, sampler = transfer._population({other: fits[other] for other in others}, seed, noise=False)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the share of the ends is at its bound in one event
-                hierarchy = Hierarchy(posterior, sampler.get_chain(flat=True))
-            values = [ratios[other] for other in others]
-            known = {
-                "EventRatios": EventRatios(values),
-                "LevelRatios": LevelRatios(values, [levels[other] for other in others]),
-            }
-            likelihood = fit.posterior.likelihood
-            for kind, each in known.items():
-                options = {"quantity": transfer._PEAK, "ratios": each, "n": 500, "seed": seed}
-                predicted = predict_new_event(hierarchy, fit.posterior, likelihood.model.supports, **options)
-                scores[kind].append(predicted.score(likelihood.measurements))
-        for kind, each in scores.items():
-            rows += _peak_rows(f"other events, {kind}, seed {seed}", each)
-        forms = LevelRatios(list(ratios.values()), list(levels.values())).forms
-        note = ", ".join(f"{form} {share:.2f}" for form, share in forms.items())
-        rows.append(Row("forms of the ratio by evidence", f"all events, seed {seed}", None, "", note))
     return rows
 
 
@@ -76,7 +40,8 @@ def _peak_rows(case: str, scores: list[QuantityScores]) -> list[Row]:
     biases = [each.median[0] / each.measured[0] for each in scores]
     ends = [each.upper[0] / each.median[0] for each in scores]
     interval = [each.interval_score[0] / each.measured[0] for each in scores]
-    rows = [Row(f"peaks within {level:.0%}", case, len(pit) * share_within(pit, level), "") for level in (0.5, 0.9)]
+    shares = {level: share_within(pit, level) for level in (0.5, 0.9)}
+    rows = [Row(f"peaks within {level:.0%}", case, each.inside, "", f"{each}") for level, each in shares.items()]
     for what, values in (
         ("predicted median / measured peak", biases),
         ("upper end / median of the peak", ends),

@@ -210,7 +210,8 @@ def score_case(
             scored[f"{way}, model"] = propagate(likelihood, samples, **options, **settings).score(case.measured)
     alone = propagate(case.model, fit.structure, quantity=quantities, **settings)
     rng = np.random.default_rng(seed)
-    draws = [EventRatios([ratios[name]], **GUESS).draw(len(alone.values), rng) for name in case.numbers]
+    ones = np.ones(len(alone.values))
+    draws = [EventRatios([ratios[name]], **GUESS).draw(ones, rng) for name in case.numbers]
     names, units = zip(*((channel.name, channel.unit) for channel in alone.channels), strict=True)
     measured = measured_quantity(quantities, case.measured)
     scored["ratios"] = score_values(names, units, alone.values * np.stack(draws, axis=1), measured, 0.9)
@@ -237,6 +238,8 @@ def within(scored: Sequence[Mapping[str, QuantityScores]]) -> list[Row]:
             np.concatenate(values) / size
             for values in ([one.upper - one.lower for one in each], [one.interval_score for one in each])
         )
-        text = f"of {len(pit)}; mean width {width.mean():.2f}, interval score {score.mean():.2f}"
-        rows += [Row(f"numbers within {p:.0%}, {way}", "all", share_within(pit, p), "", text) for p in (0.5, 0.9)]
+        text = f"mean width {width.mean():.2f}, interval score {score.mean():.2f}"
+        for p in (0.5, 0.9):
+            share = share_within(pit, p)
+            rows.append(Row(f"numbers within {p:.0%}, {way}", "all", share.value, "", f"{share}; {text}"))
     return rows

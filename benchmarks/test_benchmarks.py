@@ -10,7 +10,7 @@ import emcee
 import numpy as np
 import pytest
 
-from benchmarks import job, noises, peers, transfer, transfer_twins, truth
+from benchmarks import job, new_event, noises, peers, tested_column, transfer, truth
 from benchmarks.__main__ import BENCHMARKS, QUICK, main, options_of, parsed
 from benchmarks.comparison import compare
 from benchmarks.growth import exponent
@@ -18,14 +18,16 @@ from benchmarks.rows import Row, as_table, machine, write_json
 from benchmarks.targets import as_row, errors, target_named
 from fe_likelihoods import (
     BridgeDeck,
-    EventRatios,
+    Channel,
     FELikelihood,
+    FunctionModel,
     GaussianNoise,
     HalfNormal,
     LinearStructure,
     Measurements,
     Posterior,
     Record,
+    peak,
 )
 from fe_likelihoods.models.linear_system import respond_structure
 from samplers import SMCSampler
@@ -197,21 +199,42 @@ def test_run_of_the_truth_benchmark_is_compared_with_the_truth():
 
 def test_predictions_of_real_events_say_where_the_data_are_missing(tmp_path, monkeypatch):
     monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
-    for benchmark in (transfer.transfer, transfer.transfer_median):
-        (row,) = benchmark()
-        assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
+    (row,) = transfer.transfer()
+    assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
     monkeypatch.setattr(noises, "_FOLDER", tmp_path)
     for part in (noises._painter_street, noises._meloland):
         (row,) = part(1)
         assert row.case == "SKIPPED" and row.value is None and str(tmp_path) in row.note
 
 
-def test_left_out_ratios_have_the_t_distribution_of_event_ratios(rng):
-    logs = 0.1 * rng.standard_normal(11)
-    t, scale = transfer_twins.leave_one_out_t(logs[None])
-    ratios = EventRatios(np.exp(np.delete(logs, 3)))
-    assert scale[0, 3] == pytest.approx(ratios.scale)
-    assert t[0, 3] == pytest.approx((logs[3] - np.log(ratios.median)) / ratios.scale)
+def test_new_events_say_where_the_data_are_missing_and_have_twins_without_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "_FOLDER", tmp_path)
+    monkeypatch.setattr("benchmarks.measured_transfer.SHARED", tmp_path)
+    monkeypatch.setattr(tested_column, "FOLDER", tmp_path)
+    rows = new_event.new_event(1, data_sets=2)
+    skipped = [row for row in rows if row.case == "SKIPPED"]
+    assert [row.what for row in skipped] == ["Painter Street", "frame", "Meloland", "columns"]
+    assert all(str(tmp_path) in row.note for row in skipped)
+    assert {row.case.split(",")[0] for row in rows if row.case != "SKIPPED"} == {"twins"}
+
+
+def test_subsets_of_events_are_scored_as_the_t_distribution_says(rng):
+    """Ratios of known scatter, from one simulation each: the true share of the others within their intervals."""
+    channels, log_ratios, likelihoods = [Channel("top", "displacement", "m")], 0.1 * rng.standard_normal(60), {}
+    for k, each in enumerate(log_ratios):
+        size = np.array([0.0, 1.0 + k])
+        model = FunctionModel(lambda theta, size=size: [theta[0] * size], ["gain"], channels, 0.1, 2)
+        likelihoods[f"{k}"] = FELikelihood(model, Measurements(channels, 0.1, [1.1 * np.exp(each) * size]))
+    medians = {name: {"gain": 1.1} for name in likelihoods}
+    structure = new_event.Structure(likelihoods, medians, [peak("top")])
+    rows = {(row.what, row.case): row for row in new_event._subsets("twin", structure, 6)}
+    assert rows["sd of the log ratio of the first number", "twin"].value == pytest.approx(log_ratios.std(ddof=1))
+    found = rows["within 90%", "twin, 8 of 60, no prior"]
+    assert found.value == pytest.approx(90.0, abs=8.0) and found.note.startswith("worst of 6: ")
+    assert rows["within 90%", "twin, 1 of 60, default prior"].value > 90.0
+    assert ("within 90%", "twin, 1 of 60, no prior") not in rows
+    wide, narrow = (rows["upper / lower end", f"twin, 3 of 60, prior worth {n}"].value for n in (3, 12))
+    assert wide > narrow
 
 
 def test_files_that_cannot_be_used_are_named_and_left_out(tmp_path, monkeypatch):

@@ -115,4 +115,4 @@ def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(
     assert set(scored) == {"SI", "relative", "relative, model", "window", "modulated", "modulated, model", "ratios"}
     for way in ("relative", "modulated"):  # independent errors add to the largest value
         assert scored[f"{way}, model"].median[0] < scored[way].median[0]
-    assert measured_transfer.within([scored])[0].note.startswith("of 2;")
+    assert measured_transfer.within([scored])[0].note.startswith("0 of 2: 0 to 66 %; mean width")

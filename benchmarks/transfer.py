@@ -5,23 +5,17 @@ middle (channel 7) is predicted. Ways to predict an event:
 
 * "one event, as usual": the posterior of the 1992 main shock, white noise or effective samples, propagated under the
   other ten events;
-* "one event, spread stated": `predict_new_event` from the main shock alone, with the stated priors below for the spread
-  between events and for the ratio of measured to fitted peaks;
+* "one event": `predict_new_event` from the main shock alone, with the priors below for the spread;
 * "other events": each event from the ten others by `predict_new_event`;
 * "other events, amplitude-dependent": the same with `EquivalentLinear`, whose softening and growth of damping are
   common to all events. One event does not tell them from its frequency and damping, so its posterior follows from that
-  of the linear model without simulations of the other one (`_amplitude_dependent`);
-* "..., by the median": peaks by `predict_from_median` with the same populations.
+  of the linear model without simulations of the other one (`_amplitude_dependent`).
 
 The rows are medians over the events (RRMSE, CRPS, interval score and width as multiples of the root mean square of the
 measured channel; coverage of the 90 % band, and of its strong part), the share of measured peaks within their 50 and
 90 % intervals, the median ratios of the upper end of the 90 % interval of the peak to its middle and to its lower end,
 and the root mean square error of the logarithm of the peak as a multiple of the stated one. The last rows are the
 evidence of the amplitude-dependent model of all events relative to the linear one, and its common parameters.
-
-`transfer_median` has the rows "..., by the median" alone, with the share of the ends on the scale "logit"
-instead of "log", and a summary of all seeds. Its other rows compare the two scales of the share, with all events: the
-draws of a new event that have a share above 1, and the evidence of "logit" relative to "log".
 
 The data are no part of this project: set FE_SHARED to a folder with the downloads from https://www.strongmotioncenter.org
 (``*ce89324p.zip``) in ``measured/painter_street_bridge``. Without them one row says so. Files that cannot be used, such
@@ -39,7 +33,6 @@ from scipy.stats import norm
 from fe_likelihoods import (
     BridgeDeck,
     EquivalentLinear,
-    EventRatios,
     FELikelihood,
     GaussianNoise,
     HalfNormal,
@@ -54,9 +47,7 @@ from fe_likelihoods import (
     StoredPosterior,
     Uniform,
     Varying,
-    event_ratio,
     peak,
-    predict_from_median,
     predict_new_event,
     propagate,
     read_record,
@@ -72,7 +63,7 @@ from samplers import SMCSampler
 from .rows import Row
 from .targets import SHARED
 
-__all__ = ["read_events", "transfer", "transfer_median"]
+__all__ = ["read_events", "transfer"]
 
 _FOLDER = SHARED / "measured" / "painter_street_bridge"
 _MAIN = "petrolia_25apr1992_ce89324p"
@@ -92,7 +83,6 @@ _NOISE = "share_ch7"
 _REFERENCE = 0.0005  # [m], near the geometric mean of the levels of the events
 _POWERS = {"softening": norm(0.15, 0.2), "damping_growth": norm(0.2, 0.3)}  # priors of one event
 _COMMON = {"softening": HalfNormal(0.3), "damping_growth": HalfNormal(0.5)}  # priors of all events (assumed)
-_GUESS = {"prior_sd": 0.1, "prior_events": 3.0}  # of the ratio of peaks, for one event (assumed)
 _PEAK = peak("ch7")
 
 
@@ -119,62 +109,12 @@ def transfer(repeats: int = 1) -> list[Row]:
         ]
     for seed in range(1, repeats + 1):
         relative = {name: _calibrate(each, "relative", seed) for name, each in records.items()}
-        ratios = {name: event_ratio(fit.posterior, fit.samples[::6], _PEAK) for name, fit in relative.items()}
-        rows += _from_one(records, relative, ratios, seed)
-        rows += _held_out("other events", relative, ratios, seed)
+        rows += _from_one(records, relative, seed)
+        rows += _held_out("other events", relative, seed)
         amplitude = {name: _amplitude_dependent(fit, seed) for name, fit in relative.items()}
-        rows += _held_out("other events, amplitude-dependent", amplitude, ratios, seed, _COMMON)
+        rows += _held_out("other events, amplitude-dependent", amplitude, seed, _COMMON)
         rows += _evidence(relative, amplitude, seed)
     return rows
-
-
-def transfer_median(repeats: int = 1) -> list[Row]:
-    """Peaks of each event from the others by the median of their population, and a summary of all seeds."""
-    records, rows = read_events()
-    if len(records) < 3:
-        return [
-            *rows,
-            Row("transfer", "SKIPPED", None, "", f"no three files *ce89324p.zip in {_FOLDER}: set FE_SHARED"),
-        ]
-    per_seed: dict[tuple[str, str], list[float]] = {}
-    for seed in range(1, repeats + 1):
-        linear = {name: _calibrate(each, "relative", seed) for name, each in records.items()}
-        amplitude = {name: _amplitude_dependent(fit, seed) for name, fit in linear.items()}
-        for case, fits, common in (("linear", linear, None), ("amplitude-dependent", amplitude, _COMMON)):
-            found = []
-            for name in fits:
-                others = {other: fit for other, fit in fits.items() if other != name}
-                hierarchy = _hierarchy(others, seed, common, noise=False, varying=_BOUNDED)
-                found.append(_by_median(hierarchy, fits, name, seed))
-            new = _peak_rows(f"other events, {case}, by the median", seed, found)
-            for row in new:
-                per_seed.setdefault((row.what, case), []).append(row.value)
-            rows += new
-        rows += _scales_of_share(linear, seed)
-    for (what, case), values in per_seed.items():
-        note = f"{min(values):.3g} to {max(values):.3g}"
-        rows.append(Row(what, f"{case}, by the median, mean of {repeats} seeds", float(np.mean(values)), "", note))
-    return rows
-
-
-def _scales_of_share(fits: dict[str, _Fit], seed: int) -> list[Row]:
-    """Draws of a new event with a share above 1, for both scales of the share, and the evidence of the bounded one."""
-    rows, samplers = [], []
-    for scale, varying in (("log", _VARYING), ("logit", _BOUNDED)):
-        posterior, sampler = _population(fits, seed, None, noise=False, varying=varying)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is counted here
-            draws = Hierarchy(posterior, sampler.get_chain(flat=True)).new_test(20_000, rng=seed)
-        case = f"share on the scale {scale}, seed {seed}"
-        rows.append(Row("draws with a share above 1", case, 100.0 * float((draws["share"] > 1.0).mean()), "%"))
-        samplers.append(sampler)
-    log, logit = samplers
-    error = np.hypot(log.log_evidence_error, logit.log_evidence_error)
-    gain = logit.log_evidence - log.log_evidence
-    return [
-        *rows,
-        Row("log-evidence of logit over log", f"{len(fits)} events, seed {seed}", gain, "", f"+- {error:.2f}"),
-    ]
 
 
 def read_events() -> tuple[dict[str, dict[int, Record]], list[Row]]:
@@ -193,10 +133,8 @@ def read_events() -> tuple[dict[str, dict[int, Record]], list[Row]]:
     return found, rows
 
 
-def _from_one(
-    records: dict[str, dict[int, Record]], relative: dict[str, _Fit], ratios: dict[str, float], seed: int
-) -> list[Row]:
-    """All other events from the main shock alone: as usual, and with a stated spread."""
+def _from_one(records: dict[str, dict[int, Record]], relative: dict[str, _Fit], seed: int) -> list[Row]:
+    """All other events from the main shock alone: as usual, and with the spread between events."""
     if _MAIN not in records:
         return [Row("transfer", "SKIPPED", None, "", f"predictions from one event need {_MAIN}.zip")]
     rows, unseen = [], [name for name in records if name != _MAIN]
@@ -205,30 +143,16 @@ def _from_one(
         scored = [_as_usual(fit, relative[name].posterior, seed) for name in unseen]
         rows += _rows(f"one event, as usual, {noise}", seed, scored)
     single = _hierarchies({_MAIN: relative[_MAIN]}, seed)
-    guess = EventRatios([ratios[_MAIN]], **_GUESS)
-    scored = [_new_event(single, guess, relative[name].posterior, seed) for name in unseen]
-    return rows + _rows("one event, spread stated", seed, scored)
+    return rows + _rows("one event", seed, [_new_event(single, relative, name, seed) for name in unseen])
 
 
-def _held_out(
-    case: str, fits: dict[str, _Fit], ratios: dict[str, float], seed: int, common: dict | None = None
-) -> list[Row]:
-    """Each event from the other ones: by the population and ratios, and the peaks by the median of the population."""
-    scored, by_median = [], []
-    for name, own in fits.items():
+def _held_out(case: str, fits: dict[str, _Fit], seed: int, common: dict | None = None) -> list[Row]:
+    """Each event from the other ones."""
+    scored = []
+    for name in fits:
         others = {other: fit for other, fit in fits.items() if other != name}
-        hierarchies = _hierarchies(others, seed, common)
-        measured = EventRatios([ratios[other] for other in others])
-        scored.append(_new_event(hierarchies, measured, own.posterior, seed))
-        by_median.append(_by_median(hierarchies[0], fits, name, seed))
-    return _rows(case, seed, scored) + _peak_rows(f"{case}, by the median", seed, by_median)
-
-
-def _by_median(hierarchy: Hierarchy, fits: dict[str, _Fit], name: str, seed: int) -> QuantityScores:
-    """Scores of the peak of one event by the median of the population of the others."""
-    posteriors, own = {other: fit.posterior for other, fit in fits.items()}, fits[name].posterior
-    found = predict_from_median(hierarchy, posteriors, own, None, quantity=_PEAK, n=2000, seed=seed)
-    return found.score(own.likelihood.measurements)
+        scored.append(_new_event(_hierarchies(others, seed, common), fits, name, seed))
+    return _rows(case, seed, scored)
 
 
 def _records(path: Path) -> dict[int, Record]:
@@ -372,14 +296,15 @@ def _as_usual(fit: _Fit, other: Posterior, seed: int) -> _Scored:
     return _score(histories, peaks, other)
 
 
-def _new_event(hierarchies: tuple[Hierarchy, Hierarchy], ratios: EventRatios, other: Posterior, seed: int) -> _Scored:
-    """Another event: its peak from the population without the noise, its histories from that with it."""
-    supports = other.likelihood.model.supports
+def _new_event(hierarchies: tuple[Hierarchy, Hierarchy], fits: dict[str, _Fit], name: str, seed: int) -> _Scored:
+    """One event: its peak from the population without the noise, its histories from that with it."""
+    posteriors = {other: fit.posterior for other, fit in fits.items()}
+    options = {"model": posteriors[name], "seed": seed}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # draws with a share above 1 fail and are left out
-        histories = predict_new_event(hierarchies[1], other, supports, noise=True, n=300, seed=seed)
-        peaks = predict_new_event(hierarchies[0], other, supports, quantity=_PEAK, ratios=ratios, n=500, seed=seed)
-    return _score(histories, peaks, other)
+        histories = predict_new_event(hierarchies[1], posteriors, None, noise=True, n=300, **options)
+        peaks = predict_new_event(hierarchies[0], posteriors, None, quantity=_PEAK, n=2000, **options)
+    return _score(histories, peaks, posteriors[name])
 
 
 def _score(histories: Prediction, peaks: Prediction, other: Posterior) -> _Scored:
@@ -408,7 +333,8 @@ def _peak_rows(case: str, seed: int, peaks: Sequence[QuantityScores]) -> list[Ro
     pit, rows = [each.pit[0] for each in peaks], []
     case = f"{case}, {len(peaks)} events, seed {seed}"
     for level in (0.5, 0.9):
-        rows.append(Row(f"peaks within {level:.0%}", case, share_within(pit, level), ""))
+        share = share_within(pit, level)
+        rows.append(Row(f"peaks within {level:.0%}", case, share.value, "", f"{share}"))
     ends = [each.upper[0] / each.median[0] for each in peaks]
     rows.append(Row("upper end / median of the peak", case, _median(ends), "", f"{min(ends):.2f} to {max(ends):.2f}"))
     apart = [each.upper[0] / each.lower[0] for each in peaks]

@@ -11,15 +11,21 @@ import lazy_loader
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# names that were public in 0.2: what takes their place, or their module
+# names that were public: what takes their place, or their module
 _REPLACED = {
     "BandNoise": 'GaussianNoise(channels, groups=edges, level="response", sensor=...), without level= for SI units',
     "EventNoise": 'GaussianNoise(channels, groups="event")',
+    "LevelRatios": 'EventRatios(values, levels=..., form="linear")',
     "MarginalNoise": "posterior.marginal()",
     "ModulatedNoise": 'GaussianNoise(channels, level="response", window=..., sensor=...)',
     "RelativeNoise": 'GaussianNoise(channels, level="measured")',
     "SharedGaussianNoise": 'GaussianNoise(channels, groups="all")',
     "TimeShiftNoise": "FELikelihood(..., time_shifts={channel: largest shift [s]})",
+    "compare_tests": "a sentence of the population: print(hierarchy), Hierarchy.spread",
+    "event_level": "part of event_ratios(hierarchy, posteriors, quantity), as levels",
+    "event_ratio": "event_ratios(hierarchy, posteriors, quantity), of all events together",
+    "predict_from_median": "predict_new_event(hierarchy, posteriors, record, model=..., quantity=...)",
+    "score_left_out": "leave_one_out(hierarchy).scores(posteriors, quantity=...)",
 }
 _IN_MODULES = {
     "adapters": "nautilus_prior serve to_bilby to_pints to_pymc",
@@ -30,7 +36,6 @@ _IN_MODULES = {
     "emulation.emulator": "ResponseEmulator",
     "emulation.guide": "ResponseGuide",
     "emulation.modes": "Mode ModeSearch find_modes",
-    "events.agreement": "Agreement",
     "events.stiffness_loss": "StiffnessLoss",
     "information.identifiability": "Combination Identifiability",
     "likelihood.block_likelihood": "BlockLogLikelihood",
@@ -49,7 +54,7 @@ _IN_MODULES = {
     "prediction.prediction": "Prediction",
     "prediction.reliability": "Exceedance",
     "prediction.score_tables": "HistoryScores QuantityScores",
-    "prediction.scores": "crps_normal crps_samples log_score_normal",
+    "prediction.scores": "Share crps_normal crps_samples log_score_normal",
     "priors.distributions": "Distribution",
     "priors.mixture_prior": "MixtureDistribution",
     "priors.multivariate": "MultivariateDistribution TruncatedMultivariateNormal",

@@ -3,11 +3,9 @@ from .cache.simulation_cache import SimulationCache
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
-from .events.agreement import compare_tests
 from .events.hierarchical_posterior import HierarchicalPosterior, Varying
 from .events.hierarchy_result import Hierarchy
-from .events.leave_one_out import leave_one_out
-from .events.ratios import EventRatios, LevelRatios
+from .events.ratios import EventRatios
 from .events.stiffness_loss import stiffness_loss
 from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
@@ -39,8 +37,8 @@ from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
 from .prediction.averaging import average_predictions
 from .prediction.fragility import fragility
-from .prediction.held_out import score_left_out
-from .prediction.new_event import event_level, event_ratio, predict_from_median, predict_new_event
+from .prediction.held_out import leave_one_out
+from .prediction.new_event import event_ratios, predict_new_event
 from .prediction.propagation import fit_measures, propagate
 from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
 from .prediction.reliability import exceedance
@@ -89,7 +87,6 @@ __all__ = [
     "Hoops",
     "IsolatedBridge",
     "JointLikelihood",
-    "LevelRatios",
     "LinearOscillator",
     "LinearStructure",
     "LogNormal",
@@ -118,14 +115,12 @@ __all__ = [
     "average_predictions",
     "check_fit",
     "check_result",
-    "compare_tests",
     "damage",
     "damage_measures",
     "damage_outputs",
     "dissipated_energy",
     "effective_samples",
-    "event_level",
-    "event_ratio",
+    "event_ratios",
     "exceedance",
     "final_value",
     "fit_measures",
@@ -151,7 +146,6 @@ __all__ = [
     "plot_residuals",
     "plot_scores",
     "plot_sensors",
-    "predict_from_median",
     "predict_new_event",
     "problems",
     "propagate",
@@ -163,7 +157,6 @@ __all__ = [
     "residual_checks",
     "rms",
     "rrmse",
-    "score_left_out",
     "share_within",
     "stiffness_loss",
     "to_si",

@@ -618,7 +618,7 @@ def test_four_earthquakes_damage_a_column(tmp_path):
 def test_many_events_predict_new_ones(tmp_path):
     """The posterior of one event misses new peaks, the population of events does not; amplitude matters."""
     output = run_tutorial("11_many_events.py", "--out", str(tmp_path))
-    assert "REDUCED SETTING" in output and "pairs of tests disagree" in output and "propagate warned" in output
+    assert "REDUCED SETTING" in output and "The tests differ in" in output and "propagate warned" in output
     summary = json.loads((tmp_path / "summary.json").read_text())
     usual, events = summary["one event, as usual"], summary["population of events"]
     assert usual["within 90 %"] <= 0.5 <= events["within 90 %"]
@@ -630,7 +630,7 @@ def test_many_events_predict_new_ones(tmp_path):
     assert events["wrong and certain"] <= usual["wrong and certain"] and 0.0 <= events["Brier score"] < 0.25
     panels = read_figure(tmp_path, "fragility").axes
     assert [panel.get_xlabel() for panel in panels] == ["peak acceleration of the base [g]"] * 2
-    for name in ("scores_as_usual", "scores_events", "scores_median", "events"):
+    for name in ("scores_as_usual", "scores_events", "events"):
         assert len(read_figure(tmp_path, name).axes) >= 2
 
 

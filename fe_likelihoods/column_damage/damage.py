@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..events.ratios import EventRatios, LevelRatios
+from ..events.ratios import EventRatios
 from ..events.spread import EventSpread
 from ..prediction.prediction import Prediction
 from ..prediction.propagation import check_effective_sample_size
@@ -217,7 +217,7 @@ def damage(
     prediction: Prediction,
     limits: Sequence[LimitState] | None = None,
     *,
-    ratios: EventRatios | LevelRatios | Mapping[str, EventRatios | LevelRatios] | None = None,
+    ratios: EventRatios | Mapping[str, EventRatios] | None = None,
     noise: bool | None = None,
     effective_sample_size: float | None = None,
     level: float = 0.95,
@@ -231,7 +231,7 @@ def damage(
         The result of ``propagate(model, samples, quantity=damage_measures(model))``.
     limits : sequence of LimitState, optional
         The limit states. Default: `limit_states`.
-    ratios : EventRatios, LevelRatios, or mapping of str to these, optional
+    ratios : EventRatios, or mapping of str to these, optional
         The model error: ratios of measured to fitted values in several events, for each measure by its name, or the
         same for all. Measures without ratios have no model error. Strains are rarely measured; a stated guess is
         ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
@@ -369,7 +369,7 @@ def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
     return limit.reshape(1) if limit.ndim == 0 else np.delete(limit, prediction.failed)
 
 
-def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios | LevelRatios]:
+def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, EventRatios]:
     """Ratios by the names of the measures; ValueError if they cannot be used."""
     if ratios is None:
         return {}
@@ -377,15 +377,15 @@ def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, Eve
     if unknown := sorted(set(found) - set(measures)):
         raise ValueError(f"ratios of {', '.join(unknown)}; the measures are {', '.join(measures)}")
     for name, each in found.items():
-        if not isinstance(each, EventRatios | LevelRatios) or each.shape:
-            raise ValueError(f"the ratios of {name!r} must be EventRatios or LevelRatios of one quantity; got {each!r}")
+        if not isinstance(each, EventRatios) or each.shape:
+            raise ValueError(f"the ratios of {name!r} must be EventRatios of one quantity; got {each!r}")
     return found
 
 
 def _extent(
     prediction: Prediction,
     values: dict[str, np.ndarray],
-    errors: Mapping[str, EventRatios | LevelRatios],
+    errors: Mapping[str, EventRatios],
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
     """Quantiles of the measures, multiplied by draws of their ratios."""
@@ -396,15 +396,13 @@ def _extent(
             drawn = found[:, event].reshape(len(found), -1)
             largest = drawn.max(axis=1)  # all places of an event share its error
             factor = np.ones(len(found))
-            factor[largest > 0.0] = ratios.draw_at(largest[largest > 0.0], rng)
+            factor[largest > 0.0] = ratios.draw(largest[largest > 0.0], rng)
             found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
         quantiles[name] = np.quantile(found, prediction.probabilities, axis=0)
     return quantiles
 
 
-def _contents(
-    states: Sequence[LimitState], errors: Mapping[str, EventRatios | LevelRatios], of_population: bool
-) -> str:
+def _contents(states: Sequence[LimitState], errors: Mapping[str, EventRatios], of_population: bool) -> str:
     """Which uncertainties the probabilities contain, in words."""
     said = "the uncertainty of the parameters" + (", their spread between events" if of_population else "")
     measures = list(dict.fromkeys(state.measure for state in states))

@@ -20,6 +20,7 @@ from .population_marginal import draw_parameters, sample_weights
 __all__ = ["Hierarchy"]
 
 _HYPER_SAMPLES = 200
+_MOSTLY_PRIOR = 0.7  # posterior to prior standard deviation of a spread, above which the data say little
 _LARGEST_OUTSIDE = 0.01  # of the draws of a new test, outside the tests' prior bounds
 
 
@@ -88,7 +89,40 @@ class Hierarchy:
             rows.append((name, *map(number, each)))
         first = f"Population of {len(self.posterior.tests)} tests, {len(self.samples)} samples"
         messages = [f"CAUTION: {message}" for message in self.checks.messages]
-        return "\n".join([f"{first}: {', '.join(self.posterior.tests)}", text_table(rows), *messages])
+        return "\n".join([f"{first}: {', '.join(self.posterior.tests)}", text_table(rows), self.spread, *messages])
+
+    @property
+    def spread(self) -> str:
+        """How much the tests differ in each varying parameter, and what follows for predictions, in one sentence.
+
+        The standard deviation between the tests, with its interval of 90 %, beside the error of a single test (the
+        median of their posterior standard deviations).
+        """
+        found, known = [], False
+        for k, (name, varying) in enumerate(self.posterior.varying.items()):
+            low, middle, high = np.quantile(self.samples[:, 2 * k + 1], [0.05, 0.5, 0.95])
+            errors = []
+            for each in self.posterior.described.values():
+                weights, values = np.exp(each.log_weights), each.points[:, k]
+                errors.append(np.sqrt(weights @ np.square(values - weights @ values) / weights.sum()))
+            error = np.median(errors)
+            unit = {"log": " %", "logit": " of the logit", "linear": ""}[varying.scale]
+            factor = 100.0 if varying.scale == "log" else 1.0
+            ends = f"{number(factor * low, 2)} to {number(factor * high, 2)}{unit}"
+            prior = np.std(varying.sd.rvs(2000, random_state=0))
+            doubt = ", mostly by its prior" if np.std(self.samples[:, 2 * k + 1]) > _MOSTLY_PRIOR * prior else ""
+            if low > error:
+                known = True
+                times = f"{number(middle / error, 2)} times the error of one test"
+                found.append(f"{name} by {number(factor * middle, 2)}{unit} ({ends}{doubt}), {times}")
+            else:
+                found.append(f"{name} by no more than the error of one test shows ({ends}{doubt})")
+        what = "must carry" if known else "carry"
+        return (
+            f"The tests differ in {', '.join(found)}: predictions for a further one {what} this spread "
+            "(predict_new_event). Posteriors under white noise are too narrow where residuals are correlated "
+            "(residual_checks); the spread then contains what they lack."
+        )
 
     def new_test(self, n: int, names: Sequence[str] | None = None, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Draw the parameters of a further test: the predictive density of the population.

@@ -33,13 +33,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..priors.points import as_points
-from ..text_tables import NamedResults, number, text_table
+from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_checks import ends_within
 from .hierarchy_result import Hierarchy
 from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
-__all__ = ["LeftOut", "leave_one_out"]
+__all__ = ["LeftOut", "without_each"]
 
 _SMALLEST_SHARE = 0.5  # effective hyper-samples of all: fewer may hide a region without samples
 _WALKERS, _BLOCK, _MOST_STEPS = 128, 200, 4000
@@ -91,44 +91,10 @@ class LeftOut(NamedTuple):
         return text_table([list(self.cells), list(self.cells.values())])
 
 
-def leave_one_out(
-    hierarchy: Hierarchy, *, sample: Callable[[HierarchicalPosterior], Any] | None = None, seed: int = 0
-) -> NamedResults:
-    """Leave each test out of a hierarchical model in turn. No simulation is run.
-
-    Parameters
-    ----------
-    hierarchy : Hierarchy
-        Population of two tests or more.
-    sample : callable, optional
-        Function of a `HierarchicalPosterior` that returns independent samples (n, ndim) of its hyper-parameters, for
-        tests that weights cannot leave out. Default: emcee with differential evolution and 128 walkers, which start
-        from the population of all tests and lose the test in steps; each step takes 20 autocorrelation times, of which
-        the second half is used, and at most 4000 moves.
-    seed : int
-        Seed of resampling and of the default sampler.
-
-    Returns
-    -------
-    dict of str to LeftOut
-        For each test; ``print`` gives a table.
-
-    Raises
-    ------
-    ValueError
-        For a hierarchy of a single test, with fewer different hyper-samples than twice the number of parameters, or
-        with hyper-samples that are impossible under the data of a test.
-
-    Warns
-    -----
-    UserWarning
-        If a new run of the default sampler was too short, or a predictive density is not known.
-
-    Examples
-    --------
-    >>> for name, left_out in leave_one_out(hierarchy).items():
-    ...     prediction = predict_new_event(left_out.hierarchy, posteriors[name], None, quantity=peak("deck"))
-    """
+def without_each(
+    hierarchy: Hierarchy, sample: Callable[[HierarchicalPosterior], Any] | None, seed: int
+) -> dict[str, LeftOut]:
+    """The population without each test in turn, see `fe_likelihoods.leave_one_out`."""
     posterior = hierarchy.posterior
     if len(posterior.tests) < 2:
         raise ValueError(f"leave_one_out needs two tests or more; got {', '.join(map(repr, posterior.tests))}")
@@ -146,7 +112,7 @@ def leave_one_out(
                 f"hyper-samples are impossible under test {name!r}, such as common parameters beyond the bounds of its "
                 "prior: start the walkers where HierarchicalPosterior.log_prob is finite"
             )
-    rng, found = np.random.default_rng(seed), NamedResults()
+    rng, found = np.random.default_rng(seed), {}
     for k, name in enumerate(posterior.tests):
         rest, own = posterior.without(name), log_marginals[:, k]
         weights, shape = smoothed_weights(own.min() - own)

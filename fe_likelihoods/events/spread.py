@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from .ratios import EventRatios, LevelRatios, RatioPopulations, standardised
+from .ratios import EventRatios, RatioPopulations, standardised
 
 __all__ = ["EventSpread", "exceedance_draws", "exceedance_of_samples"]
 
@@ -29,17 +29,17 @@ class EventSpread(NamedTuple):
     weights : ndarray, shape (n_populations, n_samples), or None
         Importance weights of the samples under each of several populations (`Hierarchy.population_weights`). None if
         the parameters are the same in all events.
-    ratios : EventRatios, LevelRatios or None
+    ratios : EventRatios or None
         Ratios that contain the model error, None for none.
     """
 
     values: np.ndarray
     weights: np.ndarray | None = None
-    ratios: EventRatios | LevelRatios | None = None
+    ratios: EventRatios | None = None
 
 
 def exceedance_of_samples(
-    values: np.ndarray, limits: np.ndarray, ratios: EventRatios | LevelRatios | None, below: bool = False
+    values: np.ndarray, limits: np.ndarray, ratios: EventRatios | None, below: bool = False
 ) -> np.ndarray:
     """Probability of each sample that its value in a new event exceeds the limit.
 
@@ -49,7 +49,7 @@ def exceedance_of_samples(
         Values of the samples.
     limits : ndarray
         Limits of the same shape; positive if there are ratios.
-    ratios : EventRatios, LevelRatios or None
+    ratios : EventRatios or None
         Ratios of one quantity.
     below : bool
         Whether the limit is exceeded by values below it.
@@ -102,10 +102,7 @@ def exceedance_draws(
         rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))[:, None]
     else:  # each draw has all samples, with the weights of its population
         rows = np.tile(np.arange(len(values)), (len(spread.weights), 1))
-    populations = None
-    if spread.ratios is not None:
-        positive = known[known > 0.0]
-        populations = spread.ratios.draw_populations(len(rows), rng, np.log(positive) if positive.size else np.zeros(1))
+    populations = None if spread.ratios is None else spread.ratios.draw_populations(len(rows), rng)
     found = np.empty((len(rows), *values.shape[1:]))
     size = max(1, _CHUNK // (rows.shape[1] * max(1, known[0].size)))
     for first in range(0, len(rows), size):
@@ -114,7 +111,7 @@ def exceedance_draws(
         if populations is None:
             single = exceedance_of_samples(known[at], limits[at], None, below)
         else:
-            part = RatioPopulations(populations.log_levels, populations.center[chunk], populations.sd[chunk])
+            part = RatioPopulations(*(each[chunk] for each in populations[:3]), populations.log_level)
             single = _given_populations(known[at], limits[at], part, below)
         counted = np.ones(single.shape)
         single = np.where(exceeding[at], 1.0, single)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import stats
 
 from ..events.hierarchy_result import Hierarchy
-from ..events.ratios import EventRatios, LevelRatios
+from ..events.ratios import EventRatios
 from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..noise.protocol import follows_response
 from ..signals.records import Record
@@ -26,7 +26,7 @@ from ..units import DIMENSIONS
 from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
-from .new_event import draw_new_event, of_hierarchy
+from .new_event import at_parameters, draw_new_event
 from .propagation import AllFailed, check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import (
@@ -175,7 +175,7 @@ def fragility(
     *,
     part: str | None = None,
     unit: str | None = None,
-    ratios: EventRatios | LevelRatios | None = None,
+    ratios: EventRatios | None = None,
     noise: bool | str | None = None,
     n: int = 500,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
@@ -192,9 +192,9 @@ def fragility(
     Parameters
     ----------
     posterior_or_model, samples
-        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: `n` parameter draws
-        for a new event are then simulated under each record, and the intervals contain the uncertainty of the
-        population.
+        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: without ratios, `n`
+        parameter draws for a new event are then simulated under each record, and the intervals contain the uncertainty
+        of the population.
     records : sequence of (Record or tuple of Record)
         Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions. Each is a
         tuple if the model has several components: the horizontal and the vertical record of an `IsolatedBridge`, or the
@@ -207,8 +207,10 @@ def fragility(
         For a `JointLikelihood` or its posterior: the name of the likelihood whose model predicts.
     unit : str, optional
         Unit of the threshold, with the dimension of the quantity's channel. Default: SI.
-    ratios : EventRatios or LevelRatios, optional
-        Ratios of measured to fitted values of the quantity in several events: the model error.
+    ratios : EventRatios, optional
+        Ratios of measured to predicted values of the quantity in several events: the model error. With the result of
+        `event_ratios`, which contains the spread of the parameters as well, the samples may be the `Hierarchy`: each
+        record is then simulated once, at the median parameters. Draws of a `Hierarchy` with other ratios are refused.
     noise : bool or str, optional
         The model error from the noise of the calibration, as for `propagate`. Default: "model" if there are no ratios,
         the noise follows the response (`GaussianNoise` with shares) and the samples have its parameters. Otherwise the
@@ -277,7 +279,8 @@ def fragility(
     if not np.all((intensities > 0.0) & (intensities < np.inf)):
         raise ValueError(f"intensities must be positive and finite; got {intensities}")
     if isinstance(samples, Hierarchy):  # all its tests together give the range of amplitudes
-        settings = of_hierarchy(samples) | settings
+        measured = [each.measurements for each in samples.posterior.tests.values() if each.measurements is not None]
+        settings = {"calibrated": measured, "check": False} | settings
     n = len(thetas)
     effective = check_effective_sample_size(effective_sample_size, n)
     check_level(level)
@@ -341,7 +344,7 @@ def _chosen(
     posterior_or_model: Any,
     samples: Any,
     part: str | None,
-    ratios: EventRatios | LevelRatios | None,
+    ratios: EventRatios | None,
     noise: bool | str | None,
     n: int,
     seed: int | None,
@@ -354,6 +357,13 @@ def _chosen(
         (posterior_or_model, None) if of_population else part_of(posterior_or_model, samples, part, bool(noise))
     )
     source = read_source(predictor)
+    if of_population and ratios is not None:
+        if ratios.at is None:
+            raise ValueError(
+                "fragility: draws of a Hierarchy and ratios are correlated; give ratios=event_ratios(hierarchy, "
+                "posteriors, quantity), which contain the spread of the parameters"
+            )
+        return predictor, at_parameters(ratios.at, source.model.parameter_names, n), False, None
     if noise is None and ratios is None and source.noise is not None and follows_response(source.noise):
         names = source.noise.parameter_names
         if of_population:

@@ -1,22 +1,22 @@
-"""Scores of predicted events: each calibrated event predicted from the others, and compared with its measurements."""
+"""Each event predicted from the others: the population without it, and the scores of its prediction."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..events.leave_one_out import LeftOut
-from ..events.ratios import EventRatios
-from ..likelihood.posterior import Posterior
+from ..events.hierarchical_posterior import HierarchicalPosterior
+from ..events.hierarchy_result import Hierarchy
+from ..events.leave_one_out import without_each
 from ..text_tables import NamedResults, number
 from ..units import from_si
 from .new_event import predict_new_event
 from .prediction import Prediction
 from .quantities import Quantity
 from .score_tables import HistoryScores, QuantityScores
+from .scores import share_within
 
-__all__ = ["HeldOutScore", "score_left_out"]
+__all__ = ["HeldOutScore", "HeldOutScores", "LeftOutTests", "leave_one_out"]
 
 
 class HeldOutScore(NamedTuple):
@@ -29,7 +29,7 @@ class HeldOutScore(NamedTuple):
     log_density : float
         Log predictive density of all data in the event, see `LeftOut`; NaN without the event's evidence.
     prediction : Prediction
-        The prediction; its number of samples is the number of simulations.
+        The prediction.
     """
 
     scores: HistoryScores | QuantityScores
@@ -38,7 +38,7 @@ class HeldOutScore(NamedTuple):
 
     @property
     def cells(self) -> dict[str, str]:
-        """The scores as texts by headings, for `score_left_out`: per number, or per channel for histories."""
+        """The scores as texts by headings: per number, or per channel for histories."""
         scores, found = self.scores, {}
         if isinstance(scores, QuantityScores):
             for k, (name, unit) in enumerate(zip(scores.names, scores.units, strict=True)):
@@ -60,65 +60,100 @@ class HeldOutScore(NamedTuple):
         return f"{self.scores}\nlog density of the data of the event: {number(self.log_density, 5)}"
 
 
-def score_left_out(
-    left_out: Mapping[str, LeftOut],
-    posteriors: Mapping[str, Posterior],
-    *,
-    quantity: Quantity = None,
-    ratios: Mapping[str, ArrayLike] | None = None,
-    noise: bool = False,
-    n: int = 500,
-    seed: int = 0,
-    **options: Any,
-) -> NamedResults:
-    """Predict each event from the others, under its own excitation, and score it with its measurements.
+class HeldOutScores(NamedResults):
+    """Scores by event; ``print`` gives a row per event, and how many numbers are within their intervals."""
+
+    def __str__(self) -> str:
+        lines = [super().__str__()]
+        of_numbers = [each.scores for each in self.values() if isinstance(each.scores, QuantityScores)]
+        for k, name in enumerate(of_numbers[0].names if of_numbers else ()):
+            pit = [each.pit[k] for each in of_numbers]
+            shares = "; ".join(f"within {level:.0%}, {share_within(pit, level)}" for level in (0.9, 0.5))
+            lines.append(f"{name}: {shares} (intervals of 95 % for the share in further events)")
+        return "\n".join(lines)
+
+
+class LeftOutTests(NamedResults):
+    """The population without each test, `LeftOut` by name; ``print`` gives a table."""
+
+    def scores(
+        self,
+        posteriors: Mapping[str, Any],
+        *,
+        quantity: Quantity = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> HeldOutScores:
+        """Predict each event from the others, under its own excitation, and score it with its measurements.
+
+        Parameters
+        ----------
+        posteriors : mapping of str to Posterior
+            The posterior of every event of the hierarchy, with its model and its measurements.
+        quantity : optional
+            As for `predict_new_event`: numbers such as ``peak(channel)``, or histories (default).
+        seed : int
+            Seed of the draws; each event has draws of its own.
+        **options
+            Further options of `predict_new_event`, such as ``noise=`` and ``n=``.
+
+        Returns
+        -------
+        HeldOutScores
+            A dict of str to HeldOutScore.
+
+        Raises
+        ------
+        ValueError
+            If a posterior is missing, and as `predict_new_event` and `Prediction.score`.
+        """
+        if missing := [name for name in self if name not in posteriors]:
+            raise ValueError(f"scores: posteriors of {', '.join(map(repr, missing))} are missing")
+        found = HeldOutScores()
+        for (name, each), own_seed in zip(self.items(), np.random.SeedSequence(seed).spawn(len(self)), strict=True):
+            given = {"model": posteriors[name], "quantity": quantity, "seed": int(own_seed.generate_state(1)[0])}
+            prediction = predict_new_event(each.hierarchy, posteriors, None, **given, **options)
+            scores = prediction.score(posteriors[name].likelihood.measurements)
+            found[name] = HeldOutScore(scores, each.log_density, prediction)
+        return found
+
+
+def leave_one_out(
+    hierarchy: Hierarchy, *, sample: Callable[[HierarchicalPosterior], Any] | None = None, seed: int = 0
+) -> LeftOutTests:
+    """Leave each test out of a hierarchical model in turn. No simulation is run.
 
     Parameters
     ----------
-    left_out : mapping of str to LeftOut
-        Result of `leave_one_out`, or some of it.
-    posteriors : mapping of str to Posterior
-        The posterior for each of these events, with its model and its measurements.
-    quantity : optional
-        As for `propagate`: numbers such as ``peak(channel)``, or histories (default).
-    ratios : mapping of str to array_like, optional
-        The `event_ratio` of each event, by name; each prediction is corrected with the ratios of the other events, two
-        or more.
-    noise, n, options
-        As for `predict_new_event`; `n` simulations for each event.
+    hierarchy : Hierarchy
+        Population of two tests or more.
+    sample : callable, optional
+        Function of a `HierarchicalPosterior` that returns independent samples (n, ndim) of its hyper-parameters, for
+        tests that weights cannot leave out. Default: emcee with differential evolution and 128 walkers, which start
+        from the population of all tests and lose the test in steps; each step takes 20 autocorrelation times, of which
+        the second half is used, and at most 4000 moves.
     seed : int
-        Seed of the draws; each event has draws of its own.
+        Seed of resampling and of the default sampler.
 
     Returns
     -------
-    dict of str to HeldOutScore
-        ``print`` gives a table with a row per event.
+    LeftOutTests
+        A dict of str to `LeftOut`. Its method ``scores(posteriors, quantity=...)`` predicts each test from the others
+        and scores it.
 
     Raises
     ------
     ValueError
-        If a posterior or a ratio is missing, and as `predict_new_event` and `Prediction.score`.
+        For a hierarchy of a single test, with fewer different hyper-samples than twice the number of parameters, or
+        with hyper-samples that are impossible under the data of a test.
+
+    Warns
+    -----
+    UserWarning
+        If a new run of the default sampler was too short, or a predictive density is not known.
+
+    Examples
+    --------
+    >>> print(leave_one_out(hierarchy).scores(posteriors, quantity=peak("deck")))
     """
-    for what, given in (("posteriors", posteriors), ("ratios", left_out if ratios is None else ratios)):
-        if missing := [name for name in left_out if name not in given]:
-            raise ValueError(f"score_left_out: {what} of {', '.join(map(repr, missing))} are missing")
-    seeds = np.random.SeedSequence(seed).spawn(len(left_out))
-    found = NamedResults()
-    for (name, each), own_seed in zip(left_out.items(), seeds, strict=True):
-        others = None
-        if ratios is not None:
-            others = EventRatios([ratios[other] for other in each.hierarchy.posterior.tests if other in ratios])
-        prediction = predict_new_event(
-            each.hierarchy,
-            posteriors[name],
-            None,
-            quantity=quantity,
-            ratios=others,
-            noise=noise,
-            n=n,
-            seed=int(own_seed.generate_state(1)[0]),
-            **options,
-        )
-        scores = prediction.score(posteriors[name].likelihood.measurements)
-        found[name] = HeldOutScore(scores, each.log_density, prediction)
-    return found
+    return LeftOutTests(without_each(hierarchy, sample, seed))

@@ -1,138 +1,154 @@
 r"""Prediction of an event that the structure has not seen yet, from several events that it has.
 
 Structural parameters differ from event to event: frequency and damping change with the amplitude, the season and the
-years. The posterior of one event, or the common posterior of all, is narrower than these differences. The prediction of
-a new event therefore draws its parameters from the event population (`Hierarchy.new_test`), and corrects quantities
-such as peaks by the ratio of measured to fitted values in the calibration events:
+years. What a model cannot fit differs as well, and both are correlated: where the fit is a compromise, parameters that
+give too low a response come with a measured value above the fitted one. A number such as a peak is therefore predicted
+from *one* distribution for both. With the median parameters :math:`\bar\theta` of the population (`Hierarchy`),
 
-.. math:: g_\mathrm{new} = r_\mathrm{new}\, g(\theta_\mathrm{new}), \qquad
-   \ln r_\mathrm{new} \sim t_\nu\!\left(m,\ s \sqrt{1 + 1 / K}\right).
+.. math:: \ln y_k = \ln g_k(\bar\theta) + e_k, \qquad
+   e_\mathrm{new} \sim t_\nu\!\left(m,\ s \sqrt{1 + 1 / K}\right),
 
-Where fitting errors and parameters are correlated, `predict_from_median` has both in one ratio.
+the ratios :math:`e^{e_k}` of measured values to the values at these parameters contain the deviation of each event from
+the median, its fitting error, and their correlation. Eleven events do not know how much events scatter, one knows
+nothing of it: the scatter has a prior (`EventRatios`), and one event has the same formula.
+
+Histories are predicted with the parameters of the population, and with its noise.
 Equations are on the page ``docs/theory/prediction.rst``.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..events.hierarchy_result import Hierarchy
-from ..events.ratios import EventRatios, LevelRatios
+from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.spread import EventSpread
 from ..signals.records import Record
-from .inputs import part_of, read_source
+from .inputs import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
 
-__all__ = ["draw_new_event", "event_level", "event_ratio", "of_hierarchy", "predict_from_median", "predict_new_event"]
+__all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
 
+_NOTABLE = 1.5  # widening of the scatter from which it is told
 _LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
 
-def event_level(
-    posterior: Any, samples: Any, quantity: ChannelQuantity | list[ChannelQuantity], part: str | None = None
-) -> np.ndarray:
-    """Fitted value of a quantity in the event that a posterior was calibrated with, for `LevelRatios`.
+def event_ratios(
+    hierarchy: Hierarchy | Mapping[str, float],
+    posteriors: Mapping[str, Any],
+    quantity: ChannelQuantity | Sequence[ChannelQuantity],
+    *,
+    form: str = "constant",
+    prior_sd: ArrayLike = PRIOR_SD,
+    prior_events: float = PRIOR_EVENTS,
+) -> EventRatios:
+    """Ratios of the measured values of several events to the values at the median parameters of their population.
 
     Parameters
     ----------
-    posterior, samples, quantity, part
-        As for `event_ratio`.
+    hierarchy : Hierarchy, or mapping of str to float
+        The population of the events, or parameters of your own by name.
+    posteriors : mapping of str to Posterior or FELikelihood
+        The likelihood with the measurements of each event. Of a `Hierarchy`, its events are used, and must be there.
+    quantity : ChannelQuantity or sequence of ChannelQuantity
+        Positive numbers, such as ``peak("deck")``.
+    form, prior_sd, prior_events
+        As for `EventRatios`.
 
     Returns
     -------
-    ndarray, shape () or (n_quantities,)
-        Median over the samples' responses [SI], without noise.
+    EventRatios
+        With the parameters in ``at``. One simulation per event.
 
     Raises
     ------
     ValueError
-        As `propagate`.
+        If a posterior or a parameter is missing, the quantity is no number of channels, measurements or samples of them
+        are missing, a value is not positive, and as `EventRatios`.
+    SimulationFailed
+        If the simulation of an event at these parameters fails.
     """
-    options = {"quantiles": (0.5,), "check": False, "progress": False}  # the median does not depend on the noise
-    return propagate(posterior, samples, part=part, quantity=quantity, **options).quantile(0.5)
-
-
-def event_ratio(
-    posterior: Any, samples: Any, quantity: ChannelQuantity | list[ChannelQuantity], part: str | None = None
-) -> np.ndarray:
-    """Ratio of the measured to the fitted value of a quantity in the event that a posterior was calibrated with.
-
-    Parameters
-    ----------
-    posterior : Posterior, FELikelihood or JointLikelihood
-        The likelihood with the measurements of the event.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        Posterior samples of this event.
-    quantity : ChannelQuantity or list of ChannelQuantity
-        Such as ``peak("deck")``.
-    part : str, optional
-        As for `propagate`.
-
-    Returns
-    -------
-    ndarray, shape () or (n_quantities,)
-        Measured value divided by the median over the samples' responses, without noise: the model error in this
-        quantity where the model fits best.
-
-    Raises
-    ------
-    ValueError
-        As `propagate`, if there are no measurements or samples of the channel are missing, and if a value is not
-        positive.
-    """
-    likelihood, rows = part_of(posterior, samples, part, False)
-    source = read_source(likelihood)
-    if source.likelihood is None:
-        raise ValueError(f"event_ratio needs a posterior or a likelihood with measurements; got {posterior!r}")
-    measured = measured_quantity(quantity, source.likelihood.measurements)
-    fitted = event_level(likelihood, rows, quantity)
-    if not ((measured > 0.0) & (fitted > 0.0)).all():
-        raise ValueError(f"event_ratio needs positive values; measured {measured}, fitted {fitted}")
-    return measured / fitted
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
+        raise ValueError(f"ratios of events need numbers such as quantity=peak(channel); got {quantity!r}")
+    of_population = isinstance(hierarchy, Hierarchy)
+    names = list(hierarchy.posterior.tests if of_population else posteriors)
+    if missing := [name for name in names if name not in posteriors]:
+        raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
+    at, values, levels = hierarchy.median_test() if of_population else dict(hierarchy), [], []
+    for name in names:
+        source = read_source(posteriors[name])
+        if source.likelihood is None:
+            raise ValueError(
+                f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
+            )
+        measured = measured_quantity(quantity, source.likelihood.measurements)
+        rows = at_parameters(at, source.model.parameter_names, 1)
+        options = {"quantiles": (), "check": False, "progress": False}
+        predicted = propagate(source.likelihood, rows, quantity=quantity, **options).mean
+        if not ((measured > 0.0) & (predicted > 0.0)).all():
+            raise ValueError(
+                f"ratios of events need positive values; event {name!r}: measured {measured}, predicted {predicted}"
+            )
+        values.append(measured / predicted)
+        levels.append(predicted)
+    return EventRatios(values, prior_sd, prior_events, levels, form, at)
 
 
 def predict_new_event(
     hierarchy: Hierarchy,
-    posterior_or_model: Any,
+    posteriors: Mapping[str, Any],
     record: Record | Any,
     *,
-    quantity: Quantity = None,
-    ratios: EventRatios | LevelRatios | None = None,
+    model: Any = None,
+    quantity: Quantity | Mapping[str, Quantity] = None,
+    form: str = "constant",
+    prior_sd: ArrayLike = PRIOR_SD,
+    prior_events: float = PRIOR_EVENTS,
     noise: bool | str = False,
     n: int = 500,
+    sensitivity: int = 20,
     seed: int | None = None,
     **options: Any,
-) -> Prediction:
+) -> Prediction | dict[str, Prediction]:
     """Predict an event that is not among the events of a hierarchical model.
 
     Parameters
     ----------
     hierarchy : Hierarchy
         The parameter population over the calibration events. Its varying and common parameters must include the model's
-        parameters, except those whose prior is the same in all events.
-    posterior_or_model : Posterior, FELikelihood or Model
-        The model to predict with, such as one event's posterior; with a noise for ``noise=True``.
+        parameters; for histories also those whose prior is the same in all events.
+    posteriors : mapping of str to Posterior or FELikelihood
+        The likelihood with the measurements of each event of the hierarchy; others are not used.
     record : Record, or sequence of Record
-        Excitation of the new event.
+        Excitation of the new event; None for the excitation of `model`.
+    model : Posterior, FELikelihood or Model, optional
+        What predicts. Default: the posterior of the first event.
     quantity : optional
-        As for `propagate`. Default: the histories of all channels.
-    ratios : EventRatios or LevelRatios, optional
-        Ratios of measured to fitted values of the quantity in the calibration events, for numbers such as
-        ``peak(name)`` or several of them. The measured value is then predicted. With `LevelRatios` (one number only)
-        each draw has the ratio at its predicted value.
+        Numbers such as ``peak("deck")``, one or a list of them: the *measured* values of the new event are predicted.
+        Histories, as for `propagate`: the response, or the measurements with ``noise=True``. Several of these by name.
+        Default: the histories of all channels.
+    form, prior_sd, prior_events
+        Of the ratio of measured values to the values at the median parameters, see `EventRatios`. The printed
+        prediction says how much of the width is due to the prior.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The noise parameters must be varying, common, or
         have the same prior in all events. Shares of the response (`GaussianNoise`)
-        transfer between events, levels in SI units do not.
+        transfer between events, levels in SI units do not. Numbers contain all errors without it.
     n : int
-        Number of draws, each one simulation. Draws with an impossible noise, such as a share of 1 or more of
-        ``level="measured"``, are left out.
+        Number of draws. Histories need a simulation for each, numbers one for each event and one for the new one. Draws
+        with an impossible noise, such as a share of 1 or more of ``level="measured"``, are left out.
+    sensitivity : int
+        Number of draws of the population, simulated for numbers in each event and in the new one, from which it is
+        known how much the numbers depend on the parameters there; 0 for none. Under a harmonic near a resonance they
+        do so far more than under earthquakes. The scatter is then widened, with a warning: see Notes.
     seed : int, optional
         Seed for drawing parameters, ratios and noise.
     **options
@@ -140,163 +156,129 @@ def predict_new_event(
 
     Returns
     -------
-    Prediction
-        Its spread contains the spread between events. With ratios, mean, variance and standard error are NaN: the
-        exponential of Student's t has no mean; use quantiles. The intervals that `exceedance` derives from it contain
-        the uncertainty of the population and the ratios.
+    Prediction, or dict of str to Prediction
+        For numbers, mean, variance and standard error are NaN: the exponential of Student's t has no mean; use
+        quantiles. The intervals that `exceedance` derives from it contain the uncertainty of the ratio.
 
     Raises
     ------
     ValueError
-        As `Hierarchy.new_test` and `propagate`; if ratios are given for histories, together with noise (they contain
-        the errors already), or for another number of quantities.
+        If the posterior of an event is missing, a parameter has no median, the quantity is neither a history nor a
+        positive number of a channel, and as `Hierarchy.new_test`, `EventRatios` and `propagate`.
+    SimulationFailed
+        If the simulation at the median parameters fails, or all simulations of the histories.
 
     Warns
     -----
     UserWarning
-        As `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. As `propagate` for peaks
-        outside the range of all events, if each `StoredPosterior` has its measurements. Residuals of the single
-        calibrations are not checked.
+        As `propagate` for peaks outside the range of all events. If a number depends on the parameters far more than in
+        the events. For histories also as `Hierarchy.new_test`, and if more than 1 % of the draws have an
+        impossible noise. Residuals of the single calibrations are not checked.
+
+    Notes
+    -----
+    The intervals of numbers are those of normal log ratios whose scatter is the same in all events: the same change of
+    the parameters changes the logarithm of the value by the same amount. Where the variance of this logarithm over the
+    population is larger than the largest one of the events, the difference is added to the variance of the new event.
+    See ``docs/theory/prediction.rst``.
 
     Examples
     --------
-    >>> ratios = EventRatios([event_ratio(posteriors[name], chains[name], peak("deck")) for name in posteriors])
-    >>> predict_new_event(hierarchy, posterior, record, quantity=peak("deck"), ratios=ratios)
+    >>> predict_new_event(hierarchy, posteriors, record, quantity=peak("deck")).quantiles
     """
-    source = read_source(posterior_or_model)
+    if not isinstance(posteriors, Mapping) or not posteriors:
+        raise ValueError(
+            f"predict_new_event: expected the posteriors of the events by name, {{name: posterior}}; got {posteriors!r}"
+        )
+    if isinstance(quantity, Mapping):
+        given = {"model": model, "form": form, "prior_sd": prior_sd, "prior_events": prior_events, "n": n, "seed": seed}
+        given["sensitivity"] = sensitivity
+        return {
+            name: predict_new_event(
+                hierarchy, posteriors, record, quantity=each, noise=noise and not _is_number(each), **given, **options
+            )
+            for name, each in quantity.items()
+        }
+    predictor = next(iter(posteriors.values())) if model is None else model
+    known = [read_source(posteriors[name]).likelihood for name in hierarchy.posterior.tests if name in posteriors]
+    settings = {
+        "calibrated": [each.measurements for each in known if each],
+        "check": False,
+        "progress": False,
+    } | options
+    if _is_number(quantity):
+        if noise:
+            raise ValueError("predict_new_event: numbers contain the errors of measurements already; noise=False")
+        given = {"form": form, "prior_sd": prior_sd, "prior_events": prior_events}
+        ratios = event_ratios(hierarchy, posteriors, quantity, **given)
+        rows = at_parameters(
+            ratios.at, read_source(predictor).model.parameter_names, n
+        )  # equal rows are simulated once
+        prediction = propagate(predictor, rows, record=record, quantity=quantity, **settings)
+        if sensitivity:
+            names = list(rows)
+            draws, _ = draw_new_event(hierarchy, names, sensitivity, None, np.random.SeedSequence(seed).spawn(1)[0])
+            own = _log_sd(predictor, draws, quantity, record, settings)
+            events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in hierarchy.posterior.tests]
+            ratios, remark = _widened(ratios, own, np.max(events, axis=0), quantity)
+            prediction = replace(prediction, remarks=(*prediction.remarks, *remark))
+        prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
+        return _corrected(prediction, ratios, np.random.default_rng(seed))
+    source = read_source(predictor)
     names = list(source.model.parameter_names)
     if noise:
         if source.noise is None:
             raise ValueError("predict_new_event: noise=True needs a posterior; got a model")
         names += source.noise.parameter_names
-    if ratios is not None:
-        several = (quantity,) if isinstance(quantity, ChannelQuantity) else quantity
-        numbers = callable(quantity) or (
-            isinstance(several, list | tuple) and all(isinstance(each, ChannelQuantity) for each in several)
-        )
-        if not numbers or noise:
-            raise ValueError(
-                "predict_new_event: ratios are for numbers such as peak(channel) and contain the error of the "
-                "measurements already: give quantity=peak(channel), and noise=False"
-            )
-    parameters, drawn, errors = np.random.SeedSequence(seed).spawn(3)
-    draws, weights = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
-    settings = {"progress": False} | of_hierarchy(hierarchy) | options
-    prediction = propagate(
-        posterior_or_model,
-        draws,
-        record=record,
-        quantity=quantity,
-        noise=noise,
-        seed=int(errors.generate_state(1)[0]),
-        **settings,
+    parameters, errors = np.random.SeedSequence(seed).spawn(2)
+    draws, _ = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
+    own_seed = int(errors.generate_state(1)[0])
+    return propagate(predictor, draws, record=record, quantity=quantity, noise=noise, seed=own_seed, **settings)
+
+
+def _log_sd(predictor: Any, draws: Mapping[str, np.ndarray], quantity: Any, record: Any, settings: Any) -> np.ndarray:
+    """Standard deviation of the logarithm of a quantity over draws of the parameters, shaped like the quantity."""
+    options = settings | {"quantiles": (), "calibrated": (), "check": False, "progress": False}
+    source = read_source(predictor)
+    values = propagate(source.likelihood or source.model, draws, record=record, quantity=quantity, **options).values
+    return np.log(np.maximum(values, np.finfo(float).tiny)).std(axis=0)
+
+
+def _widened(
+    ratios: EventRatios, own: np.ndarray, of_events: np.ndarray, quantity: Any
+) -> tuple[EventRatios, tuple[str, ...]]:
+    """Ratios for a new event that depends more on the parameters than the events do, and a remark on it."""
+    excess = np.maximum(np.square(own) - np.square(of_events), 0.0)
+    widening = np.sqrt(1.0 + excess / np.square(ratios.sd))
+    ratios = replace(ratios, widening=widening)
+    if not (widening > _NOTABLE).any():
+        return ratios, ()
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    far = [f"{each} {w:.1f} times" for each, w in zip(several, np.atleast_1d(widening), strict=True) if w > _NOTABLE]
+    remark = (
+        "the calibration hardly speaks for this motion, under which the response depends on the parameters more than "
+        f"in any calibrated event, as under a harmonic near a resonance. The scatter is widened: {', '.join(far)}. "
+        "Calibrate with a motion of this kind"
     )
-    if isinstance(prediction, Mapping):  # several quantities of the same draws
-        return {name: _with_spread(each, weights, None) for name, each in prediction.items()}
-    prediction = _with_spread(prediction, weights, ratios)
-    return prediction if ratios is None else _corrected(prediction, ratios, np.random.default_rng(drawn))
+    warnings.warn(f"predict_new_event: {remark}", stacklevel=3)
+    return ratios, (remark,)
 
 
-def predict_from_median(
-    hierarchy: Hierarchy,
-    posteriors: Mapping[str, Any],
-    posterior_or_model: Any,
-    record: Record | Any,
-    *,
-    quantity: ChannelQuantity | list[ChannelQuantity],
-    prior_sd: float = 0.1,
-    prior_events: float = 0.0,
-    n: int = 500,
-    seed: int | None = None,
-    **options: Any,
-) -> Prediction:
-    r"""Predict the measured peaks of a new event from the population's median parameters and a ratio.
+def _is_number(quantity: Any) -> bool:
+    """Whether a quantity is a number, or several, not a history."""
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    is_list = isinstance(several, list | tuple)
+    return callable(quantity) or (is_list and any(isinstance(each, ChannelQuantity) for each in several))
 
-    Each ratio divides a measured value by the value at these parameters, :math:`r_k = y_k / g_k(\bar\theta)`. It
-    combines the event's deviation from the median and its fitting error, including their correlation.
-    `predict_new_event` adds both as if they were independent, so that intervals are too wide where both cancel: where
-    events whose parameters give a low response are also fitted too low.
 
-    Parameters
-    ----------
-    hierarchy : Hierarchy
-        The parameter population over the calibration events.
-    posteriors : mapping of str to Posterior or FELikelihood
-        The likelihood with the measurements of each event of the hierarchy; others are not used.
-    posterior_or_model : Posterior, FELikelihood or Model
-        The model to predict with. All its parameters must be varying or common.
-    record : Record, or sequence of Record
-        Excitation of the new event; None for the model's excitation.
-    quantity : ChannelQuantity or list of ChannelQuantity
-        Positive numbers, such as ``peak("deck")``.
-    prior_sd, prior_events : float
-        Guess of the log ratios' standard deviation, and the number of events that it is worth, as for `EventRatios`.
-        Needed for one event.
-    n : int
-        Number of ratio draws. Each event of the hierarchy, and the new one, is simulated once.
-    seed : int, optional
-        Seed of the draws.
-    **options
-        Further options of `propagate`, such as ``quantiles=`` and ``from_state=``.
-
-    Returns
-    -------
-    Prediction
-        Its values predict measurements. The intervals that `exceedance` derives from it contain the uncertainty of the
-        ratio.
-
-    Raises
-    ------
-    ValueError
-        If the posterior of an event is missing, a parameter of the model is neither varying nor common, the quantity is
-        a history, and as `event_ratio` and `EventRatios`.
-    SimulationFailed
-        If the simulation at these parameters fails.
-
-    Warns
-    -----
-    UserWarning
-        As `predict_new_event`, if peaks are outside the range of all events.
-
-    Notes
-    -----
-    The intervals are exact for normal log ratios whose scatter is the same in all events: the same change of the
-    parameters changes the logarithm of the peak by the same amount. See ``docs/theory/prediction.rst``.
-
-    Examples
-    --------
-    >>> predict_from_median(hierarchy, posteriors, model, record, quantity=peak("deck")).quantiles
-    """
-    several = (quantity,) if isinstance(quantity, ChannelQuantity) else quantity
-    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
-        raise ValueError(f"predict_from_median needs numbers such as quantity=peak(channel); got {quantity!r}")
-    if missing := [name for name in hierarchy.posterior.tests if name not in posteriors]:
-        raise ValueError(f"predict_from_median: posteriors of {', '.join(map(repr, missing))} are missing")
-    median = hierarchy.median_test()
-    wanted = read_source(posterior_or_model).model.parameter_names
-    if missing := [name for name in wanted if name not in median]:
+def at_parameters(parameters: Mapping[str, float], names: Sequence[str], n: int) -> dict[str, np.ndarray]:
+    """Equal rows of a model's parameters (n,) by name; ValueError for parameters without a value."""
+    if missing := [name for name in names if name not in parameters]:
         raise ValueError(
-            f"predict_from_median: {', '.join(missing)} belong to each event alone and have no median; make them "
-            "varying or common, or use predict_new_event"
+            f"{', '.join(missing)} belong to each event alone and have no median; make them varying or common in the "
+            "HierarchicalPosterior"
         )
-    events = [posteriors[name] for name in hierarchy.posterior.tests]
-    at_median = {name: np.array([median[name]]) for name in wanted}
-    ratios = EventRatios([event_ratio(each, at_median, quantity) for each in events], prior_sd, prior_events)
-    rows = {name: np.full(n, median[name]) for name in wanted}  # equal rows are simulated once
-    measured = [read_source(each).likelihood.measurements for each in events]
-    settings = {"progress": False, "calibrated": measured, "check": False} | options
-    prediction = propagate(posterior_or_model, rows, record=record, quantity=quantity, **settings)
-    prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
-    return _corrected(prediction, ratios, np.random.default_rng(seed))
-
-
-def _with_spread(prediction: Prediction, weights: np.ndarray, ratios: EventRatios | LevelRatios | None) -> Prediction:
-    """The prediction with its event spread; histories, whose values are not kept, are returned unchanged."""
-    if prediction.values is None:
-        return prediction
-    weights = np.delete(weights, prediction.failed, axis=1)
-    spread = EventSpread(prediction.values, weights / weights.sum(axis=1, keepdims=True), ratios)
-    return replace(prediction, spread=spread)
+    return {name: np.full(n, parameters[name]) for name in names}
 
 
 def draw_new_event(
@@ -332,12 +314,6 @@ def draw_new_event(
     return {name: draws[name] for name in names}, hierarchy.population_weights(draws)
 
 
-def of_hierarchy(hierarchy: Hierarchy) -> dict[str, Any]:
-    """Arguments of `propagate` for draws of a population, which was calibrated with all tests, not with one of them."""
-    tests = hierarchy.posterior.tests.values()
-    return {"calibrated": [each.measurements for each in tests if each.measurements is not None], "check": False}
-
-
 def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]:
     """Leave out draws whose noise is impossible: a population has no bounds, but shares of the response have."""
     if not hasattr(noise, "standard_deviations"):
@@ -355,14 +331,9 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     return {name: values[possible] for name, values in draws.items()}
 
 
-def _corrected(prediction: Prediction, ratios: EventRatios | LevelRatios, rng: np.random.Generator) -> Prediction:
+def _corrected(prediction: Prediction, ratios: EventRatios, rng: np.random.Generator) -> Prediction:
     """The prediction times draws of a new event's ratio."""
-    if ratios.shape != prediction.mean.shape:
-        raise ValueError(
-            f"predict_new_event: expected ratios (n_events, ...) of a quantity of shape {prediction.mean.shape}; got "
-            f"{ratios.values.shape}"
-        )
-    values = prediction.values * ratios.draw_at(prediction.values, rng)
+    values = prediction.values * ratios.draw(prediction.values, rng)
     effective = prediction.effective_sample_size
     quantiles, errors = quantiles_with_errors(
         values.reshape(len(values), -1), np.ones(len(values), dtype=int), prediction.probabilities, effective

@@ -363,7 +363,9 @@ class Prediction:
             noise = f"of measured values, by the ratios of {len(self.spread.ratios.values)} events"
         lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
         if self.has_ratios:
-            lines.append("the ratio of a new event has no mean: use the quantiles")
+            share = np.mean(self.spread.ratios.prior_share)
+            lines.append(f"the ratio of a new event has no mean: use the quantiles; {share:.0%} of their squared width")
+            lines[-1] += " is due to the prior of the scatter between events"
         if self.n_failed:
             collapse = f" (the structure collapsed in {len(self.collapsed)})" if len(self.collapsed) else ""
             lines.append(f"{self.n_failed} samples failed{collapse} and are left out")

@@ -56,6 +56,7 @@ from .transfer_checks import (
     Peaks,
     calibration_of,
     is_first_warning,
+    remark_on_harmonic,
     remark_on_level,
     remark_on_peaks,
     remark_on_same_response,
@@ -234,7 +235,8 @@ def propagate(
         the largest measured peak of the calibration, or less than half of the smallest one.
         If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
         SI units, and their level is more than three times the level of the calibration measurements, or less than a
-        third. If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and the
+        third. If the power of another record is in a band of less than a fifth of the width in the calibration.
+        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and the
         median peak is more than 1.1 times as large as without noise. Once for each likelihood, if its residuals are
         correlated and `GaussianNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent,
         or the whitened residuals of shares or bands are correlated; and if less than 0.75 times the simulated response
@@ -325,6 +327,8 @@ def propagate(
     remarks, of_calibration = [assumed], ()
     if other:
         remarks.append(remark_on_peaks(peaks, model.channels, known, alone=calibrated is None))
+    if moved and state == "virgin" and calibration.likelihood is not None:
+        remarks.append(remark_on_harmonic(calibration.model, model))
     if other and noise:
         remarks.append(remark_on_level(predictions.values(), peaks, source))
     if noise is True:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from ..events.ratios import EventRatios, LevelRatios
+from ..events.ratios import EventRatios
 from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
@@ -77,7 +77,7 @@ class Exceedance(NamedTuple):
         With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
         averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
         `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios,
-        and with `LevelRatios`: ratios at other levels are no trials at the predicted level.
+        and with the form "linear": ratios at other levels are no trials at the predicted level.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     """
@@ -110,7 +110,7 @@ def exceedance(
     threshold: ArrayLike,
     *,
     unit: str | None = None,
-    ratios: EventRatios | LevelRatios | None = None,
+    ratios: EventRatios | None = None,
     noise: bool | None = None,
     effective_sample_size: float | None = None,
     level: float = 0.95,
@@ -127,7 +127,7 @@ def exceedance(
         for each entry, shape (...). Positive if there are ratios.
     unit : str, optional
         Unit of the threshold, with the dimension of the predicted channel. Default: SI.
-    ratios : EventRatios or LevelRatios, optional
+    ratios : EventRatios, optional
         Ratios of measured to fitted values of the quantity in several events: the model error, for a prediction without
         noise. A prediction by `predict_new_event` has its ratios already.
     noise : bool, optional
@@ -225,7 +225,7 @@ def exceedance(
             for k in range(len(rows))
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        by_events = np.array([each.upper_by_events for each in columns])
+        by_events = None if spread.ratios.form == "linear" else np.array([each.upper_by_events for each in columns])
         return Exceedance(limits, *numbers, effective, said, by_events, unit)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
@@ -267,7 +267,7 @@ def exceedance_probability(
     share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
     lower, upper = interval_of_draws(draws, share, effective, spread, level)
     by_events = None
-    if isinstance(spread.ratios, EventRatios):
+    if spread.ratios is not None and spread.ratios.form == "constant":
         by_events = _upper_by_events(values, limits, spread.ratios, level, below)
     return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread), by_events)
 

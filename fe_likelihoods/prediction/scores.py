@@ -27,11 +27,14 @@ C. A. T. Ferro (2014), Fair scores for ensemble forecasts, Quarterly Journal of 
 1917-1923, doi:10.1002/qj.2270.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 __all__ = [
+    "Share",
     "crps_normal",
     "crps_samples",
     "interval_score",
@@ -211,7 +214,36 @@ def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
     return np.where(unknown, np.nan, (below + 0.5) / (len(ascending) + 1.0))
 
 
-def share_within(pit: ArrayLike, level: float) -> float:
+class Share(NamedTuple):
+    """How many measured values are within their intervals; ``print`` shows "10 of 11: 62 to 98 %".
+
+    Attributes
+    ----------
+    inside, n : int
+        Number of values within, and of all values.
+    """
+
+    inside: int
+    n: int
+
+    @property
+    def value(self) -> float:
+        """The share [-]."""
+        return self.inside / self.n
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of 95 % for the share in further events (Wilson 1927): values of n events show it no better."""
+        from scipy.stats import binomtest  # slow to import
+
+        return tuple(binomtest(self.inside, self.n).proportion_ci(method="wilson"))
+
+    def __str__(self) -> str:
+        low, high = (100.0 * each for each in self.interval)
+        return f"{self.inside} of {self.n}: {low:.0f} to {high:.0f} %"
+
+
+def share_within(pit: ArrayLike, level: float) -> Share:
     """Share of measured values within their central predicted intervals, from their PIT.
 
     Parameters
@@ -224,18 +256,23 @@ def share_within(pit: ArrayLike, level: float) -> float:
 
     Returns
     -------
-    float
-        The share.
+    Share
+        The numbers, the share, and its interval.
 
     Raises
     ------
     ValueError
         If there is no value, one is not between 0 and 1, or the level is out of range.
 
+    References
+    ----------
+    E. B. Wilson (1927), Probable inference, the law of succession, and statistical inference, Journal of the American
+    Statistical Association 22, 209-212, doi:10.1080/01621459.1927.10502953.
+
     Examples
     --------
-    >>> share_within([0.1, 0.4, 0.97], 0.9)
-    0.6666666666666666
+    >>> print(share_within([0.1, 0.4, 0.97], 0.9))
+    2 of 3: 21 to 94 %
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"share_within: level must be a probability between 0 and 1; got {level!r}")
@@ -243,7 +280,7 @@ def share_within(pit: ArrayLike, level: float) -> float:
     there = there[~np.isnan(there)]
     if not there.size or not ((there >= 0.0) & (there <= 1.0)).all():
         raise ValueError(f"share_within: expected PIT values between 0 and 1; got {pit!r}")
-    return float(np.mean(np.abs(there - 0.5) <= 0.5 * level))
+    return Share(int((np.abs(there - 0.5) <= 0.5 * level).sum()), there.size)
 
 
 def _as_floats(*arrays: ArrayLike) -> tuple[np.ndarray, ...]:

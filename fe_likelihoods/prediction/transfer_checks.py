@@ -34,6 +34,7 @@ __all__ = [
     "calibration_of",
     "sample_to_check",
     "is_first_warning",
+    "remark_on_harmonic",
     "remark_on_level",
     "remark_on_peaks",
     "remark_on_same_response",
@@ -51,6 +52,7 @@ _LARGEST_COUNT_RATIO = 2.0  # of independent samples: assumed by the noise, and 
 _LARGEST_ADDED_PEAK = 1.1  # median peak with white errors, as a multiple of the median response peak
 _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the response is too large
 _WORSE = 1.1  # RRMSE of the response divided by the RRMSE of its best multiple, beyond which this is said
+_NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 _SAME = 1e-6  # difference of two responses, relative to their norm, up to which a motion changes nothing
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
@@ -318,6 +320,38 @@ def remark_on_same_response(
         "prediction repeats the calibration. Check that the model reads the motion that it is given, not one file that "
         "is always the same (rehearse, or `fe-likelihoods check`, finds this before a run)"
     )
+
+
+def remark_on_harmonic(calibrated: Any, other: Any) -> str:
+    """Remark if the power of a motion is in a much narrower band than in the calibration; empty if not.
+
+    The bandwidth is (sum P)^2 / sum P^2 times the frequency step, for the power P of the Fourier transform: the width
+    of a band with constant power. The mean over the supports is compared.
+
+    Parameters
+    ----------
+    calibrated, other : Model
+        The models under the motion of the calibration and under the other one.
+    """
+    found = [[_bandwidth(each) for each in motions_of(model)] for model in (calibrated, other)]
+    if not all(found):
+        return ""
+    before, now = (float(np.mean(each)) for each in found)
+    if not now < _NARROW * before:
+        return ""
+    return (
+        f"this motion has its power in a band of {now:.2g} Hz, as a harmonic has; {before:.2g} Hz in the calibration. "
+        "Near a resonance the response depends on frequency and damping far more than in the calibration, which hardly "
+        "speaks for it: the spread of the posterior is too narrow. Calibrate with a motion of this kind, or predict "
+        "with the spread between several events (in Python, predict_new_event)"
+    )
+
+
+def _bandwidth(motion: Any) -> float:
+    """Width of a band with the same power [Hz]; inf for a motion without power."""
+    power = np.square(np.abs(np.fft.rfft(motion.acceleration)))
+    squares = np.square(power).sum()
+    return float(power.sum() ** 2 / squares / (motion.n_steps * motion.dt)) if squares > 0.0 else np.inf
 
 
 def _motion(model: Any) -> np.ndarray | None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
+from ..prediction.scores import share_within
 from ..signals.channels import Measurements
 from ..simulation.model import SimulationFailed
 from ..units import from_si
@@ -209,10 +210,11 @@ def _sentence(
         return f"{text} There are no measurements to compare with."
     known = [row for row in numbers if np.isfinite(row.pit)]
     if known:
-        inside = sum(row.place.startswith("within") for row in known)
-        text += f" {inside} of {len(known)} measured numbers are within their {_percent(LEVEL)} intervals"
+        share = share_within([row.pit for row in known], LEVEL)
+        text += f" {share.inside} of {share.n} measured numbers are within their {_percent(LEVEL)} intervals"
         outside = [f"{row.name} {row.place}" for row in known if not row.place.startswith("within")]
-        text += f" ({', '.join(outside)})." if outside else "."
+        text += f" ({', '.join(outside)})" if outside else ""
+        text += "; so few show a share between {} and {} of all such numbers.".format(*map(_percent, share.interval))
     for scores in histories:
         shares = ", ".join(
             f"{_percent(share)} of {channel.name}"

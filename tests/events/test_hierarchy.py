@@ -414,3 +414,23 @@ def test_unknown_tests_and_numbers_are_refused(result):
         result.weights("EQ9")
     with pytest.raises(ValueError, match="1 or more; got 0"):
         result.new_test(0)
+
+
+def test_the_spread_is_said_beside_the_error_of_one_test(rng):
+    prior = Prior({"frequency": LogNormal(5.0, 0.5), "damping": LogNormal(0.1, 1.0)})
+    samples = [[5.0, 0.1] * np.exp([0.01, 0.2] * rng.standard_normal((500, 2))) for _ in range(4)]
+    tests = {f"E{k}": StoredPosterior(each, prior) for k, each in enumerate(samples)}
+    varying = {name: Varying(prior.distributions[name], HalfNormal(0.3)) for name in prior.names}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        known = [5.0, 0.1, 0.1, 0.05] * np.exp([0.01, 0.1, 0.1, 1.0] * rng.standard_normal((400, 4)))
+        result = Hierarchy(HierarchicalPosterior(tests, varying), known)
+    low, high = (f"{100.0 * each:.2g}" for each in np.quantile(known[:, 1], [0.05, 0.95]))
+    assert f"The tests differ in frequency by 10 % ({low} to {high} %), 10 times the error of one test" in result.spread
+    assert "damping by no more than the error of one test shows (" in result.spread
+    assert "must carry this spread" in result.spread and "white noise are too narrow" in result.spread
+    assert "mostly by its prior" not in result.spread and result.spread in str(result)
+    known[:, 1] = np.abs(0.3 * rng.standard_normal(400))  # the draws of the prior
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert "mostly by its prior" in Hierarchy(result.posterior, known).spread

@@ -10,7 +10,8 @@ from scipy.fft import dct
 
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
 from fe_likelihoods.events.hierarchy_result import Hierarchy
-from fe_likelihoods.events.ratios import EventRatios, LevelRatios
+from fe_likelihoods.events.ratios import EventRatios
+from fe_likelihoods.events.spread import EventSpread
 from fe_likelihoods.events.stored_posterior import StoredPosterior
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
@@ -18,20 +19,20 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.noise.gaussian import GaussianNoise
 from fe_likelihoods.prediction.fragility import fragility
 from fe_likelihoods.prediction.model_error import model_error
-from fe_likelihoods.prediction.new_event import event_level, event_ratio, predict_new_event
+from fe_likelihoods.prediction.new_event import draw_new_event, event_ratios
 from fe_likelihoods.prediction.propagation import propagate
-from fe_likelihoods.prediction.quantities import peak, rms
-from fe_likelihoods.prediction.reliability import exceedance
+from fe_likelihoods.prediction.quantities import peak
+from fe_likelihoods.prediction.reliability import exceedance, exceedance_probability
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
-from tests.prediction.test_new_event import SHAPE, Amplified, hierarchy  # noqa: F401  a fixture
+from tests.prediction.test_new_event import Amplified, hierarchy  # noqa: F401  a fixture
 from tests.prediction.twins import fragility_twin
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
-RATIOS = EventRatios(np.exp(LOGS))
+RATIOS = EventRatios(np.exp(LOGS), prior_events=0)
 T = stats.t(3, LOGS.mean(), LOGS.std(ddof=1) * np.sqrt(1.25))
 
 
@@ -76,8 +77,10 @@ def test_exceedance_with_ratios_is_the_integral_over_samples_and_ratios(rng):
         "the uncertainty of the parameters and the error of the model, from the ratios of 4 events"
     )
     assert exceedance([-1.0, -2.0], 1.0, ratios=RATIOS).probability == 0.0  # times a positive ratio, it stays negative
-    two = exceedance(np.stack([values, 2.0 * values], axis=1), 1.5, ratios=EventRatios(np.exp([LOGS, LOGS - 0.1]).T))
-    one = exceedance(2.0 * values, 1.5, ratios=EventRatios(np.exp(LOGS - 0.1)))
+    two = exceedance(
+        np.stack([values, 2.0 * values], axis=1), 1.5, ratios=EventRatios(np.exp([LOGS, LOGS - 0.1]).T, prior_events=0)
+    )
+    one = exceedance(2.0 * values, 1.5, ratios=EventRatios(np.exp(LOGS - 0.1), prior_events=0))
     assert two.probability[1] == one.probability and two.lower[1] == one.lower
 
 
@@ -86,7 +89,7 @@ def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
     """Exact for one value and ratios of five events; the interval of Clopper and Pearson of one value is of no use."""
     truth, inside = stats.norm.sf(np.log(limit), 0.1, 0.2), []
     for _ in range(300):
-        ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal(5)))
+        ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal(5)), prior_events=0)
         found = exceedance(np.ones(50), limit, ratios=ratios, level=0.9)
         inside.append(found.lower <= truth <= found.upper)
     assert abs(np.mean(inside) - 0.9) < 4.0 * np.sqrt(0.09 / 300)
@@ -95,17 +98,19 @@ def test_intervals_of_the_probability_cover_the_true_probability(limit, rng):
 
 
 def test_intervals_contain_their_own_probability(hierarchy, record, rng):  # noqa: F811
-    few = EventRatios([0.9887505, 1.00023499, 1.00460618])  # P has the tail of t with 2 degrees of freedom
+    few = EventRatios(
+        [0.9887505, 1.00023499, 1.00460618], prior_events=0
+    )  # P has the tail of t with 2 degrees of freedom
     limits = np.array([0.01, 0.1, 0.5, 0.9, 1.0, 1.1, 2.0, 10.0, 100.0])
     found = exceedance(np.ones(200), limits, ratios=few)
     assert np.all(found.lower <= found.probability) and np.all(found.probability <= found.upper)
-    exact = stats.t.sf(np.log(limits), few.degrees_of_freedom, np.log(few.median), few.scale)
+    exact = stats.t.sf(np.log(limits), 2, np.log(few.quantile(0.5)), few.sd * np.sqrt(4.0 / 3.0))
     np.testing.assert_allclose(found.probability, exact, rtol=1e-10)
-    quantile = np.quantile(few.draw_populations(100_000, rng, np.zeros(1)).sd, 0.99)
+    quantile = np.quantile(few.draw_populations(100_000, rng).sd, 0.99)
     assert special.ndtr(-np.log(100.0) / quantile) < 1e-100 < 1e-7 < found.probability[-1]  # what made it fail
     # Shares of samples that are all zero, or all one, are not certain.
-    options = {"quantity": peak("top"), "n": 200, "seed": 1}
-    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
+    draws, options = hierarchy.new_test(200, ["gain"], 1), {"quantity": peak("top"), "progress": False}
+    plain = propagate(Amplified(2.0), draws, **options)
     for limit, share in ((10.0 * plain.values.max(), 0.0), (0.1 * plain.values.min(), 1.0)):
         found = exceedance(plain, limit, noise=False)
         assert found.probability == share
@@ -120,7 +125,7 @@ def test_intervals_contain_their_own_probability(hierarchy, record, rng):  # noq
 
 def test_what_the_events_tell_of_a_probability_without_the_form_of_their_ratios(rng):
     """Clopper-Pearson for the events themselves: far in the tail it is far above the interval, which ends at P."""
-    few = EventRatios([0.9887505, 1.00023499, 1.00460618])
+    few = EventRatios([0.9887505, 1.00023499, 1.00460618], prior_events=0)
     limits = np.array([0.5, 1.002, 100.0])
     found = exceedance(np.ones(200), limits, ratios=few)
     expected = [1.0, stats.beta.ppf(0.975, 2.0, 2.0), 1.0 - 0.025 ** (1.0 / 3.0)]  # 3, 1 and 0 of 3 events
@@ -138,7 +143,7 @@ def test_events_at_other_levels_are_no_trials_of_the_predicted_one(slope, rng):
     values = np.exp(0.3 + slope * np.log(levels / 0.1) + 0.03 * rng.standard_normal(12))
     predicted = 2.0 * np.exp(0.01 * rng.standard_normal(400))
     limits = 2.0 * np.exp(0.3 + slope * np.log(20.0)) * np.array([0.95, 1.0, 1.05])
-    found = exceedance(predicted, limits, ratios=LevelRatios(values, levels=levels))
+    found = exceedance(predicted, limits, ratios=EventRatios(values, prior_events=0, levels=levels, form="linear"))
     assert np.all((found.lower <= found.probability) & (found.probability <= found.upper))
     assert 0.7 < found.probability[0] and found.probability[2] < 0.3
     assert found.upper_by_events is None and "events alone" not in str(found)
@@ -156,7 +161,7 @@ def test_what_the_events_tell_holds_for_any_tail_of_the_ratios(degrees):
     limit = np.exp(0.1 * stats.t.isf(truth, degrees))
     for seed in range(300):
         values = np.exp(0.1 * np.random.default_rng(seed).standard_t(degrees, 30))
-        found = exceedance(np.ones(5), limit, ratios=EventRatios(values), level=0.9)
+        found = exceedance(np.ones(5), limit, ratios=EventRatios(values, prior_events=0), level=0.9)
         by_events.append(truth <= found.upper_by_events)
         normal.append(truth <= found.upper)
     assert np.mean(by_events) > 0.95 - 4.0 * np.sqrt(0.05 * 0.95 / 300)
@@ -174,7 +179,7 @@ def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
     }
     population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
     hierarchy = Hierarchy(population, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))  # noqa: F811
-    options = {"ratios": RATIOS, "n": 50, "seed": 1, "progress": False}
+    options = {"ratios": event_ratios(hierarchy, posteriors, peak("top")), "n": 5, "seed": 1, "progress": False}
 
     def said(samples, strength, **more):
         with warnings.catch_warnings(record=True) as found:
@@ -187,32 +192,26 @@ def test_fragility_of_a_hierarchy_is_compared_with_all_its_events(wave, rng):
     (beyond,) = said(hierarchy, 20.0)
     assert "10 times the largest" in beyond and "Hierarchy" not in beyond
     assert said(hierarchy, 2.0, calibrated=[posteriors["weak"].likelihood.measurements])
+    with pytest.raises(ValueError, match="draws of a Hierarchy and ratios are correlated"):
+        fragility(posteriors["weak"], hierarchy, [wave.record], peak("top"), 1.0, ratios=RATIOS)
     (single,) = said(rng.normal(1.0, 0.05, size=(50, 1)), 2.0)
     assert "vary between events (in Python, Hierarchy)" in single
 
 
-def test_exceedance_of_a_new_event_has_the_spread_of_the_population(hierarchy):  # noqa: F811
-    options = {"quantity": peak("top"), "n": 2000, "seed": 1}
-    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
-    corrected = predict_new_event(hierarchy, Amplified(), 2.0, ratios=RATIOS, **options)
-    limit = 2.0 * 0.03 * np.abs(SHAPE).max() * 1.2
-    found = exceedance(corrected, limit)
-    draws = np.log(plain.values[:, None] / limit) + T.rvs(size=(1, 4000), random_state=2)
-    assert float(found.probability) == pytest.approx((draws > 0.0).mean(), abs=0.01)
-    assert "their spread between events and the error of the model, from the ratios of 4 events" in found.uncertainty
-    assert found.lower < (corrected.values > limit).mean() < found.upper
-    again = exceedance(plain, limit, ratios=RATIOS)
-    assert again[1:5] == found[1:5]
-    with pytest.warns(UserWarning, match="exceedance: the probabilities leave the error of the model out"):
-        without = exceedance(plain, limit)
-    assert without.uncertainty.endswith("their spread between events, not the error of the model")
-    with pytest.raises(ValueError, match="contains it already"):
-        exceedance(corrected, limit, ratios=RATIOS)
-    # The hyper-parameters of this fixture are known, so that only the error by draws is left.
-    assert without.upper - without.lower < 0.1
+def test_exceedance_of_draws_of_a_population_has_its_uncertainty(wave, hierarchy):  # noqa: F811
+    """Weights of the draws in single populations: hyper-parameters that are known, and some that differ."""
+
+    def width(population):
+        draws, weights = draw_new_event(population, ["gain"], 2000, None, np.random.SeedSequence(1))
+        values, limit = draws["gain"], np.array(0.036)
+        found = exceedance_probability(values, limit, EventSpread(values, weights), 2000.0, 0.95, 1)
+        assert found.lower < (values > limit).mean() < found.upper
+        assert found.uncertainty.endswith("their spread between events, not the error of the model")
+        return found.upper - found.lower
+
     varied = type(hierarchy)(hierarchy.posterior, hierarchy.samples * np.exp(0.2 * np.sin(np.arange(200)))[:, None])
-    wide = exceedance(predict_new_event(varied, Amplified(), 2.0, **options), limit, noise=False)
-    assert wide.upper - wide.lower > 3.0 * (without.upper - without.lower)
+    known = width(hierarchy)
+    assert known < 0.1 and width(varied) > 3.0 * known
 
 
 def test_weights_of_draws_are_those_of_single_populations(hierarchy):  # noqa: F811
@@ -227,28 +226,6 @@ def test_weights_of_draws_are_those_of_single_populations(hierarchy):  # noqa: F
     assert np.abs(z).max() < 4.5 and np.mean(np.square(z)) < 2.0
     with pytest.raises(ValueError, match="missing share_top"):
         varied.population_weights({"gain": draws["gain"]})
-
-
-def test_level_ratios_correct_each_draw_at_its_own_level(hierarchy):  # noqa: F811
-    levels = np.array([0.005, 0.01, 0.03, 0.1, 0.3])
-    ratios = LevelRatios((levels / 0.03) ** 0.4 * np.exp([0.01, -0.01, 0.0, 0.01, -0.01]), levels, "linear")
-    options = {"quantity": peak("top"), "n": 500, "seed": 1}
-    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
-    corrected = predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, **options)
-    expected = plain.values * (plain.values / 0.03) ** 0.4
-    assert np.median(np.abs(np.log(corrected.values / expected))) < 0.03
-    limit = float(np.median(expected))
-    assert float(exceedance(corrected, limit).probability) == pytest.approx(0.5, abs=0.03)
-    with pytest.raises(ValueError, match="expected ratios"):
-        predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, quantity=[peak("top"), rms("top")], n=20)
-
-
-def test_event_level_is_what_the_ratio_divides_by(wave):
-    posterior = with_noise(wave, "measured")
-    samples = np.array([[0.8, 0.1], [1.1, 0.1], [0.9, 0.1]])
-    level = event_level(posterior, samples, peak("top"))
-    assert level == pytest.approx(0.9 * np.abs(wave.shape).max())
-    assert event_ratio(posterior, samples, peak("top")) * level == pytest.approx(np.abs(wave.shape).max())
 
 
 def test_error_of_the_model_has_the_level_of_the_noise_and_the_spectrum_of_the_response(wave):

@@ -1,4 +1,4 @@
-"""Ratios of events: constant ones and those that depend on the level, against closed forms; coverage, with controls."""
+"""Ratios of events: the t distributions of the textbook, the prior of their scatter, coverage with controls."""
 
 import warnings
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from fe_likelihoods.events.ratios import EventRatios, LevelRatios
+from fe_likelihoods.events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from fe_likelihoods.prediction.reliability import exceedance
 from tests.prediction.twins import ratio_twin
+
+LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 
 
 @pytest.fixture
@@ -17,84 +19,102 @@ def events(rng):
     return np.exp(0.1 + 0.3 * np.log(levels) + 0.1 * rng.standard_normal(8)), levels
 
 
-def test_constant_form_is_that_of_event_ratios(events):
+def test_ratio_of_a_new_event_is_the_t_distribution_of_the_textbook():
+    ratios = EventRatios(np.exp(LOGS), prior_events=0)
+    expected = stats.t(3, LOGS.mean(), LOGS.std(ddof=1) * np.sqrt(1.25))
+    p = np.array([0.05, 0.5, 0.95])
+    np.testing.assert_allclose(np.log(ratios.quantile(p)), expected.ppf(p), rtol=1e-10)
+    draws = np.log(ratios.draw(np.ones(20_000), np.random.default_rng(1)))
+    assert stats.kstest(draws, expected.cdf).pvalue > 1e-3
+    assert ratios.prior_share == 0.0
+
+
+def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_width_it_is():
+    ratios = EventRatios(np.exp(LOGS), prior_sd=0.2, prior_events=6.0)
+    squares = np.square(LOGS - LOGS.mean()).sum()
+    assert ratios.degrees_of_freedom == 9.0
+    assert ratios.sd == pytest.approx(np.sqrt((6.0 * 0.04 + squares) / 9.0))
+    assert ratios.prior_share == pytest.approx(0.24 / (0.24 + squares))
+    assert f"{ratios.prior_share:.0%}" in str(ratios) and "prior of the scatter 0.2, worth 6 events" in str(ratios)
+    certain = EventRatios(np.exp(LOGS), prior_sd=0.3, prior_events=1e6)  # replaces the scatter of the events
+    assert np.log(certain.quantile(0.95) / certain.quantile(0.5)) == pytest.approx(
+        0.3 * np.sqrt(1.25) * stats.norm.ppf(0.95), rel=1e-4
+    )
+    one = EventRatios([1.2])  # the same formula with one event
+    assert one.sd == PRIOR_SD and one.degrees_of_freedom == PRIOR_EVENTS and one.prior_share == 1.0
+    expected = 1.2 * np.exp(stats.t.ppf(0.95, PRIOR_EVENTS) * PRIOR_SD * np.sqrt(2.0))
+    assert one.quantile(0.95) == pytest.approx(expected)
+    both = EventRatios(np.exp(np.stack([LOGS, 2.0 * LOGS], axis=1)), prior_sd=[0.1, 0.2])
+    np.testing.assert_allclose(both.sd, both.sd[0] * np.array([1.0, 2.0]))
+    assert both.of_quantity(1).sd == pytest.approx(both.sd[1])
+
+
+def test_a_line_is_the_regression_of_the_textbook(events):
     values, levels = events
-    for guess in ({}, {"prior_sd": 0.3, "prior_events": 2.0}):
-        plain, constant = EventRatios(values, **guess), LevelRatios(values, levels, "constant", **guess)
-        at = np.array([1e-3, 1.0, 50.0])
-        np.testing.assert_allclose(constant.quantile(0.5, at), plain.median, rtol=1e-12)
-        np.testing.assert_allclose(constant.quantile(0.95, at), plain.median * plain.factor(0.9), rtol=1e-12)
-        np.testing.assert_allclose(
-            constant.probability_above(np.array([0.7, 1.1, 1.6]), np.log(at)),
-            plain.probability_above(np.array([0.7, 1.1, 1.6]), np.log(at)),
-            rtol=1e-10,
-        )
-    equal = LevelRatios(values, np.ones(8))  # without different levels nothing else is possible
-    assert equal.forms["constant"] == 1.0
-    assert equal.quantile(0.9, 1.0) == pytest.approx(EventRatios(values).median * EventRatios(values).factor(0.8))
+    ratios = EventRatios(values, prior_events=0, levels=levels, form="linear")
+    x, at = np.log(levels), np.array([-2.0, 0.0, 0.7, 3.0])
+    slope, offset = np.polyfit(x, np.log(values), 1)
+    np.testing.assert_allclose(np.log(ratios.quantile(0.5, np.exp(at))), offset + slope * at, atol=1e-10)
+    residual = np.sqrt(np.square(np.log(values) - offset - slope * x).sum() / 6)
+    textbook = residual * np.sqrt(1.0 + 1.0 / 8 + (at - x.mean()) ** 2 / np.square(x - x.mean()).sum())
+    width = np.log(ratios.quantile(0.95, np.exp(at)) / ratios.quantile(0.5, np.exp(at)))
+    np.testing.assert_allclose(width, stats.t.ppf(0.95, 6) * textbook, rtol=1e-10)
+    several = EventRatios(np.stack([values, values], axis=1), levels=np.stack([levels, levels], axis=1), form="linear")
+    single = EventRatios(values, levels=levels, form="linear")
+    np.testing.assert_allclose(several.quantile(0.9, [2.0, 5.0]), single.quantile(0.9, [2.0, 5.0]))
+    np.testing.assert_allclose(several.of_quantity(0).quantile(0.9, 2.0), single.quantile(0.9, 2.0))
 
 
-def test_a_steep_line_is_the_regression_of_the_textbook(rng):
-    """With a slope far above the scatter its prior is nearly flat: mean and t interval of least squares."""
-    x = np.linspace(-1.0, 1.0, 12)
-    values = np.exp(0.2 + 0.2 * x + 0.02 * rng.standard_normal(12))
-    ratios, (slope, offset) = LevelRatios(values, np.exp(x), "linear"), np.polyfit(x, np.log(values), 1)
-    at = np.array([-2.0, 0.0, 0.7, 3.0])
-    np.testing.assert_allclose(np.log(ratios.quantile(0.5, np.exp(at))), offset + slope * at, atol=5e-3)
-    residual = np.sqrt(np.square(np.log(values) - offset - slope * x).sum() / 10)
-    textbook = residual * np.sqrt(1.0 + 1.0 / 12 + (at - x.mean()) ** 2 / np.square(x - x.mean()).sum())
-    width = np.log(ratios.quantile(0.95, np.exp(at))) - np.log(ratios.quantile(0.5, np.exp(at)))
-    np.testing.assert_allclose(width, stats.t.ppf(0.95, 10) * textbook, rtol=0.12)
-    assert width[3] > 1.5 * width[1]  # wider where it extrapolates
-
-
-def test_smooth_form_is_the_gaussian_process_with_unknown_mean_and_variance(events):
-    """One amplitude and length, against the posterior of mean, curve and variance by brute force."""
+@pytest.mark.parametrize("form", ("constant", "linear"))
+def test_draws_populations_and_probabilities_belong_together(events, form):
     values, levels = events
-    ratios = LevelRatios(values, levels, "smooth")
-    part, z_new = ratios._parts[5], 0.4
-    y, z = np.log(values), (np.log(levels) - np.log(levels).mean()) / np.log(levels).std()
-    a, length = part.kernel.amplitude, part.kernel.length
-    far = 1e6  # standard deviation of the mean, in units of s
-    points = np.append(z, z_new)
-    joint = np.eye(9) + a**2 * np.exp(-0.5 * np.square((points[:, None] - points) / length)) + far**2
-    gain = np.linalg.solve(joint[:8, :8], joint[:8, 8])
-    mean, factor = gain @ y, joint[8, 8] - gain @ joint[:8, 8]
-    scale = np.sqrt(y @ np.linalg.solve(joint[:8, :8], y) / 7 * factor)
-    log_level = np.log(levels).mean() + np.log(levels).std() * z_new
-    center, found = ratios._components(np.array([log_level]))[5]
-    assert center[0] == pytest.approx(mean, abs=1e-4) and found[0] == pytest.approx(scale, rel=1e-3)
-
-
-def test_draws_populations_and_probabilities_belong_together(events):
-    values, levels = events
-    ratios, rng = LevelRatios(values, levels), np.random.default_rng(1)
+    ratios, rng = EventRatios(values, levels=levels, form=form), np.random.default_rng(1)
+    populations = ratios.draw_populations(4000, rng)
     for level in (0.05, 1.0, 8.0):
         limit = ratios.quantile(0.8, level)
         assert ratios.probability_above(limit, np.log(level)) == pytest.approx(0.2, abs=1e-9)
-        drawn = ratios.draw_at(np.full(20_000, level), rng)
+        drawn = ratios.draw(np.full(20_000, level), rng)
         assert abs((drawn > limit).mean() - 0.2) < 4.0 * np.sqrt(0.16 / 20_000)
-        populations = ratios.draw_populations(4000, rng, np.log([0.05, level, 8.0]))
         centers = populations.center_at(np.full(4000, np.log(level)))
         above = special.ndtr((centers - np.log(limit)) / populations.sd)
-        assert abs(above.mean() - 0.2) < 4.0 * above.std() / np.sqrt(4000) + 1e-3
+        assert abs(above.mean() - 0.2) < 4.0 * above.std() / np.sqrt(4000)
 
 
-def test_evidence_chooses_the_form_and_few_events_choose_none(rng):
-    x = np.linspace(-1.5, 1.5, 14)
-    noise = 0.03 * rng.standard_normal(14)
-    level = np.exp(x)
-    assert LevelRatios(np.exp(0.3 * x + noise), level).forms["linear"] > 0.7
-    assert LevelRatios(np.exp(0.3 * np.sin(3.0 * x) + noise), level).forms["smooth"] > 0.95
-    flat = LevelRatios(np.exp(noise), level).forms
-    assert flat["constant"] > max(flat["linear"], flat["smooth"]) and sum(flat.values()) == pytest.approx(1.0)
-    assert LevelRatios(np.exp(0.3 * x[:3]), level[:3]).forms == {"constant": 1.0, "linear": 0.0, "smooth": 0.0}
-    assert LevelRatios(np.exp(0.3 * x[:9] + noise[:9]), level[:9]).forms["smooth"] == 0.0
+@pytest.mark.parametrize("n_events", (2, 5, 10))
+def test_intervals_of_ratios_cover_new_events_and_normal_quantiles_do_not(n_events, rng):
+    sets = 4000
+    ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal((n_events, sets))), prior_events=0)
+    new = np.exp(0.1 + 0.2 * rng.standard_normal(sets))
+    error = 4.0 * np.sqrt(0.25 / sets)
+    for level in (0.5, 0.9):
+        inside = np.abs(np.log(new / ratios.quantile(0.5))) < np.log(
+            ratios.quantile(0.5 + 0.5 * level) / ratios.quantile(0.5)
+        )
+        assert abs(inside.mean() - level) < error
+    narrow = np.abs(np.log(new / ratios.quantile(0.5))) < stats.norm.ppf(0.95) * np.log(ratios.values).std(axis=0)
+    assert narrow.mean() < 0.9 - error
+
+
+@pytest.mark.parametrize("n_events", (1, 4))
+def test_the_prior_covers_where_scatters_differ_as_it_states_and_helps_the_worst(n_events, rng):
+    """Structures with scatters drawn from the prior: covered with few events; and fewer narrow intervals by chance."""
+    sets, degrees = 4000, 5.0
+    spread = 0.12 * np.sqrt(degrees / rng.chisquare(degrees, sets))
+    found = np.exp(spread * rng.standard_normal((n_events, sets)))
+    new = np.exp(spread * rng.standard_normal(sets))
+    ratios = EventRatios(found, 0.12, degrees)
+    inside = np.abs(np.log(new / ratios.quantile(0.5))) < np.log(ratios.quantile(0.95) / ratios.quantile(0.5))
+    assert abs(inside.mean() - 0.9) < 4.0 * np.sqrt(0.09 / sets)
+    if n_events > 1:  # control: without the prior the interval is right on average, and wider for it
+        alone = EventRatios(found, prior_events=0)
+        widths = [np.log(each.quantile(0.95) / each.quantile(0.5)) for each in (ratios, alone)]
+        assert np.quantile(widths[0] / spread, 0.05) > 1.2 * np.quantile(widths[1] / spread, 0.05)
+        assert np.mean(widths[0]) < np.mean(widths[1])
 
 
 @pytest.mark.parametrize("truth", ("slope 0", "slope 0.2"))
-def test_intervals_cover_new_events_and_constant_ratios_miss_far_ones(truth):
-    found = [ratio_twin(truth, 10, None, seed) for seed in range(40)]
+def test_lines_cover_new_events_and_constant_ratios_miss_far_ones(truth):
+    found = [ratio_twin(truth, 10, "linear", seed) for seed in range(40)]
     inside, far, score = (np.array(each) for each in zip(*found, strict=True))
     for k, level in enumerate((0.5, 0.9)):
         assert abs(inside[:, k].mean() - level) < 4.0 * inside[:, k].std() / np.sqrt(40)
@@ -109,39 +129,42 @@ def test_intervals_cover_new_events_and_constant_ratios_miss_far_ones(truth):
 
 
 def test_what_cannot_be_used_is_refused():
-    with pytest.raises(ValueError, match="LevelRatios: expected positive ratios"):
-        LevelRatios([[1.0], [1.1]], [1.0, 2.0])
-    with pytest.raises(ValueError, match="LevelRatios: one event does not show"):
-        LevelRatios([1.1], [1.0])
+    for bad in ([], [0.0, 1.0], [np.nan, 1.0], 1.2):
+        with pytest.raises(ValueError, match="expected positive ratios"):
+            EventRatios(bad)
+    with pytest.raises(ValueError, match="prior_sd must be positive"):
+        EventRatios([1.0, 1.1], prior_sd=0.0)
+    with pytest.raises(ValueError, match=r"one prior_sd, or one per quantity, \(2,\)"):
+        EventRatios([[1.0, 1.1]], prior_sd=[0.1, 0.1, 0.1])
+    for too_few in ({"values": [1.1]}, {"values": [1.0, 1.1], "levels": [1.0, 2.0], "form": "linear"}):
+        with pytest.raises(ValueError, match="do not show how ratios scatter"):
+            EventRatios(**too_few, prior_events=0)
     for bad in ([1.0], [1.0, 0.0], [1.0, np.inf]):
-        with pytest.raises(ValueError, match="one positive predicted value for each of 2 ratios"):
-            LevelRatios([1.0, 1.1], bad)
-    with pytest.raises(ValueError, match="form must be one of constant, linear, smooth"):
-        LevelRatios([1.0, 1.1], [1.0, 2.0], "quadratic")
-    with pytest.raises(ValueError, match="a linear dependence needs events of different levels"):
-        LevelRatios([1.0, 1.1], [2.0, 2.0], "linear")
-    ratios = LevelRatios([1.0, 1.1, 0.9, 1.2], [1.0, 2.0, 3.0, 4.0])
+        with pytest.raises(ValueError, match="one positive predicted value for each ratio"):
+            EventRatios([1.0, 1.1], levels=bad)
+    with pytest.raises(ValueError, match="form must be one of constant, linear"):
+        EventRatios([1.0, 1.1], levels=[1.0, 2.0], form="smooth")
+    for levels in (None, [2.0, 2.0]):
+        with pytest.raises(ValueError, match="a linear form needs levels= of events that differ"):
+            EventRatios([1.0, 1.1], levels=levels, form="linear")
     for p, level in ((1.5, 1.0), (0.5, 0.0)):
-        with pytest.raises(ValueError, match="expected a probability between 0 and 1 and positive"):
-            ratios.quantile(p, level)
+        with pytest.raises(ValueError, match="expected probabilities between 0 and 1 and positive"):
+            EventRatios([1.0, 1.1]).quantile(p, level)
     with pytest.raises(ValueError, match="ratios of one quantity"):
-        EventRatios([[1.0, 1.1], [0.9, 1.2]]).draw_populations(3, np.random.default_rng(1), np.zeros(1))
+        EventRatios([[1.0, 1.1], [0.9, 1.2]]).draw_populations(3, np.random.default_rng(1))
 
 
-def test_equal_ratios_are_said_and_have_no_nan():
-    with pytest.warns(UserWarning, match="EventRatios: the ratios of 2 events are equal.*prior_events=3"):
-        equal = EventRatios([1.0, 1.0])
-    with pytest.warns(UserWarning, match="LevelRatios: the ratios of 3 events are equal"):
-        levels = LevelRatios([1.0] * 3, [1.0, 2.0, 3.0])
+def test_equal_ratios_without_a_prior_are_said_and_have_no_nan():
+    with pytest.warns(UserWarning, match="EventRatios: the ratios of 2 events are equal.*prior_events="):
+        equal = EventRatios([1.0, 1.0], prior_events=0)
     with pytest.warns(UserWarning, match="are equal"):  # one of two quantities
-        EventRatios([[1.0, 1.1], [1.0, 1.2]])
-    for ratios in (equal, levels):
-        found = ratios.probability_above(np.array([0.9, 1.0, 1.1]), np.zeros(3))
-        assert found.tolist() == [1.0, 0.0, 0.0]  # strictly above, as without ratios
-        for limit, expected in ((0.9, 1.0), (1.0, 0.0), (1.1, 0.0)):
-            one = exceedance(np.ones(50), limit, ratios=ratios)
-            assert (one.lower, one.probability, one.upper) == (expected,) * 3
+        EventRatios([[1.0, 1.1], [1.0, 1.2]], prior_events=0)
+    found = equal.probability_above(np.array([0.9, 1.0, 1.1]), np.zeros(3))
+    assert found.tolist() == [1.0, 0.0, 0.0]  # strictly above, as without ratios
+    for limit, expected in ((0.9, 1.0), (1.0, 0.0), (1.1, 0.0)):
+        one = exceedance(np.ones(50), limit, ratios=equal)
+        assert (one.lower, one.probability, one.upper) == (expected,) * 3
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        EventRatios([1.0, 1.0], prior_sd=0.15, prior_events=3)
-        EventRatios([1.0, 1.001])
+        assert EventRatios([1.0, 1.0]).sd > 0.0
+        EventRatios([1.0, 1.001], prior_events=0)

@@ -1,18 +1,23 @@
-"""Prediction of a new event: closed forms of the ratio and of the population; coverage, with controls."""
+"""Prediction of a new event: closed forms of numbers and histories; coverage where errors are correlated."""
+
+import warnings
 
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.signal import bilinear, lfilter
 
 from fe_likelihoods import GaussianNoise
 from fe_likelihoods.events.hierarchical_posterior import HierarchicalPosterior, Varying
 from fe_likelihoods.events.hierarchy_result import Hierarchy
-from fe_likelihoods.events.ratios import EventRatios
+from fe_likelihoods.events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from fe_likelihoods.events.stored_posterior import StoredPosterior
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.prediction.new_event import event_ratio, predict_new_event
-from fe_likelihoods.prediction.quantities import peak, rms
+from fe_likelihoods.prediction.new_event import event_ratios, predict_new_event
+from fe_likelihoods.prediction.quantities import arias_intensity, peak, rms
+from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.priors.distributions import HalfNormal, LogNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -21,6 +26,9 @@ TOP = Channel("top", "displacement", "mm")
 TIME = 0.02 * np.arange(100)
 SHAPE = np.sin(2.0 * np.pi * TIME)
 MEDIAN, SPREAD = 0.03, 0.25
+NOISE = GaussianNoise([TOP])
+LOGS = np.array([0.1, -0.2, 0.15, 0.3])  # of measured peaks over those at the median of the population
+LARGEST = np.abs(SHAPE).max()
 
 
 class Amplified(FunctionModel):
@@ -38,6 +46,31 @@ class Amplified(FunctionModel):
         return Amplified(scale)
 
 
+def likelihoods(peaks):
+    """Events of increasing strength, with these measured peaks."""
+    found = {}
+    for k, value in enumerate(peaks):
+        model = Amplified(1.0 + 0.3 * k)
+        found[f"EQ{k}"] = FELikelihood(model, Measurements([TOP], model.dt, [value / LARGEST * SHAPE]), NOISE)
+    return found
+
+
+def population(names, rng):
+    """A population of median 0.03 and spread 0.25; its tests have no influence on it."""
+    prior = Prior({"gain": LogNormal(MEDIAN, 1.0)})
+    tests = {name: StoredPosterior({"gain": MEDIAN * np.exp(0.3 * rng.standard_normal(200))}, prior) for name in names}
+    varying = {"gain": Varying(LogNormal(MEDIAN, 0.5), HalfNormal(0.3))}
+    known = np.array([MEDIAN, SPREAD]) * np.exp(1e-6 * rng.standard_normal((50, 2)))
+    return Hierarchy(HierarchicalPosterior(tests, varying), known)
+
+
+@pytest.fixture
+def events(rng):
+    measured = LARGEST * MEDIAN * (1.0 + 0.3 * np.arange(4)) * np.exp(LOGS)
+    found = likelihoods(measured)
+    return population(found, rng), found
+
+
 @pytest.fixture
 def hierarchy(rng):
     """A population whose hyper-parameters are known: median 0.03 and spread 0.25 of the logarithm of the gain."""
@@ -46,8 +79,6 @@ def hierarchy(rng):
     for k in range(6):
         gain = np.exp(np.log(MEDIAN) + SPREAD * rng.standard_normal() + 0.05 * rng.standard_normal(400))
         tests[f"EQ{k}"] = {"gain": gain, "share_top": 0.2 * np.exp(0.05 * rng.standard_normal(400))}
-    from fe_likelihoods.events.stored_posterior import StoredPosterior
-
     tests = {name: StoredPosterior(values, prior) for name, values in tests.items()}
     varying = {"gain": Varying(LogNormal(MEDIAN, 0.5), HalfNormal(0.3))}
     varying["share_top"] = Varying(LogNormal(0.2, 0.5), HalfNormal(0.3))
@@ -64,66 +95,99 @@ def posterior(rng):
     return Posterior(FELikelihood(model, measured, noise), {"gain": LogNormal(0.03, 1.0), "share_top": HalfNormal(0.5)})
 
 
-def test_ratio_of_a_new_event_is_the_t_distribution_of_the_textbook():
-    logs = np.array([0.1, -0.05, 0.2, 0.0])
-    ratios = EventRatios(np.exp(logs))
-    expected = stats.t(3, logs.mean(), logs.std(ddof=1) * np.sqrt(1.25))
-    assert float(ratios.median) == pytest.approx(np.exp(expected.mean()), rel=1e-12)
-    assert float(ratios.median * ratios.factor(0.9)) == pytest.approx(np.exp(expected.ppf(0.95)), rel=1e-12)
-    draws = np.log(ratios.draw(20_000, np.random.default_rng(1)))
-    assert stats.kstest(draws, expected.cdf).pvalue > 1e-3
-    # a guess that is worth many events replaces the spread of the events
-    certain = EventRatios(np.exp(logs), prior_sd=0.3, prior_events=1e6)
-    assert float(certain.scale) == pytest.approx(0.3 * np.sqrt(1.25), rel=1e-4)
-    one = EventRatios([1.2], prior_sd=0.15, prior_events=3)
-    assert float(one.median) == pytest.approx(1.2) and float(one.scale) == pytest.approx(0.15 * np.sqrt(2.0))
-
-
-@pytest.mark.parametrize("n_events", (2, 5, 10))
-def test_intervals_of_ratios_cover_new_events_and_normal_quantiles_do_not(n_events, rng):
-    sets = 4000
-    ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal((n_events, sets))))
-    new = np.exp(0.1 + 0.2 * rng.standard_normal(sets))
-    error = 4.0 * np.sqrt(0.25 / sets)
-    for level in (0.5, 0.9):
-        inside = np.abs(np.log(new / ratios.median)) < np.log(ratios.factor(level))
-        assert abs(inside.mean() - level) < error
-    narrow = np.abs(np.log(new / ratios.median)) < stats.norm.ppf(0.95) * np.log(ratios.values).std(axis=0)
-    assert narrow.mean() < 0.9 - error
-
-
-def test_a_guess_of_the_spread_covers_one_event_if_it_is_right(rng):
-    sets, degrees = 4000, 4.0
-    spread = 0.2 * np.sqrt(degrees / rng.chisquare(degrees, sets))  # as the prior states
-    first, new = np.exp(spread * rng.standard_normal((2, sets)))
-    ratios = EventRatios(first[None], prior_sd=0.2, prior_events=degrees)
-    inside = np.abs(np.log(new / ratios.median)) < np.log(ratios.factor(0.9))
-    assert abs(inside.mean() - 0.9) < 4.0 * np.sqrt(0.09 / sets)
-
-
-def test_peak_of_a_new_event_has_the_spread_of_the_population_and_of_the_ratios(hierarchy):
-    ratios = EventRatios(np.exp([0.1, -0.05, 0.2, 0.0]))
-    options = {"quantity": peak("top"), "n": 4000, "seed": 1}
-    plain = predict_new_event(hierarchy, Amplified(), 2.0, **options)
-    median = 2.0 * MEDIAN * np.abs(SHAPE).max()
-    assert stats.kstest(np.log(plain.values / median) / SPREAD, "norm").pvalue > 1e-3
-    corrected = predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, **options)
-    rng = np.random.default_rng(2)
-    logs = SPREAD * rng.standard_normal(40_000) + np.log(ratios.draw(40_000, rng))
-    expected = median * np.exp(np.quantile(logs, [0.05, 0.5, 0.95]))
-    np.testing.assert_allclose(corrected.quantiles, expected, rtol=0.04)
-    assert corrected.noise and np.isfinite(plain.mean)
-    for none in (corrected.mean, corrected.variance, corrected.sd, corrected.standard_error):
+def test_the_peak_has_the_t_distribution_of_the_ratios_at_the_median(events):
+    """With the stated prior of the scatter, and without it."""
+    hierarchy, posteriors = events
+    squares = np.square(LOGS - LOGS.mean()).sum()
+    for prior, degrees, squared in (({"prior_events": 0}, 3, squares), ({}, 9, 6 * PRIOR_SD**2 + squares)):
+        options = {"model": Amplified(), "quantity": peak("top"), "n": 20_000, "seed": 1} | prior
+        found = predict_new_event(hierarchy, posteriors, 2.0, **options)
+        scale = np.sqrt(squared / degrees * 1.25)
+        expected = stats.t(degrees, np.log(2.0 * MEDIAN * LARGEST) + LOGS.mean(), scale)
+        assert stats.kstest(np.log(found.values), expected.cdf).pvalue > 1e-3
+        limit = np.exp(expected.ppf(0.9))
+        exceeded = exceedance(found, limit)
+        assert float(exceeded.probability) == pytest.approx(0.1, abs=1e-4)
+        assert exceeded.lower < 0.05 and exceeded.upper > 0.2  # four events tell little about it
+        again = predict_new_event(hierarchy, posteriors, 2.0, **options)
+        np.testing.assert_array_equal(again.values, found.values)
+    share = 6 * PRIOR_SD**2 / (6 * PRIOR_SD**2 + squares)
+    assert f"use the quantiles; {share:.0%} of their squared width is due to the prior" in str(found)
+    assert "20000 samples, of measured values, by the ratios of 4 events;" in str(found)
+    for none in (found.mean, found.variance, found.sd, found.standard_error):
         assert none.shape == () and np.isnan(none)  # exp(t) has no mean
-    assert "has no mean: use the quantiles" in corrected._repr_html_()
-    assert "has no mean" not in plain._repr_html_()
-    assert corrected.score(median).measured[0] == median
-    again = predict_new_event(hierarchy, Amplified(), 2.0, ratios=ratios, **options)
-    np.testing.assert_array_equal(again.values, corrected.values)
+    assert found.noise and "with measurement noise" not in str(found)
+    options["quantity"] = [peak("top"), rms("top")]
+    assert predict_new_event(hierarchy, posteriors, 2.0, **options).values.shape == (20_000, 2)
+
+
+def test_one_event_has_the_same_formula(rng):
+    posteriors = likelihoods([1.2 * LARGEST * MEDIAN])
+    found = predict_new_event(population(posteriors, rng), posteriors, 2.0, quantity=peak("top"), n=20_000, seed=1)
+    expected = stats.t(PRIOR_EVENTS, np.log(2.0 * 1.2 * MEDIAN * LARGEST), PRIOR_SD * np.sqrt(2.0))
+    assert stats.kstest(np.log(found.values), expected.cdf).pvalue > 1e-3
+    assert found.spread.ratios.prior_share == 1.0
+
+
+def test_ratios_of_a_line_are_those_at_the_predicted_level(rng):
+    measured = LARGEST * MEDIAN * (1.0 + 0.3 * np.arange(5)) ** 0.6  # the model is too strong for strong motions
+    posteriors = likelihoods(measured)
+    options = {"model": Amplified(), "quantity": peak("top"), "form": "linear", "n": 20, "seed": 1}
+    found = predict_new_event(population(posteriors, rng), posteriors, 10.0, prior_sd=1e-6, **options)
+    np.testing.assert_allclose(found.values, LARGEST * MEDIAN * 10.0**0.6, rtol=1e-3)
+
+
+def test_ratios_of_several_quantities_are_of_each():
+    channels = [Channel("top", "acceleration", "g")]
+    model = FunctionModel(lambda theta: [theta[0] * SHAPE], ["gain"], channels, 0.02, len(SHAPE))
+    likelihood = FELikelihood(model, Measurements(channels, model.dt, 1.1 * model.simulate([1.0])))
+    ratios = event_ratios({"gain": 1.0}, {"EQ": likelihood}, [peak("top"), arias_intensity("top")])
+    np.testing.assert_allclose(ratios.values, [[1.1, 1.21]])
+    np.testing.assert_allclose(ratios.levels, [[LARGEST, arias_intensity("top").evaluate([SHAPE], 0.02)]])
+    assert ratios.at == {"gain": 1.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("correlation", (0.0, -0.8))
+@pytest.mark.parametrize("n_events", (5, 10))
+def test_intervals_cover_new_events_whose_ratio_goes_with_their_parameters(n_events, correlation, rng):
+    sets, new = 200, 20
+    hierarchy = population([f"EQ{k}" for k in range(n_events)], rng)
+    scales = 1.0 + 0.3 * np.arange(n_events)
+    mixing = np.array([[SPREAD, 0.0], [0.1 * correlation, 0.1 * np.sqrt(1.0 - correlation**2)]])
+    together = np.empty((sets, new))
+    for row in range(sets):
+        gains, ratios = np.exp(mixing @ rng.standard_normal((2, n_events + new)))
+        peaks = MEDIAN * LARGEST * gains * ratios
+        posteriors = likelihoods(scales * peaks[:n_events])
+        options = {"model": Amplified(), "quantity": peak("top"), "n": 400, "seed": row, "prior_events": 0}
+        found = predict_new_event(hierarchy, posteriors, 1.0, **options)
+        together[row] = np.searchsorted(np.sort(found.values), peaks[n_events:]) / 400.0
+    for level in (0.5, 0.9):
+        assert abs((np.abs(together - 0.5) <= 0.5 * level).mean() - level) < 0.03
+
+
+@pytest.mark.parametrize("scatter, lowest", ((0.3, 0.88), (0.6, 0.86)))
+@pytest.mark.parametrize("correlation", (0.0, -0.8))
+def test_intervals_are_nearly_right_where_sensitivities_differ(correlation, scatter, lowest):
+    """Three parameters, whose derivatives of the log peak scatter between events; closed form of the prediction."""
+    rng = np.random.default_rng(1)
+    sd, slope, events, sets = np.array([0.05, 0.4, 0.15]), np.array([1.0, -0.3, 0.5]), 10, 4000
+    direction = slope * sd / np.linalg.norm(slope * sd)
+    slopes = slope * (1.0 + scatter * rng.standard_normal((sets, events + 1, 3)))
+    z = rng.standard_normal((sets, events + 1, 3))
+    independent = np.sqrt(1.0 - correlation**2) * rng.standard_normal((sets, events + 1))
+    log_ratios = 0.1 * (correlation * z @ direction + independent)
+    fitted = sd * z[:, :-1] + 0.05 * rng.standard_normal((sets, events, 3))
+    logs = log_ratios + ((sd * z - fitted.mean(axis=1, keepdims=True)) * slopes).sum(axis=2)
+    ratios = EventRatios(np.exp(logs[:, :-1].T), prior_events=0)
+    pit = 1.0 - ratios.probability_above(np.exp(logs[:, -1]), np.zeros(sets))
+    assert abs((np.abs(pit - 0.5) < 0.25).mean() - 0.5) < 0.03
+    assert lowest < (np.abs(pit - 0.5) < 0.45).mean() < 0.9
 
 
 def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posterior):
-    prediction = predict_new_event(hierarchy, posterior, 0.1, noise=True, n=2000, seed=1)
+    prediction = predict_new_event(hierarchy, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
     squared = MEDIAN**2 * np.exp(2.0 * SPREAD**2)  # mean square of a log-normal gain
     share = 0.2**2 * np.exp(2.0 * 0.1**2)
     variance = 0.01 * (squared - MEDIAN**2 * np.exp(SPREAD**2)) * SHAPE**2 + 0.01 * squared * share * np.mean(SHAPE**2)
@@ -136,7 +200,7 @@ def test_shares_of_modulated_noise_have_no_upper_limit(hierarchy):
     measured = Measurements([TOP], model.dt, model.simulate([MEDIAN]))
     noise = GaussianNoise(model.channels, level="response", window=0.5, sensor=(1e-9,), local=0.0)
     posterior = Posterior(FELikelihood(model, measured, noise), {"gain": HalfNormal(1.0), "share_top": HalfNormal(0.5)})
-    prediction = predict_new_event(wide, posterior, 0.1, noise=True, n=2000, seed=1)
+    prediction = predict_new_event(wide, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
     assert prediction.n_samples == 2000
     level = 0.1 * MEDIAN * np.sqrt(np.mean(SHAPE**2))
     expected = level * 0.6 * np.exp(0.5**2)  # root mean square of a log-normal share
@@ -146,38 +210,102 @@ def test_shares_of_modulated_noise_have_no_upper_limit(hierarchy):
 def test_draws_of_impossible_shares_are_left_out(hierarchy, posterior):
     wide = Hierarchy(hierarchy.posterior, hierarchy.samples * [1.0, 1.0, 3.0, 5.0])  # a median of 0.6, a spread of 0.5
     with pytest.warns(UserWarning, match=r"1\d% of the draws have an impossible noise.*level='response'.*logit"):
-        prediction = predict_new_event(wide, posterior, 0.1, noise=True, n=2000, seed=1)
+        prediction = predict_new_event(wide, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
     expected = 2000 * stats.norm.cdf(np.log(1.0 / 0.6) / 0.5)
     assert abs(prediction.n_samples - expected) < 4.0 * np.sqrt(2000 * 0.15 * 0.85)
 
 
-def test_ratio_of_one_event(posterior):
-    samples = np.array([[MEDIAN, 0.1], [0.9 * MEDIAN, 0.1], [1.3 * MEDIAN, 0.1]])
-    measured = posterior.likelihood.measurements
-    expected = np.abs(measured.values).max() / (MEDIAN * np.abs(SHAPE).max())
-    assert float(event_ratio(posterior, samples, peak("top"))) == pytest.approx(expected, rel=1e-12)
-    both = event_ratio(posterior, samples, [peak("top"), rms("top")])
-    assert both.shape == (2,) and both[0] == pytest.approx(expected, rel=1e-12)
+def test_several_quantities_by_name(events):
+    hierarchy, posteriors = events
+    wanted = {"histories": None, "peak": peak("top"), "numbers": [peak("top"), rms("top")]}
+    found = predict_new_event(hierarchy, posteriors, 1.0, quantity=wanted, n=50, seed=1)
+    assert found["histories"].dt == 0.02 and found["peak"].values.shape == (50,)
+    assert found["numbers"].values.shape == (50, 2)
 
 
-def test_what_cannot_be_predicted_is_refused(hierarchy, posterior):
-    with pytest.raises(ValueError, match="one event does not show"):
-        EventRatios([1.1])
-    for bad in ([], [0.0, 1.0], [np.nan, 1.0], 1.2):
-        with pytest.raises(ValueError, match="expected positive ratios"):
-            EventRatios(bad)
-    with pytest.raises(ValueError, match="prior_sd must be positive"):
-        EventRatios([1.0, 1.1], prior_sd=0.0)
-    with pytest.raises(ValueError, match="level must be between"):
-        EventRatios([1.0, 1.1]).factor(90)
-    ratios = EventRatios([1.0, 1.1])
-    with pytest.raises(ValueError, match="ratios are for numbers"):
-        predict_new_event(hierarchy, posterior, 1.0, ratios=ratios)
-    with pytest.raises(ValueError, match="ratios are for numbers"):
-        predict_new_event(hierarchy, posterior, 1.0, ratios=ratios, quantity=peak("top"), noise=True)
-    with pytest.raises(ValueError, match="needs a posterior"):
-        predict_new_event(hierarchy, Amplified(), 1.0, noise=True)
-    with pytest.raises(ValueError, match="expected ratios"):
-        predict_new_event(hierarchy, posterior, 1.0, ratios=ratios, quantity=[peak("top"), rms("top")], n=20)
-    with pytest.raises(ValueError, match="needs a posterior or a likelihood"):
-        event_ratio(Amplified(), [[1.0]], peak("top"))
+def test_the_median_of_a_population_is_that_of_its_log_centers(events):
+    hierarchy, _ = events
+    expected = np.exp(np.log(hierarchy.samples[:, 0]).mean())
+    assert hierarchy.median_test() == {"gain": pytest.approx(expected, rel=1e-12)}
+
+
+def test_what_cannot_be_predicted_is_refused(events, hierarchy, posterior):
+    population_of_four, posteriors = events
+    options = {"quantity": peak("top")}
+    with pytest.raises(ValueError, match="posteriors of 'EQ0', 'EQ1' are missing"):
+        predict_new_event(population_of_four, {k: posteriors[k] for k in ("EQ2", "EQ3")}, 1.0, **options)
+    for function in (np.max, [peak("top"), "top"]):
+        with pytest.raises(ValueError, match="need numbers such as"):
+            predict_new_event(population_of_four, posteriors, 1.0, quantity=function)
+    other = Amplified()
+    other.parameter_names = ["stiffness"]
+    with pytest.raises(ValueError, match="stiffness belong"):
+        predict_new_event(population_of_four, posteriors, 1.0, model=other, **options)
+    with pytest.raises(ValueError, match="contain the errors of measurements already"):
+        predict_new_event(population_of_four, posteriors, 1.0, noise=True, **options)
+    with pytest.raises(ValueError, match="noise=True needs a posterior"):
+        predict_new_event(hierarchy, {"EQ0": Amplified()}, 1.0, noise=True)
+    with pytest.raises(ValueError, match="expected the posteriors of the events by name"):
+        predict_new_event(hierarchy, posterior, 1.0, **options)
+    with pytest.raises(ValueError, match="needs a posterior or a likelihood with measurements"):
+        event_ratios({"gain": 1.0}, {"EQ0": Amplified()}, peak("top"))
+    still = {"EQ0": FELikelihood(Amplified(0.0), posterior.likelihood.measurements, NOISE)}
+    with pytest.raises(ValueError, match="need positive values; event 'EQ0'"):
+        event_ratios({"gain": 1.0}, still, peak("top"))
+
+
+class Resonant(FunctionModel):
+    """An oscillator of 2 Hz, whose frequency and damping are multiples, under a base acceleration."""
+
+    def __init__(self, motion):
+        super().__init__(self.respond, ["frequency", "damping"], [TOP], 0.02, len(motion))
+        self.motion, self.path_dependent = motion, False
+
+    def respond(self, theta):
+        omega = 4.0 * np.pi * theta[0]
+        system = ([-1.0], [1.0, 2.0 * 0.05 * theta[1] * omega, omega**2])
+        return [lfilter(*bilinear(*system, fs=50.0), self.motion)]
+
+    def with_record(self, motion):
+        return Resonant(motion)
+
+
+@pytest.fixture(scope="module")
+def resonant():
+    """Six events under filtered noise, whose frequencies and damping ratios differ by 3 and 40 %."""
+    rng = np.random.default_rng(4)
+    motions = rng.standard_normal((6, 1000))
+    truths = np.exp([0.03, 0.4] * rng.standard_normal((6, 2)))
+    prior = Prior({"frequency": LogNormal(1.0, 0.2), "damping": LogNormal(1.0, 0.7)})
+    posteriors, tests = {}, {}
+    for k, (motion, truth) in enumerate(zip(motions, truths, strict=True)):
+        model = Resonant(motion)
+        posteriors[f"EQ{k}"] = FELikelihood(model, Measurements([TOP], 0.02, model.simulate(truth)), NOISE)
+        tests[f"EQ{k}"] = StoredPosterior(truth * np.exp([0.005, 0.05] * rng.standard_normal((200, 2))), prior)
+    varying = {name: Varying(each, HalfNormal(0.4)) for name, each in prior.distributions.items()}
+    known = [*np.exp(np.log(truths).mean(axis=0)), 0.03, 0.4]
+    known = np.array([known[0], 0.03, known[1], 0.4]) * np.exp(1e-3 * rng.standard_normal((50, 4)))
+    return Hierarchy(HierarchicalPosterior(tests, varying), known), posteriors
+
+
+def test_a_harmonic_near_resonance_widens_the_interval_and_other_motions_hardly(resonant):
+    hierarchy, posteriors = resonant
+    time = 0.02 * np.arange(1000)
+    options = {"quantity": peak("top"), "n": 200, "seed": 1, "calibrated": ()}
+    with pytest.warns(UserWarning, match=r"hardly speaks for this motion.*widened: peak of top \d\.\d times"):
+        near = predict_new_event(hierarchy, posteriors, np.sin(4.0 * np.pi * time), **options)
+    assert near.spread.ratios.widening > 1.4 and "harmonic near a resonance" in near.remarks[-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        far = predict_new_event(hierarchy, posteriors, np.sin(np.pi * time), **options)
+        alike = predict_new_event(hierarchy, posteriors, np.random.default_rng(9).standard_normal(1000), **options)
+        off = predict_new_event(hierarchy, posteriors, np.sin(4.0 * np.pi * time), sensitivity=0, **options)
+    assert far.spread.ratios.widening == 1.0 and alike.spread.ratios.widening < 1.3
+    assert off.spread.ratios.widening == 1.0 and off.remarks == ()
+    rng, inside = np.random.default_rng(5), []
+    model = Resonant(np.sin(4.0 * np.pi * time))
+    for truth in np.exp([0.03, 0.4] * rng.standard_normal((100, 2))):  # new events under the harmonic
+        value = np.abs(model.simulate(truth)).max()
+        inside.append([abs(each.score(value).pit[0] - 0.5) <= 0.45 for each in (near, off)])
+    widened, alone = np.mean(inside, axis=0)
+    assert widened > 0.75 and alone < 0.55, "the control: without the widening"

@@ -7,13 +7,11 @@ import pytest
 
 from fe_likelihoods import (
     EventRatios,
-    LevelRatios,
     Prior,
     Record,
     StoredPosterior,
     Uniform,
     average_predictions,
-    compare_tests,
     exceedance,
     fragility,
     leave_one_out,
@@ -23,7 +21,7 @@ from fe_likelihoods import (
 from fe_likelihoods.column_damage.damage import LimitState
 from fe_likelihoods.column_damage.park_ang import ParkAng
 from fe_likelihoods.prediction.fragility_curve import fit_fragility
-from fe_likelihoods.prediction.held_out import HeldOutScore
+from fe_likelihoods.prediction.held_out import HeldOutScore, HeldOutScores
 from fe_likelihoods.prediction.score_tables import score_values
 from fe_likelihoods.text_tables import NamedResults, text_table
 from tests.events.test_leave_one_out import ALIKE, hierarchy_of
@@ -135,13 +133,13 @@ def test_the_unit_of_an_intensity_of_the_users_own_is_not_invented():
 
 def test_ratios():
     text = str(RATIOS)
-    assert text.startswith("Ratios of measured to fitted values in 3 events")
-    factor = RATIOS.factor(0.9)
-    assert cells(text, 2) == ["1", "1", f"{1 / factor:.3g} to {factor:.3g}"]
-    levels = LevelRatios([1.3, 1.2, 1.1, 0.98, 0.9], levels=[0.1, 0.3, 0.5, 1.0, 2.0])
-    text = str(levels)
-    assert [cells(text, row)[0] for row in (2, 3)] == ["0.1", "2"] and "linear" in text
-    assert float(cells(text, 2)[1]) == pytest.approx(levels.quantile(0.5, 0.1), rel=5e-3)
+    assert text.startswith("Ratios of measured to predicted values in 3 events, form constant; prior of the scatter")
+    low, high = RATIOS.quantile([0.05, 0.95])
+    assert cells(text, 2) == ["1", "any", "1", f"{low:.3g} to {high:.3g}", f"{RATIOS.prior_share:.0%}"]
+    line = EventRatios([1.3, 1.2, 1.1, 0.98, 0.9], levels=[0.1, 0.3, 0.5, 1.0, 2.0], form="linear")
+    text = str(line)
+    assert [cells(text, row)[1] for row in (2, 3)] == ["0.1", "2"]
+    assert float(cells(text, 2)[2]) == pytest.approx(line.quantile(0.5, 0.1), rel=5e-3)
 
 
 def test_events_that_were_left_out():
@@ -162,21 +160,12 @@ def test_held_out_scores(predicted, rng):
         )
         for name, factor in {"first": 1.0, "second": 1.5}.items()
     }
-    text = str(NamedResults(scores))
+    text = str(HeldOutScores(scores))
     assert cells(text, 0)[:3] == ["event", "a [cm]", "90% interval of a"]
     assert cells(text, 2)[:2] == ["second", "1.5"] and cells(text, 2)[-1] == "12.5"
     assert len({len(cells(text, row)) for row in range(3)}) == 1
+    assert text.splitlines()[3].startswith("a: within 90%, 1 of 2: 9 to 91 %; within 50%, 1 of 2: 9 to 91 %")
     assert str(scores["first"]).endswith("log density of the data of the event: 12.5")
-
-
-def test_agreement_of_a_pair():
-    posterior = hierarchy_of(ALIKE, n=500).posterior
-    found = compare_tests(posterior.tests, ["a"])
-    pair = found.pairs[0]
-    row = cells(str(found), 1)
-    assert row[0] == ", ".join(pair.tests) and float(row[1]) == pytest.approx(pair.differences["a"], abs=0.051)
-    assert str(pair).startswith(f"{pair.tests[0]!r} and {pair.tests[1]!r}: distance {pair.distance:.3g}, p = ")
-    assert len(str(pair).splitlines()) == 2 + len(pair.differences)
 
 
 def test_constants_and_limits():

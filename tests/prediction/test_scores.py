@@ -91,8 +91,8 @@ def test_pit_of_samples_is_uniform_for_the_true_distribution_alone(rng):
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
     narrow = pit_samples(0.5 * rng.normal(size=(99, 3000)), rng.normal(size=3000))
     assert stats.kstest(narrow, "uniform").pvalue < 1e-10
-    assert abs(share_within(pit, 0.9) - 0.9) < 4.0 * np.sqrt(0.09 / 3000)
-    assert share_within(narrow, 0.9) < 0.65
+    assert abs(share_within(pit, 0.9).value - 0.9) < 4.0 * np.sqrt(0.09 / 3000)
+    assert share_within(narrow, 0.9).value < 0.65
     assert 0.0 < pit_samples([[1.0], [2.0]], [9.0])[0] < 1.0
 
 
@@ -138,13 +138,14 @@ def test_intervals_from_few_samples_have_their_level_and_are_those_of_the_pit(n,
     values, y = rng.normal(size=(2, n, 20_000))[0], rng.normal(size=20_000)
     scores = score_values([""] * 20_000, ["SI"] * 20_000, values, y, level)
     np.testing.assert_array_equal(scores.within, (scores.lower <= y) & (y <= scores.upper))
-    assert scores.within.mean() == share_within(scores.pit, level)
+    assert scores.within.mean() == share_within(scores.pit, level).value
     nearest = 1.0 / (n + 1.0)  # half a rank at both ends
     assert abs(scores.within.mean() - level) < nearest + 4.0 * np.sqrt(level * (1 - level) / 20_000)
 
 
 def test_share_within_leaves_missing_values_out_and_refuses_others():
-    assert share_within([0.1, np.nan, 0.4, 0.97], 0.9) == pytest.approx(2 / 3)
+    assert share_within([0.1, np.nan, 0.4, 0.97], 0.9) == (2, 3)
+    assert str(share_within([0.5] * 10 + [0.99], 0.9)) == "10 of 11: 62 to 98 %"
     for bad in ([], [np.nan], [1.2]):
         with pytest.raises(ValueError, match="PIT values between 0 and 1"):
             share_within(bad, 0.9)

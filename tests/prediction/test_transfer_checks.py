@@ -16,6 +16,7 @@ from fe_likelihoods import (
     HierarchicalPosterior,
     Hierarchy,
     JointLikelihood,
+    LinearOscillator,
     LogNormal,
     Measurements,
     Posterior,
@@ -116,28 +117,25 @@ def test_the_range_is_that_of_all_calibrated_events(rng):
 
 def test_a_new_event_is_compared_with_the_events_of_the_hierarchy(rng):
     events = {name: calibrated(rng, strength=each) for name, each in (("weak", 1.0), ("strong", 4.0))}
-    measured = events["weak"][0].likelihood.measurements
-    for stored, expected in ((True, 1), (False, 0)):
-        tests = {
-            name: StoredPosterior(samples, each.prior, measurements=each.likelihood.measurements if stored else None)
-            for name, (each, samples) in events.items()
-        }
-        population = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
+    posteriors = {name: each for name, (each, _) in events.items()}
+
+    def population(names):
+        tests = {name: StoredPosterior(events[name][1], posteriors[name].prior) for name in names}
+        varying = {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            hierarchy = Hierarchy(population, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))
-        model = events["weak"][0].likelihood.model
-        for strength, number in ((4.0, 0), (1.0, 0), (12.0, expected), (0.2, expected)):
-            found = said(predict_new_event, hierarchy, model, excitation(rng, strength), quantity=peak("top"), n=50)
+            known = [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2)))
+            return Hierarchy(HierarchicalPosterior(tests, varying), known)
+
+    both, single = population(events), population(["weak"])
+    for quantity in (peak("top"), None):
+        for strength, number in ((4.0, 0), (1.0, 0), (12.0, 1), (0.2, 1)):
+            record = excitation(rng, strength)
+            found = said(predict_new_event, both, posteriors, record, quantity=quantity, n=20)
             assert len(found) == number
             assert not any("Hierarchy" in text for text in found), "which is the population in use"
     # a population of one event: the spread between events is stated
-    tests = {"weak": StoredPosterior(events["weak"][1], events["weak"][0].prior, measurements=measured)}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        single = HierarchicalPosterior(tests, {"gain": Varying(LogNormal(1.0, 0.5), HalfNormal(0.1))})
-        single = Hierarchy(single, [1.0, 0.05] * np.exp(0.01 * rng.standard_normal((50, 2))))
-    (text,) = said(predict_new_event, single, model, excitation(rng, 12.0), quantity=peak("top"), n=50)
+    (text,) = said(predict_new_event, single, posteriors, excitation(rng, 12.0), quantity=peak("top"), n=50)
     assert "Calibrate with events of this amplitude" in text and "Hierarchy" not in text
     # control: samples of one posterior
     (text,) = said(propagate, *events["weak"], record=excitation(rng, 12.0), check=False)
@@ -266,3 +264,26 @@ def test_remarks_of_equal_predictions_are_equal_and_warned_of_once(rng, strength
     assert propagate(posterior, posterior.sample_prior(100, 1), noise=True, progress=False).remarks == ()
     right, samples = calibrated(rng)
     assert propagate(right, samples, record=record, noise=True, progress=False).remarks == ()
+
+
+def test_a_harmonic_is_said_and_another_broad_motion_is_not(rng):
+    record = Record("noise", 0.02, rng.standard_normal(1000))
+    model = LinearOscillator(record)
+    posterior = FELikelihood(model, Measurements(model.channels, model.dt, model.simulate([1.0, 1.0])))
+    sine = Record("sine", 0.02, np.sin(2.0 * np.pi * 0.02 * np.arange(1000)))
+    options = {"samples": np.ones((20, 2)), "calibrated": (), "check": False, "progress": False}
+
+    def about_harmonics(motion):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            remarks = propagate(posterior, record=motion, **options).remarks
+        return [text for text in remarks if "as a harmonic has" in text]
+
+    (text,) = about_harmonics(sine)
+    assert "in a band of 0.05 Hz" in text  # one line of the Fourier transform of 20 s
+    for other in (
+        record.scale(3.0),
+        Record("other", 0.02, rng.standard_normal(400)),
+        Record("still", 0.02, np.zeros(400)),
+    ):
+        assert about_harmonics(other) == []

@@ -15,14 +15,16 @@ from scipy import special, stats
 
 from fe_likelihoods import (
     EventRatios,
+    FELikelihood,
     HalfNormal,
     HierarchicalPosterior,
     Hierarchy,
-    LevelRatios,
     LogNormal,
+    Measurements,
     Prior,
     StoredPosterior,
     Varying,
+    event_ratios,
     fragility,
     interval_score,
     peak,
@@ -46,28 +48,20 @@ _PROBABILITIES = np.linspace(0.05, 0.95, 9)  # of the true curve at the intensit
 _GRID = np.meshgrid(np.linspace(-2.0, 2.0, 161), np.linspace(0.0025, 1.2, 120), indexing="ij")
 
 
-def ratio_twin(truth: str, events: int, form: str | None, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+def ratio_twin(truth: str, events: int, form: str, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Shares of new events within intervals of 50 and 90 %, the counts of far ones (and their number), and the score.
 
-    ``form="constant"`` is `EventRatios`.
+    The ratios have no prior of their scatter.
     """
     rng = np.random.default_rng([seed, events])
     x = _LEVEL_SD * rng.standard_normal(events + _NEW)
     logs = TRUTHS[truth](x) + _SD * rng.standard_normal(len(x))
-    ratios = (
-        EventRatios(np.exp(logs[:events]))
-        if form == "constant"
-        else LevelRatios(np.exp(logs[:events]), np.exp(x[:events]), form)
-    )
+    ratios = EventRatios(np.exp(logs[:events]), prior_events=0, levels=np.exp(x[:events]), form=form)
     new, at = logs[events:], x[events:]
     above = ratios.probability_above(np.exp(new), at)
     inside = np.stack([np.abs(above - 0.5) <= 0.5 * level for level in (0.5, 0.9)])
     far = np.abs(at - x[:events].mean()) > 1.5 * _LEVEL_SD
-    if form == "constant":
-        width = np.log(ratios.factor(0.9))
-        low, high = (np.full(_NEW, np.log(ratios.median) + sign * width) for sign in (-1.0, 1.0))
-    else:
-        low, high = (np.log(ratios.quantile(p, np.exp(at))) for p in (0.05, 0.95))
+    low, high = (np.log(ratios.quantile(p, np.exp(at))) for p in (0.05, 0.95))
     score = high - low + 20.0 * (np.maximum(low - new, 0.0) + np.maximum(new - high, 0.0))
     return inside.mean(axis=1), np.array([*inside[:, far].sum(axis=1), far.sum()]), float(score.mean())
 
@@ -87,14 +81,14 @@ class _Scaled(FunctionModel):
 
 
 def fragility_twin(
-    events: int, seed: int, ratio_sd: float = 0.2, n: int = 400
+    events: int, seed: int, ratio_sd: float = 0.2, n: int = 20
 ) -> tuple[bool, np.ndarray, np.ndarray, list[float]]:
     """Whether the band holds the curve, and the intervals its points; those of one posterior without error; scores."""
     rng = np.random.default_rng([seed, events])
     center, spread = MEDIAN_SD * rng.standard_normal(), abs(SPREAD_SD * rng.standard_normal())
     logs = center + spread * rng.standard_normal(events)
     bias = 0.1
-    ratios = EventRatios(np.exp(bias + ratio_sd * rng.standard_normal(events)))
+    peaks = np.exp(logs + bias + ratio_sd * rng.standard_normal(events))
     data = logs + ERROR * rng.standard_normal(events)
     prior, sd = Prior({"gain": LogNormal(1.0, 1.0)}), ERROR / np.sqrt(1.0 + ERROR**2)
     stored = {
@@ -111,9 +105,15 @@ def fragility_twin(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         hierarchy = Hierarchy(HierarchicalPosterior(stored, varying, max_samples=100), hyper_samples(data, rng, 300))
-    found = fragility(_Scaled(record), hierarchy, records, peak("top"), 1.0, ratios=ratios, n=n, **options)
+    model = _Scaled(record)
+    likelihoods = {
+        name: FELikelihood(model, Measurements(model.channels, model.dt, [value * record.acceleration]))
+        for name, value in zip(stored, peaks, strict=True)
+    }
+    ratios = event_ratios(hierarchy, likelihoods, peak("top"), prior_events=0)
+    found = fragility(model, hierarchy, records, peak("top"), 1.0, ratios=ratios, n=n, **options)
     lower, upper = found.band(0.9)
-    alone = fragility(_Scaled(record), stored["EQ0"].samples, records, peak("top"), 1.0, noise=False, **options)
+    alone = fragility(model, stored["EQ0"].samples, records, peak("top"), 1.0, noise=False, **options)
     return (
         bool(((lower <= truth) & (truth <= upper)).all()),
         (found.lower <= truth) & (truth <= found.upper),
