@@ -261,7 +261,7 @@ for name, supports in new_events.items():
 def show_scores(title: str, scores: dict) -> dict[str, float]:
     """Print one line of scores of predicted peaks; return the numbers."""
     pit = [each.pit[0] for each in scores.values()]
-    shares = {f"within {level:.0%}": share_within(pit, level) for level in (0.9, 0.5)}
+    shares = {f"within {100 * level:.0f} %": share_within(pit, level) for level in (0.9, 0.5)}
     numbers = {
         "CRPS / measured": float(np.mean([each.crps[0] / each.measured[0] for each in scores.values()])),
         "interval score / measured": float(

@@ -41,7 +41,7 @@ def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_w
         0.3 * np.sqrt(1.25) * stats.norm.ppf(0.95), rel=1e-4
     )
     one = EventRatios([1.2])  # the same formula with one event
-    assert one.sd == PRIOR_SD and one.degrees_of_freedom == PRIOR_EVENTS and one.prior_share == 1.0
+    assert one.sd == pytest.approx(PRIOR_SD) and one.degrees_of_freedom == PRIOR_EVENTS and one.prior_share == 1.0
     expected = 1.2 * np.exp(stats.t.ppf(0.95, PRIOR_EVENTS) * PRIOR_SD * np.sqrt(2.0))
     assert one.quantile(0.95) == pytest.approx(expected)
     both = EventRatios(np.exp(np.stack([LOGS, 2.0 * LOGS], axis=1)), prior_sd=[0.1, 0.2])
