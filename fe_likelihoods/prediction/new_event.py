@@ -216,10 +216,12 @@ def predict_new_event(
         )  # equal rows are simulated once
         prediction = propagate(predictor, rows, record=record, quantity=quantity, **settings)
         if sensitivity:
-            names = list(rows)
-            draws, _ = draw_new_event(hierarchy, names, sensitivity, None, np.random.SeedSequence(seed).spawn(1)[0])
-            own = _log_sd(predictor, draws, quantity, record, settings)
-            events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in hierarchy.posterior.tests]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of draws beyond bounds, and what the prediction has said
+                seeds = np.random.SeedSequence(seed).spawn(1)[0]
+                draws, _ = draw_new_event(hierarchy, list(rows), sensitivity, None, seeds)
+                own = _log_sd(predictor, draws, quantity, record, settings)
+                events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in hierarchy.posterior.tests]
             ratios, remark = _widened(ratios, own, np.max(events, axis=0), quantity)
             prediction = replace(prediction, remarks=(*prediction.remarks, *remark))
         prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))

@@ -53,6 +53,7 @@ from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
 from .transfer_checks import (
+    Ends,
     Peaks,
     calibration_of,
     is_first_warning,
@@ -230,7 +231,7 @@ def propagate(
     Warns
     -----
     UserWarning
-        If channels of `model` have the mean noise of others.
+        If channels of `model` have the mean noise of others. If a `final_value` is taken while the structure moves.
         If the median of the predicted peak of a channel, under another record or of another `model`, is more than twice
         the largest measured peak of the calibration, or less than half of the smallest one.
         If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
@@ -301,7 +302,7 @@ def propagate(
     if cache is not None:
         cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
         stored = StoredResponses(model, source.executor, cache)
-    peaks = Peaks()
+    peaks, ends = Peaks(), Ends(wanted.values(), model)
     checked = sample_to_check(calibration, complete) if check else None
     own_response = other_response = None  # of the checked sample to the excitation of the calibration, and to another
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
@@ -314,6 +315,7 @@ def propagate(
                     own_response = responses[row].copy()
                 elif not reasons[row] and moved and state == "virgin":
                     other_response = responses[row].copy()
+            ends.add(responses, reasons)
             if other or noise is True:
                 peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
@@ -324,7 +326,7 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    remarks, of_calibration = [assumed], ()
+    remarks, of_calibration = [assumed, ends.remark()], ()
     if other:
         remarks.append(remark_on_peaks(peaks, model.channels, known, alone=calibrated is None))
     if moved and state == "virgin" and calibration.likelihood is not None:

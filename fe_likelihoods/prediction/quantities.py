@@ -20,6 +20,7 @@ from ..units import G0
 __all__ = [
     "ChannelQuantity",
     "Evaluator",
+    "MeanOfLast",
     "Quantity",
     "arias_intensity",
     "dissipated_energy",
@@ -198,7 +199,8 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
     channel : str
         Name of the channel.
     samples : int
-        Number of last samples. Where the structure still vibrates, choose a whole number of periods.
+        Number of last samples. Where the structure still vibrates, choose a whole number of periods, or append rest to
+        the record: ``record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0)``.
 
     Raises
     ------
@@ -207,7 +209,7 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
     """
     if not isinstance(samples, int | np.integer) or samples < 1:
         raise ValueError(f"final_value: samples must be a whole number, 1 or more; got {samples!r}")
-    return ChannelQuantity(channel, _MeanOfLast(int(samples)), name="final value")
+    return ChannelQuantity(channel, MeanOfLast(int(samples)), name="final value")
 
 
 def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
@@ -257,7 +259,7 @@ def _measured(quantity: ChannelQuantity, measurements: Measurements) -> float:
     return float(quantity.evaluate(measurements.values, measurements.steps[0]))
 
 
-class _MeanOfLast(NamedTuple):
+class MeanOfLast(NamedTuple):
     """Function of a history: the mean of its last samples."""
 
     samples: int

@@ -1,11 +1,14 @@
 """Energies of responses: closed forms, dimensions and units in every place, parts of histories, errors before a run."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import (
     arias_intensity,
@@ -18,6 +21,7 @@ from fe_likelihoods.prediction.quantities import (
 from fe_likelihoods.prediction.reliability import exceedance
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0
 
 CHANNELS = (
@@ -146,3 +150,29 @@ def test_displacements_are_finite_and_one_history_and_pairs_are_measured_at_the_
     with pytest.raises(ValueError, match="force, drift are measured at different times"):
         measured_quantity(WORK, late)
     assert final_value("drift").channel_names == ["drift"]
+
+
+def test_a_final_value_during_a_vibration_is_said_and_after_rest_it_is_not(rng):
+    record = Record("noise", 0.02, rng.standard_normal(500))
+    rest = record.followed_by(Record("rest", 0.02, [0.0, 0.0]), rest=60.0)
+
+    def drifting(record):
+        """An oscillator of 1 Hz beside a displacement that stays."""
+        wave = LinearOscillator(record).simulate([1.0, 1.0])[1]
+        return wave + 0.2 * np.abs(wave).max()
+
+    for motion, expected in ((record, 1), (rest, 0)):
+        channels = [Channel("top", "displacement", "mm")]
+        model = FunctionModel(
+            lambda theta, motion=motion: [theta[0] * drifting(motion)], ["g"], channels, 0.02, motion.n_steps
+        )
+        model.record = motion
+        for quantity in (final_value("top"), {"end": [final_value("top"), peak("top")]}):
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                propagate(model, np.ones((5, 1)), quantity=quantity, progress=False)
+            said = [str(each.message) for each in found]
+            assert sum("still moves in the last 2 s" in text and "top (+- " in text for text in said) == expected
+        with warnings.catch_warnings():  # the peak of the same response has no such remark
+            warnings.simplefilter("error")
+            propagate(model, np.ones((5, 1)), quantity=peak("top"), progress=False)
