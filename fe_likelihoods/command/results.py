@@ -13,6 +13,7 @@ from ..prediction.prediction import Prediction
 from ..reporting.advice import Judgement
 from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
+from ..reporting.table import moments_of
 from ..signals.error_measures import rrmse
 from .models import NotRun
 
@@ -35,12 +36,12 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     """
     from samplers import ladder_table, summary
 
-    posterior = run.posterior
-    shown = np.stack([p.shown(column) for p, column in zip(run.parameters, run.samples.T, strict=True)], axis=1)
-    errors = run.mean_error / np.array([p.factor for p in run.parameters])
+    posterior, factors = run.posterior, np.array([p.factor for p in run.parameters])
+    mean, errors, sd, low, median, high = (values / factors for values in moments_of(run))
     labels = [parameter.label for parameter in run.parameters]
-    moments = summary(shown, labels, mean_error=errors)
-    low, median, high = np.quantile(shown, [0.05, 0.5, 0.95], axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cv = sd / np.abs(mean)
+    moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors)
     fit = _fit_rows(posterior, run.samples)
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [

@@ -29,9 +29,11 @@ from .modes import (
     approach,
     check_starts,
     draw_starts,
+    ended,
     search_from,
     search_modes,
     unseen_share,
+    with_mode,
 )
 from .stacked import is_joint
 from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
@@ -82,6 +84,7 @@ _OPEN_ENDS = (
 )
 _LATE = 0.1  # growth of the emulated log-evidence after draws were made, from which ridges are followed again
 _FEW_ENDED = 0.5  # share of the starts below which their ends say little
+_TOO_FEW = 3  # such starts below which a result is refused: two miss one of two equal modes in half of all cases
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
@@ -133,6 +136,7 @@ class ResponseGuide:
         self._wide: StudentMixture | None = None
         self._beyond = np.empty((0, self._target.n_structural))  # points beyond the ends of a curved posterior
         self._curves = 0  # times that such points were tried
+        self._ridge = False  # whether the data leave a combination of parameters to the prior
         self._extensions = 0  # of the emulator along directions that the data leave to the prior
 
     def check(self, log_prob_fn: Callable) -> None:
@@ -156,12 +160,23 @@ class ResponseGuide:
     @property
     def concerns(self) -> tuple[str, ...]:
         """Why parts of the posterior may be missing."""
-        return (*self._concerns, *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN))
+        return (*self._concerns, *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN), *self._of_few_ends(_TOO_FEW, np.inf))
 
     @property
     def refusals(self) -> tuple[str, ...]:
         """Why parts of the posterior are probably missing."""
-        return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
+        return (*self._of_unseen_modes(_MOST_UNSEEN, np.inf), *self._of_few_ends(1, _TOO_FEW))
+
+    def _of_few_ends(self, least: int, below: float) -> tuple[str, ...]:
+        """A sentence on a ridge to which less than half of the starts led, at least `least` and fewer than `below`."""
+        n = 0 if self.search is None else ended(self.search)
+        if not self._ridge or not least <= n < min(below, _FEW_ENDED * len(self.search.ends)):
+            return ()
+        return (
+            f"only {n} of {len(self.search.ends)} starts led to a mode, the others were given up far below it, and the "
+            "data leave a direction to the prior, or the posterior is curved: parts of it may be missing. Where the "
+            "model is a function, let it take n_steps, so that the search begins with the first part of the record",
+        )
 
     def _of_unseen_modes(self, least: float, most: float) -> tuple[str, ...]:
         """A sentence if the expected share of unseen modes is above `least` and not above `most`."""
@@ -179,7 +194,7 @@ class ResponseGuide:
         """What a verdict without concerns rests on."""
         if self.search is None or not self.search.modes:
             return ""
-        n, modes = sum(end >= 0 for end in self.search.ends), len(self._modes)
+        n, modes = ended(self.search), len(self._modes)
         missed = 1.0 - 0.05 ** (1.0 / n)
         return (
             f"{n} starts led to {modes} mode{'s' if modes > 1 else ''}; with 95 % probability, they would have found "
@@ -341,14 +356,9 @@ class ResponseGuide:
         yield from self._follow_curves(session)
         self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
         reached = self._free_directions()[1]
+        self._ridge = len(reached) > 0
         if np.any(reached < _REACHED):
             self._add_concern(_SHORT_OF_THE_RIDGE)
-        ended = sum(end >= 0 for end in self.search.ends)
-        if len(reached) and ended < _FEW_ENDED * len(self.search.ends):
-            self._add_concern(
-                f"only {ended} of {len(self.search.ends)} starts led to a mode, the others were given up far below it, "
-                "and the data leave a direction to the prior, or the posterior is curved: parts of it may be missing"
-            )
 
     def _follow_curves(self, session: Any) -> Iterator[None]:
         """Simulate beyond the ends of a curved posterior until it ends there.
@@ -510,7 +520,7 @@ class ResponseGuide:
                 self._add_concern("the budget ended an ascent to a mode that the search had missed")
             elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
                 self._add_modes([found])
-                self._emulated = None
+                self.search, self._emulated = with_mode(self.search, found), None
             elif found.log_density > max(mode.log_density for mode in self._modes) + _IMPLAUSIBLE:
                 self._replace_nearest(found)
 

@@ -68,6 +68,7 @@ _EXPLAINED = 0.01, 0.1, 1.0
 _NEAR = 20.0  # largest difference of log-densities at which the line between ends is examined
 _ALONG = np.array([0.207, 0.414, 0.732])  # points of this line, unequal so that equally spaced modes are not all hit
 _ROUGHNESS = 4.0  # depth of a valley between points of one rough mode, as a multiple of the cost of a step
+_DEEPEST = 9.0  # at most: along wrong axes, steps cost hundreds
 _TOO_SHORT = 0.02  # squared length of a step, in units of the Laplace approximation, with which a design is repeated
 _DESIGNS = 4  # at most, around one end
 _DESIGN_FROM = 0.25  # log-density per dimension still to gain at which the first one is made
@@ -119,6 +120,8 @@ class Ascent(NamedTuple):
         Gradient of the log-density.
     hessian : (n_structural, n_structural) float
         Gauss-Newton Hessian of minus the log-density.
+    ended : bool
+        Whether the ascent goes no further.
     """
 
     coords: np.ndarray
@@ -130,6 +133,7 @@ class Ascent(NamedTuple):
     weights: np.ndarray
     gradient: np.ndarray
     hessian: np.ndarray
+    ended: bool = False
 
     @property
     def gain_left(self) -> float:
@@ -401,13 +405,16 @@ class _Climb:
         """Number of the ascent that a line without a valley leads to from nearly the same height; None if none.
 
         On a rough or curved likelihood, derivatives at one point do not describe the other points of its mode. The line
-        is straight in logarithms of positive parameters, in which a ridge of equal products is straight.
+        is straight in logarithms of positive parameters, in which a ridge of equal products is straight. A lower ascent
+        that goes on is no end: from a saddle, lines without a valley lead up to two modes.
         """
         here = self.here
         for number, end in list(self._known.items()):
             if number == self._number:
                 continue
             if abs(end.value - here.value) > _NEAR or np.abs(end.coords - here.coords).max() >= self._apart:
+                continue
+            if end.value < here.value - self.dip and not end.ended:
                 continue
             points = self._target.line(here.coords, end.coords, _ALONG)
             runs = yield points
@@ -494,7 +501,8 @@ def ascend(
         # at a saddle, such as the axis of symmetry of an even response, a point of the design is higher
         higher = climb.highest(points, runs, end.value + tolerance)
         # a step of a standard deviation costs 0.5; on a rough likelihood it costs more, and so do points on a line
-        climb.dip = max(_DIP, _ROUGHNESS * (end.value - float(np.median(climb.values or end.value))))
+        cost = end.value - float(np.median(climb.values or end.value))
+        climb.dip = float(np.clip(_ROUGHNESS * cost, _DIP, _DEEPEST))
         yield from climb.difference(axes, runs)
         climb.here = higher or climb.here
         yield from climb.climb(False, tolerance)
@@ -505,6 +513,7 @@ def ascend(
             yield target.moved(end.coords, np.concatenate([_FAR * free, -_FAR * free]))
     joined = (yield from climb.connected()) if designed else None
     if joined is None:
+        known[number] = known[number]._replace(ended=True)
         return number
     del known[number]
     return joined

@@ -23,7 +23,7 @@ from ..signals.fit_gate import CARE, LARGE_ERROR, REMARK, WRONG, Fault, Finding,
 from ..simulation.faults import ChangedModel
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
-from .table import ParameterRow, rows_of
+from .table import Moments, ParameterRow, rows_of
 
 __all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "windows_of"]
 
@@ -268,7 +268,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
         samples = as_points(samples, posterior.prior.names)
         points = np.concatenate([samples.mean(axis=0)[None], points])
         none = np.full(posterior.ndim, np.nan)
-        rows = rows_of(posterior.parameters, posterior.prior, samples, none, none)
+        rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none), none)
     compared: list[Compared] = []
     keys = getattr(posterior.likelihood, "likelihoods", {"": None})
     for key, (likelihood, columns) in zip(keys, posterior.likelihood.parts(), strict=True):

@@ -10,7 +10,36 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Truncate
 from ..priors.priors import Prior
 from .run import FinishedRun
 
-__all__ = ["ParameterRow", "describe_prior", "parameter_rows", "rows_of"]
+__all__ = ["Moments", "ParameterRow", "describe_prior", "moments_of", "parameter_rows", "rows_of"]
+
+
+class Moments(NamedTuple):
+    """Means, their Monte Carlo standard errors, standard deviations, 5 %, 50 % and 95 % quantiles (ndim,)."""
+
+    mean: np.ndarray
+    mean_error: np.ndarray
+    sd: np.ndarray
+    low: np.ndarray
+    median: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of_samples(cls, samples: np.ndarray, mean_error: np.ndarray) -> "Moments":
+        """Moments of samples (n, ndim)."""
+        return cls(
+            samples.mean(axis=0), mean_error, samples.std(axis=0), *np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
+        )
+
+
+def moments_of(run: FinishedRun) -> Moments:
+    """Moments of the chain, or of the signed sample of a run with a guide if it has smaller errors of all means."""
+    signed = getattr(run.sampler, "signed_sample", None)
+    if signed is not None:
+        mean, error = signed.expectation()
+        if np.all(error < run.mean_error):
+            quantiles = (signed.quantile(probability).value for probability in (0.05, 0.5, 0.95))
+            return Moments(mean, error, signed.standard_deviation().value, *quantiles)
+    return Moments.of_samples(run.samples, run.mean_error)
 
 
 class ParameterRow(NamedTuple):
@@ -56,27 +85,25 @@ class ParameterRow(NamedTuple):
 
 def parameter_rows(run: FinishedRun) -> list[ParameterRow]:
     """One row per parameter, in the order of the chain."""
-    return rows_of(run.parameters, run.prior, run.samples, run.mean_error, run.truth)
+    return rows_of(run.parameters, run.prior, moments_of(run), run.truth)
 
 
 def rows_of(
     parameters: Sequence[Parameter],
     prior: Prior | None,
-    samples: np.ndarray,
-    mean_error: np.ndarray,
+    moments: Moments,
     truth: np.ndarray,
 ) -> list[ParameterRow]:
-    """One row for each parameter of samples (n, ndim); errors of the means and true values (ndim,) may be NaN."""
-    mean, sd = samples.mean(axis=0), samples.std(axis=0)
-    low, high = np.quantile(samples, [0.05, 0.95], axis=0)
+    """One row for each parameter; errors of the means and true values (ndim,) may be NaN."""
+    mean, mean_error, sd, low, _, high = moments
     rows, known = [], [] if prior is None else prior.table()[1]
     for i, parameter in enumerate(parameters):
-        text, moments, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)
+        text, of_prior, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)
         if prior is not None:
             text = _words_of(prior, parameter.name, parameter.factor)
-            moments, bounds = known[i][2:4], known[i][4:6]
+            of_prior, bounds = known[i][2:4], known[i][4:6]
         numbers = mean[i], mean_error[i], sd[i]
-        shown = [float(each) for each in parameter.shown([*moments, *numbers])]
+        shown = [float(each) for each in parameter.shown([*of_prior, *numbers])]
         others = [float(each) for each in parameter.shown([low[i], high[i], parameter.nominal, truth[i], *bounds])]
         cv = float(sd[i] / abs(mean[i])) if mean[i] else np.nan
         unit = parameter.label.removeprefix(parameter.name).strip()

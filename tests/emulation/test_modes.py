@@ -1,14 +1,33 @@
 """Modes: against a general optimiser, for every noise; two modes; failures; budgets; growing records."""
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from fe_likelihoods import Channel, FELikelihood, FunctionModel, Measurements, Posterior, Uniform, problems
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    TruncatedNormal,
+    Uniform,
+    problems,
+)
 from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _at_least_one, _Climb, _Point, _valley
-from fe_likelihoods.emulation.modes import UNSEEN, find_modes, unseen_share
+from fe_likelihoods.emulation.modes import (
+    UNSEEN,
+    Mode,
+    ModeSearch,
+    ended,
+    find_modes,
+    unseen_share,
+    with_mode,
+)
 from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning, SMCSampler
 
@@ -91,10 +110,50 @@ def test_starts_are_added_until_few_unseen_modes_are_expected(n, most):
     for search in found:
         assert len(search.ends) <= most
         assert unseen_share(search) <= UNSEEN or len(search.ends) == 32
-        assert sum(end >= 0 for end in search.ends) >= 6 or len(search.ends) >= 12
+        assert ended(search) >= 6 or len(search.ends) >= 12
         assert len(search.modes) >= n - 1
     # a share of UNSEEN is expected to be missed: of 30, 1.5 with a standard deviation of 1.2
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
+
+
+@pytest.mark.parametrize("difference", [0.4, 0.7])
+def test_two_straight_ridges_are_two_modes(difference):
+    """Only (a - b)^2 is identified. With wrong derivatives at first, steps cost hundreds, which is no roughness; and
+    from the saddle a = b, lines lead up to both modes."""
+    time, channels = 0.02 * np.arange(100), [Channel("top", "displacement", "m")]
+    function = partial(_of_squared_difference, time)
+    model = FunctionModel(function, ("a", "b"), channels, 0.02, 100, version="two ridges")
+    noise = 0.05 * np.random.default_rng(1).standard_normal((1, 100))
+    measured = Measurements(channels, 0.02, model.simulate(np.array([difference, 0.0])) + noise)
+    prior = {"a": TruncatedNormal(0.0, 1.0, -np.inf), "b": TruncatedNormal(0.0, 1.0, -np.inf)}
+    posterior = Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.2)})
+    for seed in range(10):
+        ends = [mode.parameters[0] - mode.parameters[1] for mode in find_modes(posterior, seed=seed).modes]
+        assert sorted(ends) == pytest.approx([-difference, difference], abs=0.05)
+
+
+def _of_squared_difference(time, theta):
+    return (np.square(theta[0] - theta[1]) * np.cos(6.0 * time))[None]
+
+
+def _mode(log_evidence):
+    return Mode(np.zeros(3), np.zeros(3), np.eye(3), 0.0, log_evidence, (), True)
+
+
+def test_a_mode_that_draws_found_counts_as_the_end_of_a_start():
+    search = with_mode(ModeSearch((_mode(0.0),), (0, 0, 0, -1), 10.0, True), _mode(-1.0))
+    assert search.ends == (0, 0, 0, -1, 1) and unseen_share(search) == pytest.approx(0.2)
+    assert with_mode(search, _mode(100.0)).ends == (-1, -1, -1, -1, -1, 2)
+
+
+@pytest.mark.parametrize(("n", "refused", "doubted"), [(2, True, False), (3, False, True), (12, False, False)])
+def test_few_starts_that_led_to_a_ridge_say_little(n, refused, doubted):
+    guide = _equal_modes(1).guide()
+    guide._ridge = True
+    guide.search = ModeSearch((_mode(0.0),), (0,) * n + (-1,) * 12, 100.0, True)
+    said = [any("parts of it may be missing" in text for text in each) for each in
+            (guide.refusals, guide.concerns)]  # fmt: skip
+    assert said == [refused, doubted]
 
 
 def test_a_result_with_many_modes_of_one_start_is_refused():

@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import warnings
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import emcee
 import matplotlib.pyplot as plt
@@ -39,9 +39,10 @@ from fe_likelihoods.reporting.failures import Failures
 from fe_likelihoods.reporting.fits import fit_data_sets
 from fe_likelihoods.reporting.report import _like
 from fe_likelihoods.reporting.run import _errors, read_run
-from fe_likelihoods.reporting.table import parameter_rows
+from fe_likelihoods.reporting.table import moments_of, parameter_rows
 from fe_likelihoods.signals.fit_gate import Finding
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
+from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian
 from tests.reporting.report_page import Page, read_page
 
@@ -226,6 +227,20 @@ def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_n
         assert "sigma_top [mm]" in notes[title].sentence and title not in {
             n.name for n in advise(finished, rows, fits, Failures((), 0, 1)).findings
         }
+
+
+def test_moments_are_those_of_the_more_accurate_sample(rng):
+    points = rng.standard_normal((20_000, 2))
+    signed = SignedSample(points, np.full(20_000, 1.0 / 20_000), np.zeros(20_000, dtype=int), 0.0, 0.0)
+    chain, errors = 1.2 * rng.standard_normal((100, 2)), np.full(2, 0.12)
+    finished = SimpleNamespace(sampler=SimpleNamespace(signed_sample=signed), samples=chain, mean_error=errors)
+    moments = moments_of(finished)
+    assert moments.sd == pytest.approx(np.ones(2), abs=0.03) and moments.high == pytest.approx(1.645, abs=0.06)
+    assert np.all(moments.mean_error < 0.01)
+    errors[1] = 1e-3
+    np.testing.assert_array_equal(moments_of(finished).sd, chain.std(axis=0))
+    finished.sampler = object()  # emcee's own
+    np.testing.assert_array_equal(moments_of(finished).sd, chain.std(axis=0))
 
 
 def test_samplers_without_a_ladder_and_functions_without_data_are_reported(tmp_path):
