@@ -31,7 +31,13 @@ from ..events.ratios import EventRatios
 from ..events.spread import EventSpread
 from ..prediction.prediction import Prediction
 from ..prediction.propagation import check_effective_sample_size
-from ..prediction.reliability import Exceedance, exceedance, exceedance_probability, warn_of_missing_error
+from ..prediction.reliability import (
+    Exceedance,
+    exceedance,
+    exceedance_probability,
+    warn_of_missing_error,
+    with_collapses,
+)
 from ..text_tables import number
 from ..units import DIMENSIONS, find_unit, from_si
 from .measures import SIDES, STRAIN_MEASURES, DamageMeasures
@@ -122,9 +128,10 @@ class Damage(NamedTuple):
         Effective number of independent samples.
     n_samples : int
         Number of samples that are counted.
-    n_failed : int
-        Number of samples whose simulation failed. They are not counted, so that the probabilities are too low if
-        simulations fail where the damage is large.
+    n_failed, n_collapsed : int
+        Number of samples whose simulation failed, and of samples whose structure collapsed. Collapsed structures reach
+        every limit state everywhere; quantiles of measures are those of the others. Failures are not counted, so that
+        the probabilities are too low if simulations fail where the damage is large.
     from_state : str
         State of the structure at the beginning, "virgin" or "end".
     uncertainty : str
@@ -145,16 +152,19 @@ class Damage(NamedTuple):
     effective_sample_size: float
     n_samples: int
     n_failed: int
+    n_collapsed: int
     from_state: str
     uncertainty: str
 
     @property
     def failures(self) -> str:
-        """How many samples failed, as a sentence; an empty text if none."""
-        if not self.n_failed:
-            return ""
-        total = self.n_samples + self.n_failed
-        return f"{self.n_failed} of {total} samples failed and are not counted: probabilities may be too low"
+        """How many structures collapsed and how many samples failed, in a sentence; an empty text if none."""
+        total, said = self.n_samples + self.n_failed + self.n_collapsed, []
+        if self.n_collapsed:
+            said.append(f"{self.n_collapsed} of {total} structures collapsed and reach every limit state")
+        if self.n_failed:
+            said.append(f"{self.n_failed} of {total} samples failed and are not counted: probabilities may be too low")
+        return "; ".join(said)
 
     def __str__(self) -> str:
         return self.table()
@@ -181,7 +191,7 @@ class Damage(NamedTuple):
         width = max([20, *(len(cell) for _, cells in rows for cell in cells)]) + 2
         lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
         closing = [f"The probabilities contain {self.uncertainty}."]
-        return "\n".join([*lines, "", *closing, *([f"{self.failures}."] if self.n_failed else [])])
+        return "\n".join([*lines, "", *closing, *([f"{self.failures}."] if self.failures else [])])
 
     def plot(self, events: Sequence[str] | None = None) -> Figure:
         """Draw the column with its probabilities, see `fe_likelihoods.plots.damage.plot_damage`."""
@@ -299,9 +309,9 @@ def damage(
         spread = EventSpread(found, weights, errors.get(state.measure))
         options = (limit, spread, effective, level, seed, state.measure in _DECREASING)
         largest = found.max(axis=(2, 3)) if found.ndim == 4 else found
-        presence[state.name] = _exceeded(largest, *options)._replace(**shown)
+        presence[state.name] = with_collapses(_exceeded(largest, *options), prediction, level)._replace(**shown)
         if found.ndim == 4:
-            location[state.name] = _exceeded(found, *options)._replace(**shown)
+            location[state.name] = with_collapses(_exceeded(found, *options), prediction, level)._replace(**shown)
     without = [state.name for state in states if state.measure not in errors]
     if without and noise is None:
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
@@ -321,7 +331,8 @@ def damage(
         measures=measures,
         effective_sample_size=effective,
         n_samples=int(prediction.n_samples),
-        n_failed=int(prediction.n_failed),
+        n_failed=int(prediction.n_failed) - len(prediction.collapsed),
+        n_collapsed=len(prediction.collapsed),
         from_state=prediction.from_state,
         uncertainty=_contents(states, errors, weights is not None),
     )

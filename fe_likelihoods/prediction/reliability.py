@@ -43,6 +43,7 @@ __all__ = [
     "interval_of_draws",
     "threshold_in_si",
     "unit_of_threshold",
+    "with_collapses",
     "warn_of_missing_error",
 ]
 
@@ -121,7 +122,8 @@ def exceedance(
     Parameters
     ----------
     prediction_or_values : Prediction, or (n, ...) array_like
-        A prediction with `values`, for instance of ``quantity=peak(...)``, or the values of the samples.
+        A prediction with `values`, for instance of ``quantity=peak(...)``, or the values of the samples. Samples whose
+        structure collapsed count as exceedances, other failures are left out.
     threshold : float or array_like
         If the quantity is a number: one threshold or an array of any shape. If it is an array: one threshold, or one
         for each entry, shape (...). Positive if there are ratios.
@@ -200,6 +202,55 @@ def exceedance(
     if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
         _warn_of_unit(limits, values, channels[0])
     said, unit = contents(has_error, spread), unit_of_threshold(unit, channels)
+    found = _of_values(values, limits, spread, effective, level, seed)._replace(uncertainty=said, unit=unit)
+    return found if prediction is None else with_collapses(found, prediction, level)
+
+
+def with_collapses(found: Exceedance, prediction: Prediction, level: float = 0.95) -> Exceedance:
+    """Count the samples of a prediction whose structure collapsed as exceedances of every limit.
+
+    A probability that leaves them out speaks of the structures that stand, and is too low.
+
+    Parameters
+    ----------
+    found : Exceedance
+        Probability among the samples that did not fail.
+    prediction : Prediction
+        The prediction with its collapsed samples.
+    level : float
+        Probability of the interval.
+
+    Returns
+    -------
+    Exceedance
+        With p = c + (1 - c) p', for the share c of collapsed samples and the probability p' among the others. The ends
+        of the interval combine those of c and p'.
+    """
+    n_collapsed = len(prediction.collapsed)
+    if not n_collapsed:
+        return found
+    total = prediction.n_samples + n_collapsed
+    share, effective = n_collapsed / total, found.effective_sample_size * total / prediction.n_samples
+    lowest, highest = binomial_interval(share, effective, level)
+    error = np.hypot(
+        (1.0 - share) * found.standard_error, (1.0 - found.probability) * np.sqrt(share * (1.0 - share) / effective)
+    )
+    by_events = found.upper_by_events
+    return found._replace(
+        probability=share + (1.0 - share) * found.probability,
+        standard_error=error,
+        lower=lowest + (1.0 - lowest) * found.lower,
+        upper=highest + (1.0 - highest) * found.upper,
+        effective_sample_size=effective,
+        uncertainty=f"{found.uncertainty}; {n_collapsed} of {total} structures collapsed, which exceed every limit",
+        upper_by_events=None if by_events is None else highest + (1.0 - highest) * by_events,
+    )
+
+
+def _of_values(
+    values: np.ndarray, limits: np.ndarray, spread: EventSpread, effective: float, level: float, seed: int
+) -> Exceedance:
+    """Probability that values (n, ...) exceed limits."""
     if spread.ratios is None and spread.weights is None:
         if values.ndim == 1:
             share = 1.0 - np.searchsorted(np.sort(values), limits, side="right") / len(values)
@@ -207,7 +258,7 @@ def exceedance(
             share = (values > limits).mean(axis=0)
         lower, upper = binomial_interval(share, effective, level)
         error = np.sqrt(share * (1.0 - share) / effective)
-        return Exceedance(limits, share, error, lower, upper, effective, said, unit=unit)
+        return Exceedance(limits, share, error, lower, upper, effective)
     if spread.ratios is not None:
         if not (limits > 0.0).all():
             raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
@@ -226,11 +277,10 @@ def exceedance(
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
         by_events = None if spread.ratios.form == "linear" else np.array([each.upper_by_events for each in columns])
-        return Exceedance(limits, *numbers, effective, said, by_events, unit)
+        return Exceedance(limits, *numbers, effective, upper_by_events=by_events)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
-    found = exceedance_probability(values, limits, spread, effective, level, seed)
-    return found._replace(threshold=limits, uncertainty=said, unit=unit)
+    return exceedance_probability(values, limits, spread, effective, level, seed)._replace(threshold=limits)
 
 
 def exceedance_probability(

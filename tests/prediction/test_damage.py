@@ -68,6 +68,17 @@ def prediction(column):
     return propagate(column, samples, quantity=damage_measures(column, park_ang=CONSTANTS), progress=False)
 
 
+def test_collapsed_columns_reach_every_limit_state(prediction):
+    """A third of the samples collapsed, and one failed otherwise: p = c + (1 - c) p' for the others."""
+    fallen = replace(prediction, collapsed=np.arange(12, 18), failed=np.arange(12, 19))
+    others, found = damage(prediction, noise=False), damage(fallen, noise=False)
+    assert (found.n_collapsed, found.n_failed, found.n_samples) == (6, 1, 12)
+    for name, each in others.presence.items():
+        np.testing.assert_allclose(found.presence[name].probability, (6.0 + 12.0 * each.probability) / 18.0)
+    assert all(each.probability.min() >= 1.0 / 3.0 for each in found.location.values())
+    assert "6 of 19 structures collapsed" in str(found) and "1 of 19 samples failed" in str(found)
+
+
 def test_energy_drifts_and_index_of_a_loop():
     model, constants = Loop(), ParkAng(0.2, 8e3, 0.1)
     channels = {"displacement": "u", "force": "f", "acceleration": "a"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods import BridgeDeck, EventRatios, IsolatedBridge, LinearStructure, Record, propagate
+from fe_likelihoods import BridgeDeck, EventRatios, IsolatedBridge, LinearStructure, Record, exceedance, propagate
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.fragility import fragility, peak_ground_acceleration
 from fe_likelihoods.prediction.fragility_curve import fit_fragility
@@ -89,6 +89,12 @@ def test_collapse_is_an_exceedance_and_no_failure(record, rng, ratios):
     prediction = propagate(model, samples, quantity=peak("displacement"), record=records[-1], progress=False)
     assert len(prediction.collapsed) == prediction.n_failed == found.n_collapsed[-1]
     assert f"the structure collapsed in {found.n_collapsed[-1]}" in str(prediction)
+    alone = exceedance(prediction, 0.1, ratios=ratios, noise=False, seed=1)
+    assert alone.probability == pytest.approx(found.probability[-1], abs=1e-12)
+    assert alone.lower < alone.probability < alone.upper and alone.effective_sample_size == pytest.approx(300.0)
+    assert f"{found.n_collapsed[-1]} of 300 structures collapsed" in str(alone)
+    survivors = exceedance(prediction.values, 0.1, ratios=ratios, noise=False, seed=1)
+    assert survivors.probability < alone.probability - 0.1
 
 
 def test_excitations_of_several_components(record, monkeypatch):
