@@ -475,10 +475,15 @@ def _contradiction(noise: Any, channels: Sequence[Channel], residuals: np.ndarra
     elif whitened:
         bands = "other bands" if getattr(noise, "n_bands", 1) > 1 else "GaussianNoise with bands"
         what, other = "whitened residuals", f"fewer samples or {bands} of frequency"
+    # the information of independent samples is proportional to their number
+    factors = np.sqrt(np.broadcast_to(assumed, wrong.shape)[wrong] / independent[wrong])
+    least, most = (f"{each:.2g}" for each in (factors.min(), factors.max()))
+    about = least if least == most else f"{least} to {most}"
     return (
         f"the {what} of the calibration are not independent, as the noise says they are: {names}. The posterior is too "
-        f"narrow, and so is the spread of the predictions between its samples. Calibrate with {other}, or predict with "
-        "the spread between several calibrated events (in Python, predict_new_event; residual_checks has the figures)"
+        f"narrow by a factor of about {about}, and so is the spread of the predictions between its samples. Calibrate "
+        f"with {other}, or predict with the spread between several calibrated events (in Python, predict_new_event; "
+        "residual_checks has the figures)"
     )
 
 
