@@ -53,12 +53,16 @@ class LinearStructure(ExternalModel):
         Time of the last sample of the channels, from the first sample of the supports [s]; between two samples, the
         earlier one is the last. Default: the end of the records. Later motion changes the response only if the
         properties depend on its amplitude (`EquivalentLinear`).
+    lags : sequence of int
+        Supports, counted from 0, whose recorder has a clock with an unknown lag. Each has a parameter, such as
+        ``lag_2`` [s]: positive where its record is later than the other records and the measured response. Lags belong
+        to the recorders of these records: under other records, give samples with the lags that these have.
 
     Raises
     ------
     ValueError
-        If there are no supports, their steps or lengths differ, `parts` has another number of supports, or fewer than
-        two samples are between `lead` and `until`.
+        If a lag is of no support, all supports have one, there are no supports, their steps or lengths differ, `parts`
+        has another number of supports, or fewer than two samples are between `lead` and `until`.
 
     Examples
     --------
@@ -75,6 +79,7 @@ class LinearStructure(ExternalModel):
         unit: str = "g",
         lead: float = 0.0,
         until: float | None = None,
+        lags: Sequence[int] = (),
     ) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
@@ -92,22 +97,31 @@ class LinearStructure(ExternalModel):
                 f"LinearStructure: expected one record for each of the {parts.n_supports} supports of "
                 f"{type(parts).__name__}; got {len(supports)}"
             )
+        lags = tuple(lags)
+        if len(set(lags)) < len(lags) or not set(lags) < {*range(len(supports))}:
+            raise ValueError(
+                f"LinearStructure: lags must be numbers of supports, from 0 to {len(supports) - 1} and not all of "
+                "them, because a lag of all clocks is a lag of the sensors (time_shifts of FELikelihood); got "
+                f"{lags!r}"
+            )
         channels = tuple(Channel(name, "absolute acceleration", unit) for name in parts.channel_names)
         self._window = sample_window("the supports", first.n_steps, first.dt, lead, until)
-        super().__init__(parts.parameter_names, channels, first.dt, self._window.stop - self._window.start)
+        names = (*parts.parameter_names, *(f"lag_{k}" for k in lags))
+        super().__init__(names, channels, first.dt, self._window.stop - self._window.start)
         self.parts = parts
         self.supports = supports
         self.unit = unit
         self.lead = float(lead)
+        self.lags = lags
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports])
+        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports], *lags)
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other support accelerations; errors as for a new structure.
 
         The lead is kept, `until` is not.
         """
-        return type(self)(self.parts, record, self.unit, self.lead)
+        return type(self)(self.parts, record, self.unit, self.lead, lags=self.lags)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
@@ -150,16 +164,27 @@ class LinearStructure(ExternalModel):
         """
         last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
         until = last * self.dt
-        if isinstance(self.parts, EquivalentLinear):  # the level belongs to the whole record
-            return type(self)(self.parts, self.supports, self.unit, self.lead, until)
+        if self.lags or isinstance(self.parts, EquivalentLinear):  # later motion counts: a late one, or its level
+            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.lags)
         return self.with_record([support.trim(0.0, until) for support in self.supports])
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
+        n = len(theta) - len(self.lags)
+        theta, motion = theta[:n], self._under_clocks(theta[n:])
         if isinstance(self.parts, EquivalentLinear):
-            system = self.parts.settle(theta, self._acceleration, self.dt).system
+            system = self.parts.settle(theta, motion, self.dt).system
         else:
             system = self.parts.assemble(theta)
         modes = complex_modes(system)
-        out = np.einsum("cs,st->ct", system.direct, self._acceleration)
-        superpose(modes, modes.shapes[:, 2] @ system.shape.T, self._acceleration, self.dt, out)
+        out = np.einsum("cs,st->ct", system.direct, motion)
+        superpose(modes, modes.shapes[:, 2] @ system.shape.T, motion, self.dt, out)
         return out[:, self._window]
+
+    def _under_clocks(self, lags: np.ndarray) -> np.ndarray:
+        """Accelerations of the supports by one clock, linear between the samples of a record."""
+        if not self.lags:
+            return self._acceleration
+        motion, time = self._acceleration.copy(), self.dt * np.arange(self._acceleration.shape[1])
+        for k, lag in zip(self.lags, lags, strict=True):
+            motion[k] = np.interp(time + lag, time, self._acceleration[k], left=0.0, right=0.0)
+        return motion

@@ -307,7 +307,10 @@ def _of_a_fault(compared: Compared, fault: Fault) -> Finding:
             f"measured response: without this lag, {better}. The clocks of recorders may differ."
         )
         # a motion that is recorded late must be shifted to earlier times
-        action = "Compare the clocks of the recorders, with `align`, and shift the record before you use the result."
+        action = (
+            "Compare the clocks of the recorders, with `align`, and shift the record before you use the result, or "
+            "make the lag a parameter (lags= of LinearStructure)."
+        )
         return Finding("Clocks of input recorders may differ", WRONG, text, action)
     text = (
         f"The {which} of {names}{where} {'are' if len(fault.names) > 1 else 'is'} {abs(fault.value):.3g} s {late} than "

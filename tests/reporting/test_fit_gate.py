@@ -147,3 +147,19 @@ def _oscillation():
 def _prior():
     known = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
     return known | {name: HalfNormal(1.0) for name in ("sigma_acceleration", "sigma_displacement")}
+
+
+def test_the_lag_of_a_recorder_is_found_as_a_parameter():
+    """The ends are 0.1 s late; with their lags as parameters the fit is right, and nothing speaks against it."""
+    model, measured = deck(late=5)
+    model = LinearStructure(model.parts, model.supports, lags=(1, 2))
+    prior = DECK | {
+        "lag_1": TruncatedNormal(0.0, 0.1, lower=-np.inf),
+        "lag_2": TruncatedNormal(0.0, 0.1, lower=-np.inf),
+    }
+    posterior, samples = sampled(model, measured, prior)
+    mean, sd = samples.mean(axis=0), samples.std(axis=0)
+    found = dict(zip(posterior.parameter_names, mean, strict=True))
+    assert found["lag_1"] == pytest.approx(0.1, abs=0.005) and found["lag_2"] == pytest.approx(0.1, abs=0.005)
+    assert (np.abs(mean[:3] - [4.0, 0.08, 0.6]) < 4.0 * sd[:3] + 0.01).all()
+    assert not [each for each in check_fit(posterior, samples) if each.weight == "wrong"]
