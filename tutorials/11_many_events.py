@@ -327,7 +327,7 @@ for name, column in zip(posterior.parameter_names, sampler.get_chain(flat=True).
 # from the strongest event as usual, once with the spread between events and the ratio of peaks. The synthetic bridge
 # has one event under each motion, with parameters of its own: its peak exceeds the limit or not. The Brier score, the
 # mean square of (probability - outcome), judges the probabilities; 0 is best, a coin has 0.25. In the full setting it
-# is 0.13 as usual, where 10 of 84 outcomes are given a probability below 1 %, and 0.05 with the population, where none
+# is 0.13 as usual, where 10 of 84 outcomes are given a probability below 1 %, and 0.06 with the population, where none
 # is. The mean over the motions is the fragility of the bridge. As usual it is too small at low intensities, because the
 # deck is stiffer and less damped there than in the strongest event.
 

@@ -113,7 +113,7 @@ class Hierarchy:
             doubt = ", mostly by its prior" if np.std(self.samples[:, 2 * k + 1]) > _MOSTLY_PRIOR * prior else ""
             if low > error:
                 known = True
-                times = f"{number(middle / error, 2)} times the error of one test"
+                times = f"{middle / error:.{0 if middle > 9.95 * error else 1}f} times the error of one test"
                 found.append(f"{name} by {number(factor * middle, 2)}{unit} ({ends}{doubt}), {times}")
             else:
                 found.append(f"{name} by no more than the error of one test shows ({ends}{doubt})")
