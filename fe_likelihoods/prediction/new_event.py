@@ -28,15 +28,17 @@ from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.spread import EventSpread
 from ..signals.records import Record
+from .excitation import under_record
 from .inputs import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
+from .transfer_checks import remark_on_harmonic
 
 __all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
 
-_NOTABLE = 1.5  # widening of the scatter from which it is told
+_SENSITIVITY = 20  # draws of the population, under a motion of another kind
 _LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
 
@@ -114,7 +116,6 @@ def predict_new_event(
     prior_events: float = PRIOR_EVENTS,
     noise: bool | str = False,
     n: int = 500,
-    sensitivity: int = 20,
     seed: int | None = None,
     **options: Any,
 ) -> Prediction | dict[str, Prediction]:
@@ -145,10 +146,6 @@ def predict_new_event(
     n : int
         Number of draws. Histories need a simulation for each, numbers one for each event and one for the new one. Draws
         with an impossible noise, such as a share of 1 or more of ``level="measured"``, are left out.
-    sensitivity : int
-        Number of draws of the population, simulated for numbers in each event and in the new one, from which it is
-        known how much the numbers depend on the parameters there; 0 for none. Under a harmonic near a resonance they
-        do so far more than under earthquakes. The scatter is then widened, with a warning: see Notes.
     seed : int, optional
         Seed for drawing parameters, ratios and noise.
     **options
@@ -171,15 +168,17 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `propagate` for peaks outside the range of all events. If a number depends on the parameters far more than in
-        the events. For histories also as `Hierarchy.new_test`, and if more than 1 % of the draws have an
+        As `propagate` for peaks outside the range of all events, and for harmonics, with which the scatter is widened
+        (see Notes). For histories also as `Hierarchy.new_test`, and if more than 1 % of the draws have an
         impossible noise. Residuals of the single calibrations are not checked.
 
     Notes
     -----
     The intervals of numbers are those of normal log ratios whose scatter is the same in all events: the same change of
-    the parameters changes the logarithm of the value by the same amount. Where the variance of this logarithm over the
-    population is larger than the largest one of the events, the difference is added to the variance of the new event.
+    the parameters changes the logarithm of the value by the same amount. Under a harmonic near a resonance it changes
+    far more. If the power of the motion is in a band of less than a fifth of the width in every event, 20 draws of the
+    population are simulated in each event and the new one. What the variance of the logarithm over them has more than
+    the largest one of the events is added to the variance of the new event.
     See ``docs/theory/prediction.rst``.
 
     Examples
@@ -192,7 +191,6 @@ def predict_new_event(
         )
     if isinstance(quantity, Mapping):
         given = {"model": model, "form": form, "prior_sd": prior_sd, "prior_events": prior_events, "n": n, "seed": seed}
-        given["sensitivity"] = sensitivity
         return {
             name: predict_new_event(
                 hierarchy, posteriors, record, quantity=each, noise=noise and not _is_number(each), **given, **options
@@ -215,13 +213,16 @@ def predict_new_event(
             ratios.at, read_source(predictor).model.parameter_names, n
         )  # equal rows are simulated once
         prediction = propagate(predictor, rows, record=record, quantity=quantity, **settings)
-        if sensitivity:
+        moved = read_source(predictor).model
+        moved = moved if record is None else under_record(moved, record)
+        tests = list(hierarchy.posterior.tests)
+        if all(remark_on_harmonic(read_source(posteriors[name]).model, moved) for name in tests):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of draws beyond bounds, and what the prediction has said
                 seeds = np.random.SeedSequence(seed).spawn(1)[0]
-                draws, _ = draw_new_event(hierarchy, list(rows), sensitivity, None, seeds)
+                draws, _ = draw_new_event(hierarchy, list(rows), _SENSITIVITY, None, seeds)
                 own = _log_sd(predictor, draws, quantity, record, settings)
-                events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in hierarchy.posterior.tests]
+                events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in tests]
             ratios, remark = _widened(ratios, own, np.max(events, axis=0), quantity)
             prediction = replace(prediction, remarks=(*prediction.remarks, *remark))
         prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
@@ -253,14 +254,14 @@ def _widened(
     excess = np.maximum(np.square(own) - np.square(of_events), 0.0)
     widening = np.sqrt(1.0 + excess / np.square(ratios.sd))
     ratios = replace(ratios, widening=widening)
-    if not (widening > _NOTABLE).any():
+    if not excess.any():
         return ratios, ()
     several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
-    far = [f"{each} {w:.1f} times" for each, w in zip(several, np.atleast_1d(widening), strict=True) if w > _NOTABLE]
+    told = ", ".join(f"{each} {w:.1f} times" for each, w in zip(several, np.atleast_1d(widening), strict=True))
     remark = (
-        "the calibration hardly speaks for this motion, under which the response depends on the parameters more than "
-        f"in any calibrated event, as under a harmonic near a resonance. The scatter is widened: {', '.join(far)}. "
-        "Calibrate with a motion of this kind"
+        "the calibration hardly speaks for this motion, which is nearly a harmonic. The scatter between events is "
+        "widened by what the response depends on the parameters more than in all calibrated events: "
+        f"{told}. Calibrate with a motion of this kind"
     )
     warnings.warn(f"predict_new_event: {remark}", stacklevel=3)
     return ratios, (remark,)
