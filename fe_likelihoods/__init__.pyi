@@ -9,6 +9,7 @@ from .events.ratios import EventRatios
 from .events.stiffness_loss import stiffness_loss
 from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
+from .information.sensors import rank_sensors
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -149,6 +150,7 @@ __all__ = [
     "predict_new_event",
     "problems",
     "propagate",
+    "rank_sensors",
     "read_columns",
     "read_imposed_test",
     "read_record",

@@ -1,0 +1,488 @@
+r"""Which sensor would tell most: expected information of sensors before they measure.
+
+With the derivatives J of the responses by standard normal coordinates of the prior (`Prior.from_normal`), the weights W
+of the measurements and the precision A of what is known already (the identity for a prior), the information of a set of
+sensors, and the variance of a target with the gradient g that they leave, are
+
+.. math::
+
+   I = \tfrac{1}{2} \log \frac{\det(A + J^T W J)}{\det A}, \qquad v = g^T (A + J^T W J)^{-1} g,
+
+averaged over draws of the parameters. Both are exact for a linear model with Gaussian noise. For other models this is
+the expected information gain of a Laplace approximation at the true parameters (Q. Long, M. Scavino, R. Tempone, S.
+Wang, 2013, Fast estimation of expected information gains for Bayesian experimental designs based on Laplace
+approximations, Computer Methods in Applied Mechanics and Engineering 259, 24-39, doi:10.1016/j.cma.2013.02.017). For
+structures see C. Papadimitriou (2004), Optimal sensor placement methodology for parametric identification of structural
+systems, Journal of Sound and Vibration 278, 923-947, doi:10.1016/j.jsv.2003.10.063.
+
+The linearisation leaves out several modes, curved ridges, and what a measurement tells where derivatives vanish. The
+noise is white, known, and independent between channels; errors of the model are not part of it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..likelihood.posterior import Posterior
+from ..prediction.quantities import ChannelQuantity, evaluator
+from ..priors.distributions import Distribution
+from ..priors.points import as_rows
+from ..priors.priors import Prior
+from ..signals.channels import Channel
+from ..simulation.model import Model, most_responses, simulate_batch
+from ..text_tables import number, text_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["SensorRanking", "Slopes", "information_of", "rank_sensors", "slopes_at", "variance_of"]
+
+SHARE = 0.05  # of the channel's RMS, the default noise
+STEP = 0.1  # of differences, in standard deviations
+FEWEST = 10  # samples for each parameter
+
+
+class Slopes(NamedTuple):
+    """Derivatives of responses by standard normal coordinates at m points; NaN where a simulation failed.
+
+    Attributes
+    ----------
+    products : (m, n_channels, d, d) float
+        Sums over the samples of the products of two derivatives [SI²], per channel.
+    mean_squares : (m, n_channels) float
+        Mean squares of the responses [SI²].
+    gradients : (m, d) float
+        Derivatives of the target [SI]; zero without one.
+    """
+
+    products: np.ndarray
+    mean_squares: np.ndarray
+    gradients: np.ndarray
+
+
+class SensorRanking(NamedTuple):
+    """Expected information of sensors; ``str`` is a table, `plot` a figure.
+
+    Errors are standard errors over the draws.
+
+    Attributes
+    ----------
+    candidates : tuple of str
+        The n candidates.
+    noise : (n,) float
+        Standard deviation of their noise [SI].
+    alone, alone_error : (n,) float
+        Expected information of each candidate, without the other candidates [nat].
+    chosen : tuple of str
+        The k sensors of the greedy choice, the best first.
+    gains, gain_errors : (k,) float
+        Information that each chosen sensor adds to those before it [nat].
+    information, information_errors : (k,) float
+        Information of the first sensors together [nat].
+    lead, lead_errors : (k,) float
+        What the next best candidate would have been worse by: information [nat], or share of the target's variance; NaN
+        where no candidate was left. A lead of less than two errors does not decide.
+    parameter_names : tuple of str
+        Names of the d parameters.
+    left : (k, d) float
+        Share of each parameter's standard deviation that is left with the first sensors [-], as a root mean square.
+    target_variance : float
+        Variance of the target before any candidate measures [SI²]; NaN without a target.
+    target_left, target_left_errors : (k,) float
+        Share of this variance that is left with the first sensors [-]; NaN without a target.
+    target_left_alone, target_left_alone_errors : (n,) float
+        The same with each candidate alone.
+    draws, failed, simulations : int
+        Draws that were used and draws that were left out because a simulation failed; simulations made.
+    """
+
+    candidates: tuple[str, ...]
+    noise: np.ndarray
+    alone: np.ndarray
+    alone_error: np.ndarray
+    chosen: tuple[str, ...]
+    gains: np.ndarray
+    gain_errors: np.ndarray
+    information: np.ndarray
+    information_errors: np.ndarray
+    lead: np.ndarray
+    lead_errors: np.ndarray
+    parameter_names: tuple[str, ...]
+    left: np.ndarray
+    target_variance: float
+    target_left: np.ndarray
+    target_left_errors: np.ndarray
+    target_left_alone: np.ndarray
+    target_left_alone_errors: np.ndarray
+    draws: int
+    failed: int
+    simulations: int
+
+    def __str__(self) -> str:
+        with_target = bool(np.isfinite(self.target_variance))
+        head = ["sensor", "alone [nat]", "gain [nat]", "together [nat]"]
+        head += ["variance left [%]", "lead [%]"] if with_target else ["lead [nat]"]
+        rows, scale = [head], 100.0 if with_target else 1.0
+        for k, name in enumerate(self.chosen):
+            i = self.candidates.index(name)
+            row = [name, _with_error(self.alone[i], self.alone_error[i])]
+            row += [_with_error(self.gains[k], self.gain_errors[k])]
+            row += [_with_error(self.information[k], self.information_errors[k])]
+            left = scale * self.target_left[k], scale * self.target_left_errors[k]
+            row += [_with_error(*left)] if with_target else []
+            rows.append([*row, _with_error(scale * self.lead[k], scale * self.lead_errors[k])])
+        left = ", ".join(
+            f"{name} {100.0 * share:.2g} %" for name, share in zip(self.parameter_names, self.left[-1], strict=True)
+        )
+        failed = f"; {self.failed} more were left out, because their simulation failed" if self.failed else ""
+        lines = [
+            f"{len(self.chosen)} of {len(self.candidates)} sensors, from derivatives at {self.draws} draws "
+            f"({self.simulations} simulations{failed})",
+            text_table(rows),
+            f"Standard deviations left with all of them: {left}",
+        ]
+        return "\n".join(lines)
+
+    def plot(self) -> "Figure":
+        """Draw the chosen sensors: information alone and added, and the share of the target's variance that is left."""
+        from ..plots.sensors import draw_ranking
+
+        return draw_ranking(self)
+
+
+def _with_error(value: float, error: float) -> str:
+    return number(value) if np.isnan(error) else f"{number(value)} ± {number(error, 2)}"
+
+
+def information_of(precision: np.ndarray, products: np.ndarray) -> np.ndarray:
+    """Information [nat] that measurements add to what is known.
+
+    Parameters
+    ----------
+    precision : (..., d, d) float
+        Precision of what is known already.
+    products : (..., d, d) float
+        Weighted products of derivatives J^T W J of the measurements.
+
+    Returns
+    -------
+    (...) float
+    """
+    return 0.5 * (np.linalg.slogdet(precision + products)[1] - np.linalg.slogdet(precision)[1])
+
+
+def variance_of(precision: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Variance (...) of a target with gradients (..., d) under a precision (..., d, d)."""
+    return np.einsum("...i,...i->...", gradients, np.linalg.solve(precision, gradients[..., None])[..., 0])
+
+
+def slopes_at(
+    model: Model,
+    prior: Prior,
+    coords: np.ndarray,
+    steps: np.ndarray,
+    target: Callable[[np.ndarray], Any] | None = None,
+    pool: Any = None,
+) -> Slopes:
+    """Derivatives of responses by forward differences, from d + 1 simulations for each point.
+
+    Parameters
+    ----------
+    model : Model
+    prior : Prior
+        Prior of its parameters, in their order.
+    coords, steps : (m, d) float
+        Standard normal coordinates, and steps of the differences.
+    target : callable, optional
+        Function of the response (n_channels, n_steps) [SI] that returns a number.
+    pool : object with ``map(function, items)``, optional
+        Runs the simulations.
+
+    Returns
+    -------
+    Slopes
+    """
+    m, d = coords.shape
+    n_channels, n_steps = len(model.channels), model.n_steps
+    products, squares = np.full((m, n_channels, d, d), np.nan), np.full((m, n_channels), np.nan)
+    gradients = np.full((m, d), np.nan)
+    unit = np.vstack([np.zeros(d), np.eye(d)])
+    points = prior.from_normal((coords[:, None] + unit * steps[:, None]).reshape(-1, d)).reshape(m, d + 1, d)
+    size = max(1, most_responses(model) // (d + 1))
+    for start in range(0, m, size):
+        part = points[start : start + size]
+        batch = simulate_batch(model, part.reshape(-1, d), pool)
+        responses = batch.response.reshape(len(part), d + 1, n_channels, n_steps)
+        for k, response in enumerate(responses, start):
+            if not np.isfinite(response).all():
+                continue
+            by = (response[1:] - response[0]) / steps[k][:, None, None]
+            products[k] = np.einsum("ict,jct->cij", by, by)
+            squares[k] = np.square(response[0]).mean(axis=1)
+            values = np.zeros(d + 1) if target is None else np.array([_number(target(each)) for each in response])
+            gradients[k] = (values[1:] - values[0]) / steps[k]
+    return Slopes(products, squares, gradients)
+
+
+def _number(value: Any) -> float:
+    if np.size(value) != 1:
+        raise ValueError(
+            f'target must be one number of the response, such as peak("top"); got an array of shape {np.shape(value)}'
+        )
+    return float(np.squeeze(value))
+
+
+def rank_sensors(
+    model: Model,
+    prior: Posterior | Prior | Mapping[str, Distribution],
+    candidates: Sequence[str] | None = None,
+    *,
+    target: ChannelQuantity | Callable[[np.ndarray], float] | None = None,
+    target_model: Model | None = None,
+    samples: Any = None,
+    installed: Sequence[str] = (),
+    n_sensors: int | None = None,
+    noise: float | Mapping[str, float] = SHARE,
+    effective_samples: float | Mapping[str, float] | None = None,
+    draws: int = 20,
+    step: float = STEP,
+    seed: int = 1,
+    pool: Any = None,
+) -> SensorRanking:
+    """Rank sensors by what they are expected to tell, before they measure.
+
+    Sensors are chosen one after the other: each time the candidate that adds most information to those chosen before,
+    or, with a target, leaves the smallest expected variance of the target. Without a target, the information of the
+    chosen set is at least 63 % of the best set's information (G. L. Nemhauser, L. A. Wolsey, M. L. Fisher (1978),
+    Mathematical Programming 14, 265-294, doi:10.1007/BF01588971).
+
+    Parameters
+    ----------
+    model : Model
+        One simulation gives the responses of all candidates, such as an `RCColumn` with ``outputs=``.
+    prior : Posterior, Prior, or mapping of parameter names to distributions
+        With at least the parameters of the model; others, such as the noise, are left out.
+    candidates : sequence of str, optional
+        Names of channels of the model. Default: all that are not installed.
+    target : ChannelQuantity or callable, optional
+        The number that the measurements shall tell: ``peak("displacement")``, or a function of the response
+        (n_channels, n_steps) [SI] of `target_model`.
+    target_model : Model, optional
+        A model with the same parameters, such as ``model.with_record(design)``. Default: the model.
+    samples : (n, d) or (n, ndim) array_like, or named values of shape (n,), optional
+        Samples of what is known already: structural parameters, or all parameters of the prior. Derivatives are taken
+        at some of them, and what is known is their covariance. Default: the prior.
+    installed : sequence of str
+        Channels of the model that measure in any case.
+    n_sensors : int, optional
+        Number of sensors to choose. Default: six, or all candidates if there are fewer.
+    noise : float or mapping of str to float
+        Standard deviation of the noise: a share of the channel's RMS over all draws, or values [SI] by the name of the
+        channel or the part of the name before the ``@``. Default: 5 % of the RMS, which makes all sensors equally
+        precise.
+    effective_samples : float or mapping of str to float, optional
+        Number of independent samples that a channel is worth, if errors are correlated in time
+        (`fe_likelihoods.effective_samples`), for all channels or by name as for `noise`. Default: all samples.
+    draws : int
+        Number m of draws. It takes m (d + 1) simulations of d parameters, and as many of a `target_model`.
+    step : float
+        Step of the differences, in standard deviations of what is known.
+    seed : int
+        Seed of the draws.
+    pool : object with ``map(function, items)``, optional
+        Runs the simulations.
+
+    Returns
+    -------
+    SensorRanking
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown, a noise level or a number is missing or not positive, the target is not one number, or
+        simulations of all draws but one fail.
+
+    Notes
+    -----
+    What the linearisation leaves out, and which noise is assumed, is in `fe_likelihoods.information.sensors`.
+
+    Examples
+    --------
+    >>> column = RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5", "strain@1.2:0.5"))
+    >>> print(rank_sensors(column, posterior, target=peak("displacement"), target_model=column.with_record(design)))
+    """
+    given = getattr(prior, "prior", prior)
+    given = given if isinstance(given, Prior) else Prior(given)
+    known = given.subset(model.parameter_names)
+    names = [channel.name for channel in model.channels]
+    if unknown := [name for name in (*(candidates or ()), *installed) if name not in names]:
+        raise ValueError(f"unknown channels {', '.join(unknown)}; the channels of the model are {', '.join(names)}")
+    candidates = [name for name in (names if candidates is None else candidates) if name not in installed]
+    if not candidates or len(set(candidates)) < len(candidates):
+        raise ValueError(f"candidates must be different channels that are not installed; got {candidates}")
+    n_sensors = min(6, len(candidates)) if n_sensors is None else n_sensors
+    if not (1 <= n_sensors <= len(candidates) and draws >= 2 and step > 0.0):
+        raise ValueError(
+            f"n_sensors must be from 1 to {len(candidates)}, draws at least 2, and step positive; got {n_sensors}, "
+            f"{draws} and {step}"
+        )
+    coords, precision = _draw(known, given, samples, draws, seed)
+    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
+    steps = step * sd * np.where(coords > 0.0, -1.0, 1.0)  # towards the median, where the prior has its parameters
+    function, other = None, model if target_model is None else target_model
+    if target is not None:
+        if tuple(other.parameter_names) != tuple(model.parameter_names):
+            raise ValueError(
+                f"target_model must have the parameters of the model, {', '.join(model.parameter_names)}; got "
+                f"{', '.join(other.parameter_names)}"
+            )
+        function = evaluator(target, other.channels, other.dt, other.n_steps).function
+        if function is None:
+            raise ValueError(f'target must be one number of the response, such as peak("top"); got {target!r}')
+    slopes = slopes_at(model, known, coords, steps, function if other is model else None, pool)
+    gradients, simulations = slopes.gradients, coords.size + draws
+    if function is not None and other is not model:
+        gradients = slopes_at(other, known, coords, steps, function, pool).gradients
+        simulations *= 2
+    good = np.isfinite(slopes.mean_squares).all(axis=1) & np.isfinite(gradients).all(axis=1)
+    if good.sum() < 2:
+        raise ValueError(
+            f"expected at least two draws whose {known.dim + 1} simulations all succeed; got {good.sum()} of {draws}: "
+            "narrow the prior, or see why simulations fail (rehearse)"
+        )
+    rms = np.sqrt(slopes.mean_squares[good].mean(axis=0))
+    levels = _noise_levels(noise, model.channels, rms)
+    weights = np.where(rms > 0.0, 1.0 / np.where(levels > 0.0, levels, np.inf) ** 2, 0.0)
+    if effective_samples is not None:
+        weights *= np.minimum(_by_channel(effective_samples, model.channels, "effective_samples") / model.n_steps, 1.0)
+    products = slopes.products[good] * weights[:, None, None]
+    start = precision + products[:, [names.index(name) for name in installed]].sum(axis=1)
+    places = [names.index(name) for name in candidates]
+    chosen = _choose(products[:, places], start, gradients[good], n_sensors, target is not None)
+    return chosen._replace(
+        candidates=tuple(candidates),
+        chosen=tuple(candidates[i] for i in chosen.chosen),
+        noise=levels[places],
+        parameter_names=known.names,
+        left=chosen.left / sd,
+        failed=int(draws - good.sum()),
+        simulations=simulations,
+    )
+
+
+def _draw(known: Prior, given: Prior, samples: Any, draws: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normal coordinates (draws, d) of draws, and the precision (d, d) of what is known in them."""
+    rng = np.random.default_rng(seed)
+    if samples is None:
+        return rng.standard_normal((draws, known.dim)), np.eye(known.dim)
+    names = given.names if isinstance(samples, Mapping) or np.shape(samples)[-1:] == (given.dim,) else known.names
+    if isinstance(samples, Mapping) and set(samples) == set(known.names):
+        names = known.names
+    rows = as_rows(samples, names)[:, [names.index(name) for name in known.names]]
+    fewest = max(FEWEST * known.dim, draws)
+    if len(rows) < fewest:
+        raise ValueError(
+            f"expected at least {fewest} samples, for {known.dim} parameters and {draws} draws; "
+            f"got {len(rows)}: give all samples of the run, sampler.get_chain(flat=True)"
+        )
+    coords = known.to_normal(rows)
+    coords = coords[np.isfinite(coords).all(axis=1)]
+    covariance = np.atleast_2d(np.cov(coords, rowvar=False))
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        raise ValueError(
+            "expected samples with a positive definite covariance, within the bounds of the prior; got samples that "
+            "do not differ: give all samples of the run, sampler.get_chain(flat=True)"
+        )
+    return coords[rng.choice(len(coords), draws, replace=False)], np.linalg.inv(covariance)
+
+
+def _by_channel(given: float | Mapping[str, float], channels: Sequence[Channel], what: str) -> np.ndarray:
+    """A positive number (n_channels,) for every channel, by its name or the part before the ``@``."""
+    names = [channel.name for channel in channels]
+    if isinstance(given, Mapping):
+        if unknown := set(given) - set(names) - {name.partition("@")[0] for name in names}:
+            raise ValueError(f"{what} has the unknown channels {', '.join(unknown)}; known are {', '.join(names)}")
+        values = [given.get(name, given.get(name.partition("@")[0], np.nan)) for name in names]
+    else:
+        values = [given] * len(names)
+    values = np.array(values, dtype=float)
+    if wrong := [name for name, value in zip(names, values, strict=True) if not value > 0.0]:
+        raise ValueError(f"{what} must be a positive number for every channel; give one for {', '.join(wrong)}")
+    return values
+
+
+def _noise_levels(noise: float | Mapping[str, float], channels: Sequence[Channel], rms: np.ndarray) -> np.ndarray:
+    """Standard deviation (n_channels,) of the noise [SI]; zero for a share of a channel without response."""
+    levels = _by_channel(noise, channels, "noise")
+    return levels if isinstance(noise, Mapping) else levels * rms
+
+
+def _mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over draws (m, ...) and its standard error."""
+    return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+
+
+def _ratio_and_error(values: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ratio of the means over draws of values (m, ...) to the mean of `whole` (m,), and its standard error."""
+    ratio = values.mean(axis=0) / whole.mean()
+    deviations = (values - np.multiply.outer(whole, ratio)) / whole.mean()
+    return ratio, deviations.std(axis=0, ddof=1) / np.sqrt(len(values))
+
+
+def _choose(
+    products: np.ndarray, start: np.ndarray, gradients: np.ndarray, n_sensors: int, by_target: bool
+) -> SensorRanking:
+    """Greedy choice from weighted products (m, n, d, d), a precision (m, d, d) and gradients (m, d) of the target.
+
+    `chosen` of the result are numbers of candidates, and its `left` are standard deviations of the coordinates.
+    """
+    n, before = products.shape[1], variance_of(start, gradients)
+    if by_target and not before.mean() > 0.0:
+        raise ValueError("expected a target that depends on the parameters; it does not change at any draw")
+    precision, rest, chosen = start, list(range(n)), []
+    alone, target_alone = (np.zeros(n), np.zeros(n)), (np.full(n, np.nan), np.full(n, np.nan))
+    gains, together, leads, left_of_target, left = [], [], [], [], []
+    for _ in range(n_sensors):
+        added = information_of(precision[:, None], products[:, rest])
+        variances = variance_of(precision[:, None] + products[:, rest], gradients[:, None])
+        if not chosen:
+            alone = _mean_and_error(added)
+            target_alone = _ratio_and_error(variances, before) if by_target else target_alone
+        value = -variances / before.mean() if by_target else added
+        order = np.argsort(-value.mean(axis=0), kind="stable")
+        best = int(order[0])
+        pair = value[:, best] - value[:, order[1]] if len(order) > 1 else np.full(len(value), np.nan)
+        leads.append(_mean_and_error(pair))
+        gains.append(_mean_and_error(added[:, best]))
+        left_of_target.append(_ratio_and_error(variances[:, best], before) if by_target else (np.nan, np.nan))
+        precision = precision + products[:, rest[best]]
+        chosen.append(rest.pop(best))
+        together.append(_mean_and_error(information_of(start, precision - start)))
+        left.append(np.sqrt(np.diagonal(np.linalg.inv(precision), axis1=1, axis2=2).mean(axis=0)))
+    (gain, gain_error), (total, total_error), (lead, lead_error), (share, share_error) = (
+        np.transpose(each) for each in (gains, together, leads, left_of_target)
+    )
+    return SensorRanking(
+        candidates=(),
+        noise=np.zeros(0),
+        alone=alone[0],
+        alone_error=alone[1],
+        chosen=tuple(chosen),
+        gains=gain,
+        gain_errors=gain_error,
+        information=total,
+        information_errors=total_error,
+        lead=lead,
+        lead_errors=lead_error,
+        parameter_names=(),
+        left=np.array(left),
+        target_variance=float(before.mean()) if by_target else np.nan,
+        target_left=share,
+        target_left_errors=share_error,
+        target_left_alone=target_alone[0],
+        target_left_alone_errors=target_alone[1],
+        draws=len(products),
+        failed=0,
+        simulations=0,
+    )

@@ -1,0 +1,209 @@
+"""Expected information of sensors: closed forms of linear models, repeated sensors, targets, and the column."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    LinearOscillator,
+    LogNormal,
+    Measurements,
+    Posterior,
+    Prior,
+    RCColumn,
+    SimulationFailed,
+    TruncatedNormal,
+    peak,
+    problems,
+    propagate,
+    rank_sensors,
+)
+from fe_likelihoods.information.sensors import slopes_at, variance_of
+from samplers import SMCSampler
+
+TIME = np.linspace(0.0, 1.0, 40)
+SHAPES = np.stack([np.sin(5.0 * TIME), np.cos(3.0 * TIME), np.ones(40)])
+MIXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.5, 0.0, 0.5], [1.0, 0.0, 0.0]])  # the last repeats the first
+NAMES = ("a", "b", "ac", "again")
+SDS = np.array([2.0, 0.5, 1.0])
+NOISE = dict(zip(NAMES, [0.5, 0.2, 0.4, 0.5], strict=True))
+PRIOR = Prior({name: norm(0.5, sd) for name, sd in zip("xyz", SDS, strict=True)})
+CHANNELS = tuple(Channel(name, "displacement", "mm") for name in NAMES)
+LINEAR = FunctionModel(lambda theta: MIXES @ (theta[:, None] * SHAPES), ("x", "y", "z"), CHANNELS, 0.02, 40)
+
+
+def products(name):
+    jacobian = MIXES[NAMES.index(name)][:, None] * SHAPES * SDS[:, None]
+    return jacobian @ jacobian.T / NOISE[name] ** 2
+
+
+def closed_form(*names):
+    """Information and posterior covariance of the coordinates."""
+    precision = np.eye(3) + sum(products(name) for name in names)
+    return 0.5 * np.linalg.slogdet(precision)[1], np.linalg.inv(precision)
+
+
+def test_a_linear_model_has_the_closed_form():
+    ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=3, n_sensors=4)
+    np.testing.assert_allclose(ranking.alone, [closed_form(name)[0] for name in NAMES], rtol=1e-6)
+    for k in range(4):
+        information, covariance = closed_form(*ranking.chosen[: k + 1])
+        np.testing.assert_allclose(ranking.information[k], information, rtol=1e-6)
+        np.testing.assert_allclose(ranking.left[k], np.sqrt(np.diag(covariance)), rtol=1e-6)
+    np.testing.assert_allclose(np.cumsum(ranking.gains), ranking.information, rtol=1e-6)
+    best_of_rest = sorted(closed_form(name)[0] for name in NAMES)[-2:]
+    np.testing.assert_allclose(ranking.lead[0], best_of_rest[1] - best_of_rest[0], rtol=1e-6)
+    assert np.isnan(ranking.lead[-1]) and ranking.simulations == 3 * 4 and ranking.failed == 0
+    assert np.abs(ranking.information_errors).max() < 1e-6  # derivatives are the same at all draws
+    assert "4 of 4 sensors, from derivatives at 3 draws (12 simulations)" in str(ranking)
+
+
+def test_a_sensor_that_repeats_another_is_worth_what_its_noise_averages():
+    """Two sensors with the same response are one sensor with half the noise variance."""
+    both = rank_sensors(LINEAR, PRIOR, ["again"], noise=NOISE, draws=2, installed=["a"])
+    averaged = rank_sensors(LINEAR, PRIOR, ["a"], noise=NOISE | {"a": 0.5 / np.sqrt(2.0)}, draws=2)
+    np.testing.assert_allclose(closed_form("a")[0] + both.gains[0], averaged.alone[0], rtol=1e-6)
+    assert rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, n_sensors=4).chosen[-1] in ("a", "again")
+
+
+def test_variance_of_a_target_has_the_closed_form():
+    """The target prefers a sensor that the information puts last."""
+    ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=3, target=lambda response: response[1].mean())
+    gradient = 0.3 * SDS[1] * SHAPES[1].mean() * np.eye(3)[1]
+    np.testing.assert_allclose(ranking.target_variance, gradient @ gradient, rtol=1e-6)
+    for k in range(4):
+        left = gradient @ closed_form(*ranking.chosen[: k + 1])[1] @ gradient
+        np.testing.assert_allclose(ranking.target_left[k], left / (gradient @ gradient), rtol=1e-6)
+    alone = [gradient @ closed_form(name)[1] @ gradient / (gradient @ gradient) for name in NAMES]
+    np.testing.assert_allclose(ranking.target_left_alone, alone, rtol=1e-6)
+    assert ranking.chosen[0] == "b"
+    assert rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, n_sensors=1).chosen != ("b",)
+
+
+def test_samples_are_what_is_known():
+    """A second test of the same sensors adds less, and as much as the closed form says."""
+    covariance = closed_form("a", "b")[1]
+    draws = 0.5 + SDS * np.random.default_rng(1).multivariate_normal(np.zeros(3), covariance, 20_000)
+    ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, samples=draws, draws=4)
+    after = [closed_form("a", "b", name)[0] - closed_form("a", "b")[0] for name in NAMES]
+    np.testing.assert_allclose(ranking.alone, after, rtol=0.05)
+    prior = Prior(PRIOR.distributions | {"sigma": LogNormal(1.0, 0.1)})
+    whole = np.column_stack([draws, np.ones(len(draws))])
+    np.testing.assert_array_equal(rank_sensors(LINEAR, prior, noise=NOISE, samples=whole, draws=4).alone, ranking.alone)
+
+
+def test_correlated_samples_and_shares_of_the_response():
+    few = rank_sensors(LINEAR, PRIOR, ["a"], noise=NOISE, draws=2, effective_samples=10.0)
+    wide = rank_sensors(LINEAR, PRIOR, ["a"], noise=NOISE | {"a": 1.0}, draws=2)
+    np.testing.assert_allclose(few.alone, wide.alone, rtol=1e-6)  # 10 of 40 samples: twice the noise
+    share = rank_sensors(LINEAR, PRIOR, ["a"], noise=0.1, draws=50)
+    rms = np.sqrt((0.5**2 + SDS[0] ** 2) * np.mean(SHAPES[0] ** 2))
+    assert abs(share.noise[0] / (0.1 * rms) - 1.0) < 4.0 / np.sqrt(100)
+
+
+def test_standard_errors_cover_another_set_of_draws():
+    """Of a model whose derivatives vary, with failures left out."""
+
+    def respond(theta):
+        if theta[0] > 2.5:
+            raise SimulationFailed("too large")
+        return np.stack([np.exp(0.5 * theta[0]) * SHAPES[0], theta[0] ** 2 * SHAPES[1]])
+
+    model = FunctionModel(respond, ("x",), CHANNELS[:2], 0.02, 40)
+    prior = {"x": norm(1.0, 1.0)}
+    noise = {"a": 0.1, "b": 0.1}
+    first, second = (rank_sensors(model, prior, noise=noise, draws=200, seed=seed) for seed in (1, 2))
+    error = np.hypot(first.alone_error, second.alone_error)
+    assert (np.abs(first.alone - second.alone) < 4.0 * error).all() and (error > 0.01).all()
+    assert 0 < first.failed < 40 and f"{first.failed} more were left out" in str(first)
+
+
+@pytest.mark.slow
+def test_the_variance_left_of_a_drift_is_what_guided_runs_obtain():
+    """Of the peak under a stronger motion, after five synthetic tests of an oscillator."""
+    motion = problems.table_motion().trim(0.0, 6.0).resample(0.02)
+    model = LinearOscillator(motion, 0.5)
+    design = model.with_record(motion.scale(2.0).trim(0.5, 5.0))
+    prior = Prior({"stiffness": TruncatedNormal(1.0, 0.2), "damping": TruncatedNormal(1.0, 0.3)})
+    sd = 0.2 * model.simulate(np.ones(2)).std(axis=1)
+    noise = dict(zip(("acceleration", "displacement"), sd, strict=True))
+    coords = np.random.default_rng(3).standard_normal((5, 2))
+    target = peak("displacement")
+
+    def largest(response):
+        return np.abs(response[1]).max()
+
+    steps = np.full((5, 2), -0.05)
+    slopes = slopes_at(model, prior, coords, steps)
+    gradients = slopes_at(design, prior, coords, steps, largest).gradients
+    precision = np.eye(2) + np.einsum("mcij,c->mij", slopes.products, 1.0 / sd**2)
+    predicted, obtained = variance_of(precision, gradients), []
+    for k, theta in enumerate(prior.from_normal(coords)):
+        errors = sd[:, None] * np.random.default_rng(k).standard_normal((2, model.n_steps))
+        measured = Measurements(model.channels, model.dt, model.simulate(theta) + errors)
+        known = {f"sigma_{name}": LogNormal(value, 1e-3) for name, value in noise.items()}
+        likelihood = FELikelihood(model, measured, GaussianNoise(model.channels))
+        posterior = Posterior(likelihood, prior.distributions | known)
+        sampler = SMCSampler(200, 4, posterior, vectorize=True, seed=k, guide=posterior.guide())
+        sampler.run_mcmc(None, 2)
+        samples = sampler.get_chain(flat=True)[:, :2]
+        obtained.append(propagate(design, samples, quantity=target, progress=False).sd ** 2)
+    ratio = np.array(obtained) / predicted
+    assert np.abs(np.log(ratio)).max() < np.log(1.4), ratio
+    ranking = rank_sensors(model, prior, noise=noise, target=target, target_model=design, draws=40)
+    assert ranking.target_left[-1] < 0.2
+
+
+def test_strains_of_the_column_near_the_base_are_ranked_before_mid_height():
+    record = problems.bridge_column_data("short").record.trim(3.0, 5.0)
+    bar = RCColumn.lhpost(record).bar_circle_radius
+    heights = (0.2, 1.8, 3.6)
+    column = RCColumn.lhpost(record, outputs=tuple(f"strain@{height}:{bar}" for height in heights))
+    prior = {name: TruncatedNormal(1.0, 0.2) for name in column.parameter_names}
+    ranking = rank_sensors(column, prior, noise={"strain": 5e-5}, effective_samples=50.0, draws=3)
+    assert ranking.chosen[0].startswith("strain@0.2:") and (np.diff(ranking.alone) < 0.0).all()
+    assert ranking.lead[0] > 2.0 * ranking.lead_errors[0]
+
+
+def test_the_figure_has_the_chosen_sensors():
+    import matplotlib.pyplot as plt
+
+    ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, target=lambda response: response[1].mean())
+    figure = ranking.plot()
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == list(ranking.chosen)
+    assert figure.axes[1].get_xlabel() == "variance of the target that is left [%]"
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"candidates": ["q"]}, "unknown channels q; the channels of the model are a, b, ac, again"),
+        ({"candidates": ["a", "a"]}, "candidates must be different channels"),
+        ({"noise": {"a": 0.1}}, "noise must be a positive number for every channel; give one for b, ac, again"),
+        ({"noise": {"q": 0.1}}, "noise has the unknown channels q"),
+        ({"noise": 0.0}, "noise must be a positive number"),
+        ({"draws": 1}, "draws at least 2"),
+        ({"target": "a"}, "target must be one number of the response"),
+        ({"target": lambda response: response[0]}, "target must be one number of the response"),
+        ({"target": lambda response: 1.0}, "a target that depends on the parameters"),
+        ({"samples": np.ones((5, 3))}, "at least 30 samples, for 3 parameters"),
+        ({"samples": np.ones((50, 3))}, "samples that do not differ"),
+    ],
+)
+def test_errors_say_what_to_do(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        rank_sensors(LINEAR, PRIOR, **{"noise": NOISE, "draws": 2} | arguments)
+
+
+def test_all_draws_fail():
+    def fail(theta):
+        raise SimulationFailed("no")
+
+    model = FunctionModel(fail, ("x",), CHANNELS[:1], 0.02, 40)
+    with pytest.raises(ValueError, match="got 0 of 2: narrow the prior"):
+        rank_sensors(model, {"x": norm(0.0, 1.0)}, draws=2)
