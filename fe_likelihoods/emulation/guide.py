@@ -160,12 +160,21 @@ class ResponseGuide:
     @property
     def concerns(self) -> tuple[str, ...]:
         """Why parts of the posterior may be missing."""
-        return (*self._concerns, *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN), *self._of_few_ends(_TOO_FEW, np.inf))
+        return (
+            *self._concerns,
+            *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN),
+            *self._of_few_ends(self._too_few, np.inf),
+        )
 
     @property
     def refusals(self) -> tuple[str, ...]:
         """Why parts of the posterior are probably missing."""
-        return (*self._of_unseen_modes(_MOST_UNSEEN, np.inf), *self._of_few_ends(1, _TOO_FEW))
+        return (*self._of_unseen_modes(_MOST_UNSEEN, np.inf), *self._of_few_ends(1, self._too_few))
+
+    @property
+    def _too_few(self) -> int:
+        """Ends below which a result is refused; on a growing record, most starts are given up on its first part."""
+        return 1 if hasattr(self._target.model, "first") else _TOO_FEW
 
     def _of_few_ends(self, least: int, below: float) -> tuple[str, ...]:
         """A sentence on a ridge to which less than half of the starts led, at least `least` and fewer than `below`."""

@@ -127,7 +127,7 @@ def test_two_straight_ridges_are_two_modes(difference):
     measured = Measurements(channels, 0.02, model.simulate(np.array([difference, 0.0])) + noise)
     prior = {"a": TruncatedNormal(0.0, 1.0, -np.inf), "b": TruncatedNormal(0.0, 1.0, -np.inf)}
     posterior = Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.2)})
-    for seed in range(10):
+    for seed in range(6):
         ends = [mode.parameters[0] - mode.parameters[1] for mode in find_modes(posterior, seed=seed).modes]
         assert sorted(ends) == pytest.approx([-difference, difference], abs=0.05)
 
