@@ -38,6 +38,7 @@ _IN_MODULES = {
     "emulation.modes": "Mode ModeSearch find_modes",
     "events.stiffness_loss": "StiffnessLoss",
     "information.identifiability": "Combination Identifiability",
+    "information.sensitivity": "Sensitivity",
     "information.sensors": "SensorRanking",
     "likelihood.block_likelihood": "BlockLogLikelihood",
     "likelihood.failures": "TooManyFailures",

@@ -9,6 +9,7 @@ from .events.ratios import EventRatios
 from .events.stiffness_loss import stiffness_loss
 from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
+from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
@@ -159,6 +160,7 @@ __all__ = [
     "residual_checks",
     "rms",
     "rrmse",
+    "sensitivity",
     "share_within",
     "stiffness_loss",
     "to_si",

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import minimize
 
-__all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict"]
+__all__ = ["GaussianProcess", "fit_process", "left_out_errors", "predict", "predict_mean"]
 
 _NUGGETS = 10.0 ** np.array([-9.0, -7.0, -5.0, -3.0, -1.0, 1.0])
 _LOG_SCALES = -2.0, 4.0  # bounds of the logarithms of the length scales, in units of the inputs
@@ -168,6 +168,11 @@ def predict(process: GaussianProcess, inputs: np.ndarray) -> tuple[np.ndarray, n
         unknown = (gap * cho_solve(gram, gap.T).T).sum(axis=1)
         variance[:, members] = np.maximum(1.0 - explained + unknown, 0.0)[:, None] + nugget
     return mean, variance * process.variances
+
+
+def predict_mean(process: GaussianProcess, inputs: np.ndarray) -> np.ndarray:
+    """Mean (n, k) of the outputs at inputs (n, d), without the variance, which takes most of the time of `predict`."""
+    return _basis(inputs) @ process.linear + _covariance(inputs, process.inputs, process.log_scales) @ process.weights
 
 
 def left_out_errors(process: GaussianProcess) -> tuple[np.ndarray, np.ndarray]:

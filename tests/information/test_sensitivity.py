@@ -1,0 +1,91 @@
+"""Sobol indices by an emulator: the Ishigami function and a g-function, whose indices are known."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from fe_likelihoods import Channel, FunctionModel, MultivariateNormal, SimulationFailed, Uniform, peak, sensitivity
+
+TOP = (Channel("top", "displacement", "m"),)
+
+
+def model_of(function, d):
+    """A model whose response is a number at both of its samples."""
+    names = [f"x{i + 1}" for i in range(d)]
+    return FunctionModel(lambda theta: np.full((1, 2), function(theta)), names, TOP, 1.0, 2)
+
+
+def first(response):
+    return response[0, 0]
+
+
+def check(found, first_order, total):
+    """Within four standard errors, which are small."""
+    assert (np.abs(found.first[0] - first_order) < 4.0 * found.first_error[0] + 0.005).all(), str(found)
+    assert (np.abs(found.total[0] - total) < 4.0 * found.total_error[0] + 0.005).all(), str(found)
+    assert max(found.first_error.max(), found.total_error.max()) < 0.06, str(found)
+
+
+def test_ishigami():
+    """T. Ishigami, T. Homma (1990), ISUMA, 398-403."""
+    a, b = 7.0, 0.1
+    model = model_of(lambda x: np.sin(x[0]) + a * np.sin(x[1]) ** 2 + b * x[2] ** 4 * np.sin(x[0]), 3)
+    prior = {name: Uniform(-np.pi, np.pi) for name in model.parameter_names}
+    found = sensitivity(model, prior, first, simulations=200)
+    alone = np.array([0.5 * (1.0 + b * np.pi**4 / 5.0) ** 2, a**2 / 8.0, 0.0])
+    both = 8.0 * b**2 * np.pi**8 / 225.0
+    variance = alone.sum() + both
+    check(found, alone / variance, (alone + [both, 0.0, both]) / variance)
+    assert found.unexplained[0] < 0.1 and found.simulations == 200
+    assert abs(found.sd[0] ** 2 / variance - 1.0) < 0.3
+
+
+def test_few_simulations_have_errors_that_say_so():
+    """Left-out runs show what the spread of the emulator alone does not: it misses the interaction."""
+    model = model_of(lambda x: np.sin(x[0]) + 7.0 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0]), 3)
+    found = sensitivity(model, {name: Uniform(-np.pi, np.pi) for name in model.parameter_names}, first, simulations=60)
+    exact = np.array([[0.3139, 0.4424, 0.0], [0.5576, 0.4424, 0.2437]])
+    z = np.array(
+        [(found.first[0] - exact[0]) / found.first_error[0], (found.total[0] - exact[1]) / found.total_error[0]]
+    )
+    assert np.abs(z).max() < 3.0 and found.unexplained[0] > 0.1 and "The emulator is rough" in str(found)
+
+
+def test_g_function_and_several_numbers():
+    """With kinks, which the emulator smooths; A. Saltelli et al. (2010), equation 30."""
+    a = np.array([1.0, 4.5, 9.0])
+    model = model_of(lambda x: np.prod((np.abs(4.0 * x - 2.0) + a) / (1.0 + a)), 3)
+    prior = {name: Uniform(0.0, 1.0) for name in model.parameter_names}
+    found = sensitivity(model, prior, lambda response: [response[0, 0], 3.0 * response[0, 0] + 1.0], simulations=200)
+    parts = 1.0 / 3.0 / (1.0 + a) ** 2
+    variance = np.prod(1.0 + parts) - 1.0
+    total = parts * np.prod(1.0 + parts) / (1.0 + parts) / variance
+    check(found, parts / variance, total)
+    np.testing.assert_allclose(found.first[1], found.first[0], rtol=1e-6)
+    assert "first 2" in str(found)
+
+
+def test_control_noise_is_not_explained():
+    random = np.random.default_rng(1)
+    model = model_of(lambda x: x[0] + 3.0 * random.standard_normal(), 2)
+    found = sensitivity(model, {"x1": norm(0.0, 1.0), "x2": norm(0.0, 1.0)}, first, simulations=60)
+    assert found.unexplained[0] > 0.5 and "The emulator is rough" in str(found)
+
+
+def test_failures_and_errors():
+    def fail(x):
+        if x[0] > 1.0:
+            raise SimulationFailed("no")
+        return x[0] + x[1]
+
+    prior = {"x1": norm(0.0, 1.0), "x2": norm(0.0, 1.0)}
+    found = sensitivity(model_of(fail, 2), prior, peak("top"), simulations=40)
+    assert found.failed == 6  # of the upper 16 %
+    with pytest.raises(ValueError, match="at least 20 simulations for 2 parameters; got 5"):
+        sensitivity(model_of(fail, 2), prior, first, simulations=5)
+    with pytest.raises(ValueError, match="numbers of the response"):
+        sensitivity(model_of(fail, 2), prior, "top")
+    with pytest.raises(ValueError, match="quantities that vary"):
+        sensitivity(model_of(lambda x: 1.0, 2), prior, first, simulations=20)
+    with pytest.raises(ValueError, match="x1, x2 have a joint prior"):
+        sensitivity(model_of(fail, 2), {("x1", "x2"): MultivariateNormal([0.0, 0.0], np.eye(2))}, first)
