@@ -69,8 +69,8 @@ class Sensitivity(NamedTuple):
             text = f" {k + 1}" if len(self.mean) > 1 else ""
             rows[0] += [f"first{text}", f"total{text}"]
             for i, row in enumerate(rows[1:]):
-                row += [f"{self.first[k, i]:.2f} ± {self.first_error[k, i]:.2f}"]
-                row += [f"{self.total[k, i]:.2f} ± {self.total_error[k, i]:.2f}"]
+                row += [f"{max(self.first[k, i], 0.0):.2f} ± {self.first_error[k, i]:.2f}"]
+                row += [f"{max(self.total[k, i], 0.0):.2f} ± {self.total_error[k, i]:.2f}"]
         shares = ", ".join(f"{number(100.0 * share, 2)} %" for share in self.unexplained)
         lines = [text_table(rows), f"From {self.simulations} simulations; the emulator leaves {shares} unexplained."]
         if (self.unexplained > LARGE_ERROR).any():

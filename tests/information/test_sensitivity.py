@@ -37,6 +37,7 @@ def test_ishigami():
     variance = alone.sum() + both
     check(found, alone / variance, (alone + [both, 0.0, both]) / variance)
     assert found.unexplained[0] < 0.1 and found.simulations == 200
+    assert "-0.0" not in str(found)
     assert abs(found.sd[0] ** 2 / variance - 1.0) < 0.3
 
 
