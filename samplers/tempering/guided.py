@@ -64,10 +64,12 @@ FEWEST_DRAWS = 25
 # weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.
 RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
 SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
-# Largest number of rounds.
-MOST_ROUNDS = 20
+# Largest number of rounds, and the number after which enough effective draws suffice: the response is rough then.
+MOST_ROUNDS, PATIENT_ROUNDS = 20, 8
 # Rounds are left out if more than this share of the guide's latest known density was hardly reached by theirs.
 LARGEST_UNREACHED = 0.03
+# They are left out so often at most: known densities of a rough response differ by as much from round to round.
+MOST_LEFT_OUT = 3
 # The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
 # size below 1.5: a round of few draws has an effective share of at least one over their number.
 HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
@@ -76,6 +78,10 @@ FIRST_TOGETHER = 8
 UNREACHED = (
     "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
     "and standard deviations may be too small. Use a larger limit of simulations"
+)
+UNSETTLED = (
+    "the density that the guide emulates has changed from round to round, in a part of it by more than a factor of "
+    "1000: the response is rough, or the posterior is larger than its draws. Compare with a run of another seed"
 )
 LIGHT_TAILS = (
     "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
@@ -291,7 +297,7 @@ def draw_rounds(
     """
     guide, session, budget = guidance
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
-    made, last = 0, None
+    made, last, left_out = 0, None, 0
     rounds: list[Round] = []  # those whose draws reach all of the posterior that the guide knows
     batches: list[Batch] = []  # of which draws are running
     lessons: list[Batch] = []  # of which the guide has not learned from all draws
@@ -344,9 +350,11 @@ def draw_rounds(
         for _ in guide.refine(points, log_prob, session) if len(points) > 0 else ():
             yield tick(f"after round {made}", True)
         reaching = [each for each in rounds if _reaches(each, guide.known_density)]
-        if len(reaching) < len(rounds):
+        if len(reaching) < len(rounds) and left_out < MOST_LEFT_OUT:
             logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)
-            rounds, outcome = reaching, None
+            rounds, outcome, left_out = reaching, None, left_out + 1
+        elif len(reaching) < len(rounds) and outcome is not None:
+            outcome = outcome._replace(shortfall=outcome.shortfall or UNSETTLED)
         if outcome is not None:
             return outcome
         if budget.refused:
@@ -379,11 +387,11 @@ def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int, made: int
         return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
     if reason := _impossible(rounds) or _hopeless(rounds):
         return RoundsOfGuide(reason, "", pooled, last)
-    if made < MOST_ROUNDS:
+    usable = enough and last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
+    if made < (PATIENT_ROUNDS if usable and _even(pooled) else MOST_ROUNDS):
         return None
-    shortfall = _describe(last, pooled)
-    usable = last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
-    return RoundsOfGuide("" if enough and usable else shortfall, shortfall, pooled, last)
+    shortfall = _describe(last, pooled, made)
+    return RoundsOfGuide("" if usable else shortfall, shortfall, pooled, last)
 
 
 def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide, made: int) -> bool:
@@ -450,10 +458,10 @@ def _hopeless(rounds: Sequence[Round]) -> str:
     return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
 
 
-def _describe(last: Round, pooled: PooledRounds) -> str:
+def _describe(last: Round, pooled: PooledRounds, made: int) -> str:
     """Text on what the rounds have reached, and what is missing."""
     return (
-        f"after {MOST_ROUNDS} rounds, the effective sample size of fresh draws is "
+        f"after {made} rounds, the effective sample size of fresh draws is "
         f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and the "
         f"effective sample size of all draws is {pooled.effective_sample_size:.0f} with a shape of "
         f"{pooled.pareto_shape:.2g} (a share of at least {100 * RELIABLE_SHARE:g} %, as many effective draws as "
