@@ -125,6 +125,13 @@ def _say_simulation(
             "check [model] and [priors]"
         )
     rehearsal = rehearse(posterior, {event.name: event.record for event in events}, progress=progress)
+    report = posterior.report()
+    if report["failure_count"]:
+        often, count = max(report["failure_reasons"].items(), key=lambda each: each[1])
+        say(
+            f"CAUTION: {report['failure_count']} of the simulations of this check failed, {count} of them: {often}. A "
+            "failed simulation counts as impossible: mend the model where its parameters are plausible"
+        )
     response = likelihood.simulate(mean[None, :n]).response[0]
     errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))

@@ -192,8 +192,10 @@ class ResponseGuide:
         unseen = 0.0 if self.search is None else unseen_share(self.search)
         if not least < unseen <= most:
             return ()
+        n = len(self.search.modes)
+        reached = f"{n} modes, to some of them only once" if n > 1 else "one mode, to which only one of them led"
         return (
-            f"{len(self.search.ends)} starts led to {len(self.search.modes)} modes, to some of them only once, so "
+            f"{len(self.search.ends)} starts led to {reached}, so "
             f"about {100.0 * unseen:.0f} % of further starts would lead to modes that were not found: use more starts, "
             "or a larger limit of simulations",
         )

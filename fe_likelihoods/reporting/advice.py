@@ -9,10 +9,10 @@ from ..cache.simulation_cache import SimulationCache
 from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..text_tables import listed
-from .discretisation import find_discretisation_error, simulations_of_the_test
 from .failures import Failures, failures
 from .fit_gate import fit_gate
 from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
+from .model_checks import find_discretisation_error, find_unread_motion, simulations_of_the_test
 from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
 from .table import ParameterRow, parameter_rows
 
@@ -100,45 +100,58 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
 def judge_run(run: FinishedRun) -> JudgedRun:
     """Judge a run; simulates the points that `check_result` names, where they are not cached."""
     rows, fits = parameter_rows(run), fit_data_sets(run)
-    coarse, made = discretisation_of(run)
+    of_model, made = check_model(run)
     failed = failures(run)  # those of the fits included
     fits = fits._replace(simulations=fits.simulations + made)
-    return JudgedRun(rows, fits, failed, advise(run, rows, fits, failed, coarse))
+    return JudgedRun(rows, fits, failed, advise(run, rows, fits, failed, of_model))
 
 
-def discretisation_of(run: FinishedRun) -> tuple[list[Finding], int]:
-    """The error of step and mesh at the centre of the samples, and the number of simulations that it took.
+def check_model(run: FinishedRun) -> tuple[list[Finding], int]:
+    """Whether the model reads its motion, and the error of step and mesh, at the centre of the samples.
 
-    The derivatives take one simulation per parameter. Where these are more than a twentieth of the run's simulations
-    and take longer than ten seconds, nothing is simulated, and a remark says so.
+    Returns the findings, and the number of simulations that they took. The derivatives take one simulation for each
+    parameter. Where these are more than a twentieth of the run's simulations and take longer than ten seconds, they are
+    left out, and a remark says so.
     """
-    if run.likelihood is None or run.prior is None or run.is_inconclusive:
+    if run.likelihood is None or run.prior is None:
         return [], 0
+    known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
+    before, others = run.likelihood.simulations, 0
+
+    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
+        nonlocal others
+        if model.fingerprint in known:
+            return known[model.fingerprint].simulate(points)
+        others += len(points)
+        return simulate_batch(model, points)
+
+    found: list[Finding] = []
+    for likelihood, columns in run.likelihood.parts():
+        theta = run.centre[columns][: len(likelihood.model.parameter_names)]
+        batch = likelihood.simulate(theta[None])
+        if not batch.reasons[0]:
+            unread = find_unread_motion(likelihood.model, theta, batch.response[0], simulate)
+            found += [each for each in unread if each.weight == WRONG]  # failures are said where they are predicted
+    if not found and not run.is_inconclusive:
+        found = _of_discretisation(run, simulate)
+    return found, run.likelihood.simulations - before + others
+
+
+def _of_discretisation(run: FinishedRun, simulate: Any) -> list[Finding]:
+    action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
     if run.n_modes > 1:
         text = "The samples have several modes, which have no common standard deviation."
-        return [Finding("Step and mesh were not tested", REMARK, text, "Halve them, and run again.")], 0
+        return [Finding("Step and mesh were not tested", REMARK, text, "Halve them, and run again.")]
     needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
     seconds = report["seconds"] / max(report["simulations"], 1)
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
         text = f"The test takes {needed} simulations of {seconds:.2g} s."
-        action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
-        return [Finding("Step and mesh were not tested", REMARK, text, action)], 0
-    known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
-    before, finer = run.likelihood.simulations, 0
-
-    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
-        nonlocal finer
-        if model.fingerprint in known:
-            return known[model.fingerprint].simulate(points)
-        finer += len(points)
-        return simulate_batch(model, points)
-
-    found = find_discretisation_error(run.posterior, run.centre, run.samples.std(axis=0), simulate)
-    return found, run.likelihood.simulations - before + finer
+        return [Finding("Step and mesh were not tested", REMARK, text, action)]
+    return find_discretisation_error(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
 
 def advise(
-    run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures, coarse: Sequence[Finding] = ()
+    run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures, of_model: Sequence[Finding] = ()
 ) -> Judgement:
     """The judgement of a run, with all that a reader has to know.
 
@@ -150,8 +163,8 @@ def advise(
     rows : list of ParameterRow
     fits : Fits
     failed : Failures
-    coarse : sequence of Finding
-        About step and mesh.
+    of_model : sequence of Finding
+        About its motion, step and mesh.
     """
     found = [
         *_of_the_verdict(run),
@@ -162,11 +175,11 @@ def advise(
             for text in fits.failures
         ),
         *fit_gate(fits.compared, () if run.is_inconclusive else rows),
-        *coarse,
+        *of_model,
         *_of_the_model(run),
         *_of_the_data(fits),
     ]
-    if not run.is_inconclusive:
+    if not run.is_inconclusive and all(each.weight != WRONG for each in found):  # a fault explains the residuals
         found += _of_the_noise(fits)
     return judge(found)
 
@@ -190,6 +203,8 @@ def _of_the_verdict(run: FinishedRun) -> list[Finding]:
             f"At least about {more:.0f} more simulations are needed, possibly several times as many: raise "
             "max_simulations and run again."
         )
+    if severe and run.likelihood is not None:
+        action += " Steps that are too coarse make a response rough and sampling hard: `check` (rehearse) tests them."
     reasons = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
     return [Finding(title, WRONG if severe else CARE, reasons, action)]
 
@@ -199,7 +214,10 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Finding]:
     if not run.tempered:
         found += _of_a_markov_chain(run)
     if not size >= FEW_SAMPLES:
-        text = f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough."
+        text = (
+            f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough, and "
+            f"standard deviations have an error of about {100.0 / np.sqrt(2.0 * max(size, 1.0)):.0f} %."
+        )
         if not np.isfinite(size):
             text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
         found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
@@ -207,7 +225,7 @@ def _of_the_chain(run: FinishedRun, rows: list[ParameterRow]) -> list[Finding]:
     if rough and size >= FEW_SAMPLES:
         text = f"The error of the mean exceeds a fifth of the standard deviation for {', '.join(rough)}."
         found.append(Finding("Rough means", CARE, text, "Make more iterations, or use more walkers."))
-    if run.n_modes > 1:
+    if run.n_modes > 1 and not run.is_inconclusive:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = (
             f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "

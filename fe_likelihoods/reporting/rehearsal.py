@@ -26,13 +26,20 @@ from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..units import from_si
-from .discretisation import find_discretisation_error, motions_to_replace, under
 from .fit_gate import Compared, compare, draws_to_compare, fit_gate
+from .model_checks import (
+    NOTHING,
+    UNREAD,
+    find_discretisation_error,
+    find_unread_motion,
+    motions_to_replace,
+    relative_difference,
+    under,
+)
 
 __all__ = ["Rehearsal", "refuse_chance", "rehearse"]
 
 EQUAL = 1e-9  # difference of two responses, relative to their norm, up to which they are the same
-NOTHING = 1e-6  # the same, of responses to a motion and to twice this motion
 LATE_SHARE = 0.05  # of a motion, by which it is shifted
 SECONDS = 60.0  # of the search for the best fit
 MOST_SEARCHED = 150  # simulations of this search
@@ -153,7 +160,9 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
         if single and not any(each.weight == WRONG for each in found):
             refined, searched, told = _at_best_fit(stage, posterior, seconds)
             found += refined
-        found += fit_gate(compared)
+        of_fit = fit_gate(compared)
+        told = None if of_fit else told  # what the data tell is not known where they are wrong or out of reach
+        found += of_fit
         simulations = stage.made + _made(posterior) - before
     return Rehearsal(by_weight(found), simulations, seconds, searched, told)
 
@@ -191,11 +200,6 @@ def _announced(posterior: Posterior, bar: tqdm) -> Any:
         posterior.when_simulated(None)
 
 
-def _relative(difference: np.ndarray, reference: np.ndarray) -> float:
-    norm = float(np.linalg.norm(reference))
-    return float(np.linalg.norm(difference)) / norm if norm > 0.0 else float(np.any(difference))
-
-
 def _of_chance(response: np.ndarray, again: np.ndarray | None, reason: str) -> list[Finding]:
     """Whether a second simulation of the same parameters gives the same response."""
     action = (
@@ -204,7 +208,7 @@ def _of_chance(response: np.ndarray, again: np.ndarray | None, reason: str) -> l
     if again is None:
         text = f"The first simulation at the mean of the prior succeeded, the second one failed: {reason}."
         return [Finding("The model is not repeatable", WRONG, text, action)]
-    share = _relative(again - response, response)
+    share = relative_difference(again - response, response)
     if share <= EQUAL:
         return []
     text = (
@@ -227,15 +231,9 @@ def _of_motions(
     motions = motions_to_replace(model)
     if not motions:
         return []
-    unread = "Check that the model reads the motion that it is given, and not one file that is always the same."
-    strong, reason = stage.run(under(model, lambda each: each.scale(2.0)), theta)
-    if strong is not None and _relative(strong - response, response) <= NOTHING:
-        text = "Twice the base motion gives the same response: the model does not use the motion that it is given."
-        return [Finding("The motion changes nothing", WRONG, f"{text} Predictions of other events repeat it.", unread)]
-    found = []
-    if strong is None:
-        text = f"Under twice the base motion the simulation at the mean of the prior fails: {reason}."
-        found.append(Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well."))
+    found = find_unread_motion(model, theta, response, stage.simulate)
+    if any(each.weight == WRONG for each in found):
+        return found
     dt = motions[0].dt
     every = max(1, round(model.dt / dt))
     steps = every * max(1, round(LATE_SHARE * motions[0].n_steps / every))
@@ -243,14 +241,14 @@ def _of_motions(
         late, _ = stage.run(under(model, lambda each: _later(each, steps)), theta)
         k = steps // every
         if late is not None and late.shape == response.shape and k < response.shape[1]:
-            moved = _relative(late[:, k:] - response[:, :-k], response[:, :-k])
-            stayed = _relative(late - response, response)
+            moved = relative_difference(late[:, k:] - response[:, :-k], response[:, :-k])
+            stayed = relative_difference(late - response, response)
             if moved > stayed:
                 text = (
                     f"Under a motion that begins {steps * dt:.3g} s later, the response does not move with it "
                     f"(difference {100.0 * moved:.2g} %, and {100.0 * stayed:.2g} % to the response that stays)."
                 )
-                found.append(Finding("The response does not follow the motion", WRONG, text, unread))
+                found.append(Finding("The response does not follow the motion", WRONG, text, UNREAD))
     for name, record in events.items():
         other = model.with_record(record)
         result, reason = stage.run(other, theta)
@@ -259,10 +257,10 @@ def _of_motions(
             found.append(Finding("An event fails", CARE, text, "Check its motion and the steps of the model."))
             continue
         n = min(result.shape[1], response.shape[1])
-        same = _relative(result[:, :n] - response[:, :n], response[:, :n]) <= NOTHING
+        same = relative_difference(result[:, :n] - response[:, :n], response[:, :n]) <= NOTHING
         if same and other.fingerprint != model.fingerprint:
             text = f"Event {name} gives the same response as the motion of the calibration."
-            found.append(Finding("An event changes nothing", WRONG, text, unread))
+            found.append(Finding("An event changes nothing", WRONG, text, UNREAD))
         break  # one event suffices: they are all read in the same way
     return found
 
@@ -305,6 +303,8 @@ def _at_best_fit(
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
     found = find_discretisation_error(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)
+    if not mode.converged:  # neither shares nor the cost of a search are known
+        return found, np.nan, None
     told = None
     with suppress(ValueError):  # a parameter that its prior does not let vary there
         told = of_mode(target.posterior, mode)

@@ -42,7 +42,7 @@ _MOST_FAULTS = 4
 # share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
 _SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
 _SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-_EQUALLY_NEAR = 0.01  # difference of logarithms of ratios that are named together
+_EQUALLY_NEAR, _NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
 
 
 class Finding(NamedTuple):
@@ -198,11 +198,13 @@ def describe_unit(factor: float, dimension: str) -> str:
         {names: value for names, value in ratios.items() if bases & set(names.split(" and "))}
         for ratios in (own, motion)
     )
-    for ratios in (firsts, own | of_motion):
+    if dimension != "acceleration":
+        own |= {f"{names} of the base motion": value for names, value in of_motion.items()}
+    for ratios, near in ((firsts, _EQUALLY_NEAR), (own, _NEAR_ENOUGH)):
         apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in ratios.items()}
         least = min(apart.values(), default=math.inf)
         if least < math.log(_SAME_UNITS):
-            return " or ".join(names for names, value in apart.items() if value < least + _EQUALLY_NEAR)
+            return " or ".join(names for names, value in apart.items() if value < least + near)
     return ""
 
 

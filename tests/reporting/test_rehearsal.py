@@ -99,6 +99,16 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
     assert not [each for each in fine.findings if "coarse" in each.name or "tested" in each.name], str(fine)
 
 
+def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
+    """The parameters may be right, but every prediction repeats the calibration; the step is not tested then."""
+    posterior = posterior_of(lambda theta, record: central_differences(theta, MOTION, 8)[:, : record.n_steps])
+    sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 1)
+    judgement = check_result(sampler)
+    assert judgement.status == "do not use" and judgement.findings[0].name == "The motion changes nothing"
+    assert not [each for each in judgement.findings if "finer" in each.name or "tested" in each.name]
+
+
 def test_a_model_without_a_step_that_could_be_halved_is_told():
     model = FunctionModel(
         lambda theta: central_differences(theta, MOTION, 8), ("stiffness", "damping"), TOP, 0.01, MOTION.n_steps

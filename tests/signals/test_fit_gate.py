@@ -54,11 +54,12 @@ def test_units_of_all_and_of_one_channel_are_named(factor):
         (1000.0, "acceleration", "m/s2 and mm/s2 or g and mg"),
         (980.0, "acceleration", "g and cm/s2 or g and gal"),
         (980.0, "displacement", "m and mm"),
-        (9.6, "displacement", "m/s2 and g"),  # of the base motion
-        (9.95, "displacement", "cm and mm or m/s2 and g"),
+        (9.6, "displacement", "cm and mm or m/s2 and g of the base motion"),
+        (9.95, "displacement", "cm and mm or m/s2 and g of the base motion"),
+        (0.102, "displacement", "cm and mm or m/s2 and g of the base motion"),
         (0.396, "displacement", "cm and in"),
         (1000.0, "force", "N and kN"),
-        (3.0, "strain", "m/s2 and ft/s2"),
+        (3.0, "strain", "m/s2 and ft/s2 of the base motion"),
         (2.0, "force", ""),
     ],
 )

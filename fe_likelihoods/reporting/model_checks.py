@@ -1,4 +1,4 @@
-"""The error of a model's time step or mesh, compared with the width of the posterior that its data give.
+"""Checks of a model at a fit: does it read its motion, and are step and mesh fine enough for its data?
 
 At a fit, the response r changes by d with half the step. With the derivatives J of the response by the parameters, each
 in units of its posterior standard deviation, and the weights W = 1 / sigma^2 of the residuals, ::
@@ -21,10 +21,20 @@ from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch
 
-__all__ = ["find_discretisation_error", "motions_to_replace", "simulations_of_the_test", "under"]
+__all__ = [
+    "find_discretisation_error",
+    "find_unread_motion",
+    "motions_to_replace",
+    "relative_difference",
+    "simulations_of_the_test",
+    "under",
+]
 
 SHIFT, LARGE_SHIFT = 0.5, 2.0  # of a parameter by half a step, in standard deviations: a caution, and a wrong result
 LARGE_SHARE = 0.1  # of the prior's standard deviation, below which no shift makes a result wrong
+
+NOTHING = 1e-6  # difference of two responses, relative to their norm, up to which a motion changes nothing
+UNREAD = "Check that the model reads the motion that it is given, and not one file that is always the same."
 
 Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 """Simulates a model at points (n, n_parameters)."""
@@ -74,6 +84,42 @@ def find_discretisation_error(
         return [Finding("The time step was not tested", REMARK, text, "Halve it in the model, and compare.")]
     found = [_compare(what, change, parts, sd, prior_sd, posterior.parameter_names) for what, change in changes.items()]
     return [each for each in found if each is not None]
+
+
+def find_unread_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
+    """Compare a response with the response to twice the motion.
+
+    Parameters
+    ----------
+    model : Model
+        One without a motion that can be replaced has no findings.
+    theta : (n_parameters,) float
+    response : (n_channels, n_steps) float
+        Its response at `theta`.
+    simulate : callable
+        As for `find_discretisation_error`.
+
+    Returns
+    -------
+    list of Finding
+        At most one: twice the motion changes nothing, or fails.
+    """
+    if not motions_to_replace(model):
+        return []
+    batch = simulate(under(model, lambda each: each.scale(2.0)), theta[None])
+    if batch.reasons[0]:
+        text = f"Under twice the base motion the simulation fails: {batch.reasons[0]}."
+        return [Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well.")]
+    if relative_difference(batch.response[0] - response, response) > NOTHING:
+        return []
+    text = "Twice the base motion gives the same response: the model does not use the motion that it is given."
+    return [Finding("The motion changes nothing", WRONG, f"{text} Predictions of other events repeat it.", UNREAD)]
+
+
+def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:
+    """Norm of a difference, relative to the norm of a reference [-]."""
+    norm = float(np.linalg.norm(reference))
+    return float(np.linalg.norm(difference)) / norm if norm > 0.0 else float(np.any(difference))
 
 
 def simulations_of_the_test(posterior: Posterior) -> int:
