@@ -1,7 +1,7 @@
 """Settings of Sphinx. `make docs` builds the pages of this folder, the API reference and the tutorials.
 
 The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
-Tutorials 01 to 05, 10 and 11 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
+Tutorials 01 to 05 and 10 to 13 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
 fetch, and are shown without output. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
 ``docs/tutorials``.
 """

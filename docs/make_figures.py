@@ -1,6 +1,7 @@
 """Make the figures of README and documentation (`make figures`): small files in docs/figures, the same on every run.
 
-Tutorial 01 makes those of the oscillator, 02 and 03 those of the updates, 10 those of damage; they take minutes.
+Tutorial 01 makes those of the oscillator, 02 and 03 those of the updates, 10 those of damage, 12 those of the choice of
+sensors, 13 those of lost stiffness; they take minutes.
 `sampler_figures` compares the samplers and shows what goes wrong. The models draw their section and their hysteresis
 loops.
 """
@@ -44,6 +45,7 @@ FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
         "fig7_predictions": "bridge_prediction",
     },
     "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
+    "12_which_sensors.py": {"column": "sensors_chosen", "predicted_and_obtained": "sensors_predicted"},
     "13_stiffness_loss.py": {"losses": "stiffness_losses"},
 }
 WIDEST = 1100  # pixels

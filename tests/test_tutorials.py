@@ -634,6 +634,47 @@ def test_many_events_predict_new_ones(tmp_path):
         assert len(read_figure(tmp_path, name).axes) >= 2
 
 
+# 12
+
+
+def test_the_sensors_at_the_base_are_chosen_and_six_leave_what_was_predicted(tmp_path):
+    """Gauges tell less along the column and towards its axis; a strong motion tells of the steel, and none of a1."""
+    output = run_tutorial("12_which_sensors.py", "--out", str(tmp_path))
+    assert "REDUCED SETTING" in output and "the motion to buy: EQ2" in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {"strain@0.15:-0.525", "strain@0.15:0.525", "displacement", "acceleration"} <= set(summary["six"])
+    gauges = {
+        tuple(map(float, name.removeprefix("strain@").split(":"))): value
+        for name, value in summary["information_alone"].items()
+        if name.startswith("strain@")
+    }
+    heights = sorted({height for height, _ in gauges})
+    for x in sorted({x for _, x in gauges}):
+        assert (np.diff([gauges[height, x] for height in heights]) < 0.0).all(), x
+    for height in heights:
+        assert min(gauges[height, -0.525], gauges[height, 0.525]) > max(gauges[height, -0.263], gauges[height, 0.263])
+    left = {name: dict(zip(summary["labels"], each, strict=False)) for name, each in summary["left_of_motions"].items()}
+    assert left["EQ2"]["Es"] < 0.5 * left["EQ1"]["Es"] and min(each["a1"] for each in left.values()) > 0.85
+    assert (np.diff(summary["target_left"]) < 0.0).all() and summary["target_left"][-1] < 0.02
+    shown = {name: dict(zip(summary["labels"], each, strict=True)) for name, each in summary["sd_left"].items()}
+    for sensors in ("six", "all"):
+        for name, predicted in shown[f"{sensors}, predicted"].items():
+            largest = {"a1": 1.3, "peak displacement": 3.0}.get(name, 2.0)
+            ratio = shown[f"{sensors}, obtained"][name] / predicted
+            assert 1.0 / largest < ratio < largest, f"{sensors}, {name}: {ratio:.2f}"
+        assert np.max(summary["deviations"][sensors]) < 4.0
+    assert all(shown["all, predicted"][name] < value for name, value in shown["six, predicted"].items())
+    ranks, _ = read_figure(tmp_path, "ranks").axes
+    assert [text.get_text() for text in ranks.get_yticklabels()] == summary["six"]
+    drawn, along = read_figure(tmp_path, "column").axes
+    numbered = {f"{k}. {name}" for k, name in enumerate(summary["six"], 1)}
+    assert numbered == {text.get_text() for text in drawn.texts} and len(along.lines) == 4
+    (compared,) = read_figure(tmp_path, "predicted_and_obtained").axes
+    np.testing.assert_allclose(
+        [bar.get_height() for bar in compared.patches], 100.0 * np.concatenate(list(summary["sd_left"].values()))
+    )
+
+
 # 13
 
 
