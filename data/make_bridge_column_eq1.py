@@ -28,21 +28,26 @@ FILTER_DAMPING = 0.30
 HIGH_PASS = 0.20  # Hz
 
 
-def base_motion(seed: int = SEED) -> Record:
-    """Make the stochastic base motion, scaled to PEAK."""
+def column_motion(name: str, seed: int, *, duration: float, peak: float, peak_time: float = PEAK_TIME) -> Record:
+    """Make a stochastic base motion with the spectral content of EQ1, scaled to `peak` [m/s²]; times in s."""
     motion = stochastic_motion(
         seed,
         dt=DT,
-        duration=DURATION,
-        peak=PEAK,
-        peak_time=PEAK_TIME,
+        duration=duration,
+        peak=peak,
+        peak_time=peak_time,
         shape=SHAPE,
         frequencies=(START_FREQUENCY, END_FREQUENCY),
         drift_time=40.0,
         filter_damping=FILTER_DAMPING,
         high_pass=HIGH_PASS,
     )
-    return Record("synthetic EQ1", DT, motion, "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters")
+    return Record(name, DT, motion, "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters")
+
+
+def base_motion(seed: int = SEED) -> Record:
+    """Make the stochastic base motion, scaled to PEAK."""
+    return column_motion("synthetic EQ1", seed, duration=DURATION, peak=PEAK)
 
 
 def main() -> None:

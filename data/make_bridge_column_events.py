@@ -14,8 +14,7 @@ Run the script with ``make data``. It writes the same file every time.
 
 from pathlib import Path
 
-from fe_likelihoods.data.ground_motion import stochastic_motion
-from fe_likelihoods.data.make_bridge_column_eq1 import DT, FILTER_DAMPING, HIGH_PASS, PEAK_TIME, SHAPE, base_motion
+from fe_likelihoods.data.make_bridge_column_eq1 import base_motion, column_motion
 
 from fe_likelihoods import Events, Record
 from fe_likelihoods.problems import (
@@ -31,25 +30,12 @@ SEED = 2
 NOISE_SEED = 1
 DURATION = 30.0  # s
 PEAK = 0.35 * G0  # m/s2
-START_FREQUENCY, END_FREQUENCY = 4.0, 2.0  # Hz at 0 s and at 40 s, as those of EQ1
 REST = 10.0  # s
 
 
 def second_motion(seed: int = SEED, peak: float = PEAK, name: str = "synthetic EQ2") -> Record:
     """Make a stronger base motion with the spectral content of EQ1, scaled to `peak` [m/s²]."""
-    motion = stochastic_motion(
-        seed,
-        dt=DT,
-        duration=DURATION,
-        peak=peak,
-        peak_time=PEAK_TIME,
-        shape=SHAPE,
-        frequencies=(START_FREQUENCY, END_FREQUENCY),
-        drift_time=40.0,
-        filter_damping=FILTER_DAMPING,
-        high_pass=HIGH_PASS,
-    )
-    return Record(name, DT, motion, "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters")
+    return column_motion(name, seed, duration=DURATION, peak=peak)
 
 
 def main() -> None:

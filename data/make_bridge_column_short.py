@@ -9,15 +9,13 @@ Run the script with ``make data``. It writes the same file every time.
 
 from pathlib import Path
 
-from fe_likelihoods.data.ground_motion import stochastic_motion
-from fe_likelihoods.data.make_bridge_column_eq1 import END_FREQUENCY, FILTER_DAMPING, HIGH_PASS, SHAPE, START_FREQUENCY
+from fe_likelihoods.data.make_bridge_column_eq1 import SEED, column_motion
 
 from fe_likelihoods import Record
 from fe_likelihoods.problems import BRIDGE_COLUMN_NOISE, SHORT_SUBSTEPS, bridge_column_measurements
 from fe_likelihoods.signals.datasets import write_dataset
 from fe_likelihoods.units import G0
 
-SEED = 17
 NOISE_SEED = 1
 DURATION = 10.0  # s
 PEAK = 0.40 * G0  # m/s2
@@ -28,20 +26,8 @@ TRUTH = {"Ec": 0.8, "Es": 1.05, "a0": 0.7, "a1": 1.5, "ft": 1.3}
 
 def short_motion() -> Record:
     """Make the stochastic base motion, scaled to PEAK, with the spectral content of EQ1."""
-    motion = stochastic_motion(
-        SEED,
-        dt=DT / 4,
-        duration=DURATION,
-        peak=PEAK,
-        peak_time=PEAK_TIME,
-        shape=SHAPE,
-        frequencies=(START_FREQUENCY, END_FREQUENCY),
-        drift_time=40.0,
-        filter_damping=FILTER_DAMPING,
-        high_pass=HIGH_PASS,
-    )
-    source = "SYNTHETIC: Rezaeian & Der Kiureghian (2008, 2010), assumed parameters"
-    return Record("synthetic short motion", DT / 4, motion, source).resample(DT)
+    motion = column_motion("synthetic short motion", SEED, duration=DURATION, peak=PEAK, peak_time=PEAK_TIME)
+    return motion.resample(DT)
 
 
 def main() -> None:

@@ -138,7 +138,7 @@ def check_model(run: FinishedRun) -> tuple[list[Finding], int]:
 
 
 def _of_discretisation(run: FinishedRun, simulate: Any) -> list[Finding]:
-    action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
+    """The error of step and mesh, or why it was not tested."""
     if run.n_modes > 1:
         text = "The samples have several modes, which have no common standard deviation."
         return [Finding("Step and mesh were not tested", REMARK, text, "Halve them, and run again.")]
@@ -146,6 +146,7 @@ def _of_discretisation(run: FinishedRun, simulate: Any) -> list[Finding]:
     seconds = report["seconds"] / max(report["simulations"], 1)
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
         text = f"The test takes {needed} simulations of {seconds:.2g} s."
+        action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
         return [Finding("Step and mesh were not tested", REMARK, text, action)]
     return find_discretisation_error(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
