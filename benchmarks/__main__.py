@@ -88,6 +88,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "fit_gate": fit_gate.fit_gate,
     "level_ratios": decisions.level_ratios,
     "fragility_bands": decisions.fragility_bands,
+    "annual_rates": decisions.annual_rates,
     "noises": noises.noises,
     "transfer": transfer.transfer,
     "measured_peaks": measured_peaks.measured_peaks,
@@ -120,6 +121,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "fit_gate": {"cases": 1, "events": 1},
     "level_ratios": {"data_sets": 2},
     "fragility_bands": {"data_sets": 2},
+    "annual_rates": {"data_sets": 2},
     "stiffness_loss": {"twins": 4, "file": "results/stiffness_loss_quick.jsonl"},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""

@@ -1,4 +1,4 @@
-"""Ratios that depend on the level, and fragility curves with the error of the model: calibration on synthetic twins.
+"""Calibration on synthetic twins: ratios that depend on the level, fragility with the error of the model, annual rates.
 
 `level_ratios`: ratios of measured to predicted peaks of K events, without a prior of their scatter. Their logarithms
 have a standard deviation of 0.1 around a constant, a line (slopes 0.1 and 0.2 per unit of the log level) or a curve;
@@ -19,11 +19,13 @@ import logging
 
 import numpy as np
 
+from fe_likelihoods import annual_risk
+from fe_likelihoods.prediction.fragility_curve import curve_with_errors
 from tests.prediction.twins import TRUTHS, fragility_twin, ratio_twin
 
 from .rows import Row
 
-__all__ = ["fragility_bands", "level_ratios"]
+__all__ = ["annual_rates", "fragility_bands", "level_ratios"]
 
 
 def level_ratios(repeats: int = 1, data_sets: int = 200) -> list[Row]:
@@ -65,4 +67,29 @@ def fragility_bands(repeats: int = 1, data_sets: int = 200) -> list[Row]:
             rows.append(Row(f"{what}: interval score of the probability", case, score.mean(), "", f"+- {error:.3f}"))
         each = ", ".join(f"{share:.0f}" for share in 100.0 * points.mean(axis=0))
         rows.append(Row("intervals, by the true probability 5 to 95 %", case, None, "%", each))
+    return rows
+
+
+def annual_rates(repeats: int = 1, data_sets: int = 200) -> list[Row]:
+    """Errors, stated errors and coverage of annual rates from finite simulations."""
+    rows, dispersion, k = [], 0.35, 2.3
+    intensity = np.array([0.3, 0.5, 0.7, 0.9, 1.2, 1.6, 2.2])
+    hazard = np.array([0.05, 20.0]), 1e-3 * np.array([0.05, 20.0]) ** -k
+    exact = 1e-3 * np.exp(0.5 * (k * dispersion) ** 2)
+    for case, samples, stated in (("100", 100, 100), ("800", 800, 800), ("control: 80 stated as 800", 80, 800)):
+        found = []
+        for seed in range(repeats * data_sets):
+            rng = np.random.default_rng(seed)
+            exceeds = (np.exp(dispersion * rng.standard_normal(samples)) < intensity[:, None]).astype(float)
+            curve = curve_with_errors(intensity, exceeds, np.ones(exceeds.shape), stated, None, rng)
+            risk = annual_risk(curve, *hazard)
+            found.append((risk.rate[0], risk.standard_error[0], risk.lower[0] <= exact <= risk.upper[0]))
+        rate, error, inside = np.array(found).T
+        scatter = rate.std() / exact
+        note = f"+- {100.0 * scatter / np.sqrt(len(rate)):.1f}"
+        rows.append(Row("mean error of the rate", f"{case} samples", 100.0 * (rate.mean() / exact - 1.0), "%", note))
+        rows.append(Row("scatter of the rate", f"{case} samples", 100.0 * scatter, "%"))
+        rows.append(Row("stated error", f"{case} samples", 100.0 * error.mean() / exact, "%"))
+        note = f"+- {100.0 * inside.std() / np.sqrt(len(inside)):.1f}"
+        rows.append(Row("90 % interval holds the rate", f"{case} samples", 100.0 * inside.mean(), "%", note))
     return rows

@@ -11,6 +11,7 @@ from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
 from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
+from .information.value import value_of_information
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -37,6 +38,7 @@ from .plots.materials import plot_material, plot_moment_curvature
 from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
+from .prediction.annual_risk import annual_risk
 from .prediction.averaging import average_predictions
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
@@ -113,6 +115,7 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
+    "annual_risk",
     "arias_intensity",
     "average_predictions",
     "check_fit",
@@ -164,4 +167,5 @@ __all__ = [
     "share_within",
     "stiffness_loss",
     "to_si",
+    "value_of_information",
 ]

@@ -95,6 +95,9 @@ class SensorRanking(NamedTuple):
         The same with each candidate alone.
     draws, failed, simulations : int
         Draws that were used and draws that were left out because a simulation failed; simulations made.
+    precisions : dict of str to (d, d) float
+        What each candidate tells of the standard normal coordinates of the prior: J^T W J, averaged over the draws, for
+        `fe_likelihoods.information.value.simulate_summary`. Precisions of several sensors add.
     """
 
     candidates: tuple[str, ...]
@@ -118,6 +121,7 @@ class SensorRanking(NamedTuple):
     draws: int
     failed: int
     simulations: int
+    precisions: dict[str, np.ndarray]
 
     def __str__(self) -> str:
         with_target = bool(np.isfinite(self.target_variance))
@@ -368,6 +372,7 @@ def rank_sensors(
         left=chosen.left / sd,
         failed=int(draws - good.sum()),
         simulations=simulations,
+        precisions=dict(zip(candidates, products[:, places].mean(axis=0), strict=True)),
     )
 
 
@@ -485,4 +490,5 @@ def _choose(
         draws=len(products),
         failed=0,
         simulations=0,
+        precisions={},
     )

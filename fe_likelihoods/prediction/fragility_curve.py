@@ -40,6 +40,11 @@ class FragilityCurve(NamedTuple):
         records. They are inf if more than a tenth of the resamplings do not determine a curve.
     unit : str
         Unit of the intensities; empty where it is not known.
+    resampled : ndarray, shape (100, 2), or None
+        Median and dispersion of the curves of resampled samples, whose scatter is the Monte Carlo error; NaN where the
+        points determine no curve. Curves of several thresholds have the same resamplings if they have the same seed.
+    drawn : ndarray, shape (up to 100, 2), or None
+        The same for draws of ratios and event population; None without them.
     """
 
     median: float
@@ -47,6 +52,8 @@ class FragilityCurve(NamedTuple):
     median_error: float = np.inf
     dispersion_error: float = np.inf
     unit: str = ""
+    resampled: np.ndarray | None = None
+    drawn: np.ndarray | None = None
 
     def __str__(self) -> str:
         median, dispersion = number(self.median), number(self.dispersion)
@@ -158,21 +165,28 @@ def curve_with_errors(
     """
     n = exceeds.shape[1]
     curve = fit_fragility(intensity, exceeds.sum(axis=1), counted.sum(axis=1))
-    if draws is None:
-        chosen = rng.multinomial(max(int(round(effective)), 1), np.full(n, 1.0 / n), size=_REPLICATES)
-        points = [(exceeds @ weights, counted @ weights) for weights in chosen]
-    else:
+    chosen = rng.multinomial(max(int(round(effective)), 1), np.full(n, 1.0 / n), size=_REPLICATES)
+    found = resampled = _fits(intensity, [(exceeds @ weights, counted @ weights) for weights in chosen])
+    drawn = None
+    if draws is not None:
         whole = draws[np.isfinite(draws).all(axis=1)]
         rows = np.linspace(0, len(whole) - 1, min(len(whole), _REPLICATES)).astype(int)
-        points = [(n * whole[row], np.full(len(intensity), float(n))) for row in rows]
-    found = []
-    for each in points:
-        try:
-            found.append(fit_fragility(intensity, *each)[:2])
-        except ValueError:  # these points do not determine a curve
-            continue
-    if not points or len(found) < 0.9 * len(points):  # those with a curve would be a biased selection
+        found = drawn = _fits(intensity, [(n * whole[row], np.full(len(intensity), float(n))) for row in rows])
+    curve = curve._replace(resampled=resampled, drawn=drawn)
+    determined = found[np.isfinite(found).all(axis=1)]
+    if not len(found) or len(determined) < 0.9 * len(found):  # those with a curve would be a biased selection
         return curve
     return curve._replace(
-        **dict(zip(("median_error", "dispersion_error"), np.std(found, axis=0).tolist(), strict=True))
+        **dict(zip(("median_error", "dispersion_error"), determined.std(axis=0).tolist(), strict=True))
     )
+
+
+def _fits(intensity: np.ndarray, points: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Median and dispersion (n, 2) of curves fitted to exceedances and trials; NaN where they determine no curve."""
+    found = np.full((len(points), 2), np.nan)
+    for k, each in enumerate(points):
+        try:
+            found[k] = fit_fragility(intensity, *each)[:2]
+        except ValueError:
+            continue
+    return found
