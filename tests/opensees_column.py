@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # the process that runs OpenSees does not have to import the 
 __all__ = ["PeerColumn", "Push", "Shake", "peer_of", "push", "require_opensees", "shake"]
 
 KIP, INCH, KSI = (to_si(1.0, unit).item() for unit in ("kip", "in", "ksi"))
+TO_MASS, GRAVITY = KIP / INCH, G0 / INCH
 CORE, COVER, STEEL = 1, 2, 3  # material tags
 MAX_ITERATIONS = 50
 
@@ -45,6 +46,7 @@ class PeerColumn(NamedTuple):
     steel: tuple  # ReinforcingSteel: fy, fu, Es, Esh, eps_sh, eps_u
     fibers: np.ndarray  # (3, n): y, area, material (CORE, COVER, STEEL)
     mass: tuple  # along x, along y, rotational
+    node_masses: tuple  # of the column itself, from the first node above the base; vertical too where the top has it
     axial_load: float
     a0: float
     a1: float
@@ -107,7 +109,7 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
         np.column_stack([part[:, 0] / INCH, part[:, 1] / INCH**2, np.full(len(part), tag)])
         for part, tag in ((core, CORE), (cover, COVER), (bars, STEEL))
     ]
-    mass = values["mass"] / (KIP / INCH)
+    mass = values["mass"] / TO_MASS
     return PeerColumn(
         core=(-fc * confinement.strength_ratio, -core_peak, -max(confinement.ultimate_strain, 1.05 * core_peak))
         + tension,
@@ -116,6 +118,9 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
         + (steel.hardening_strain, steel.ultimate_strain),
         fibers=np.concatenate(fibers).T,
         mass=(mass, mass * model.vertical_mass, model.rotational_inertia / (KIP * INCH)),
+        node_masses=tuple(
+            np.append(np.ones(model.n_elements - 1), 0.5) * model.column_mass / model.n_elements / TO_MASS
+        ),
         axial_load=(values["mass"] * G0 if model.axial_load is None else model.axial_load) / KIP,
         a0=values["a0"],
         a1=values["a1"],
@@ -126,7 +131,7 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
     )
 
 
-Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the value last; ("node", node, dof)
+Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the value last; ("nodeDisp", node, dof)
 
 
 def shake(
@@ -161,7 +166,9 @@ def push(column: PeerColumn, targets: np.ndarray, tolerance: float = 1e-10, reco
 def _record(ops, recorders: Recorders) -> list[float]:
     """Current values of all recorders."""
     return [
-        ops.nodeDisp(*arguments[1:]) if arguments[0] == "node" else ops.eleResponse(*arguments[:-1])[arguments[-1]]
+        getattr(ops, arguments[0])(*arguments[1:])
+        if str(arguments[0]).startswith("node")
+        else ops.eleResponse(*arguments[:-1])[arguments[-1]]
         for arguments in recorders
     ]
 
@@ -186,7 +193,10 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     for i in range(n + 1):
         ops.node(i + 1, 0.0, column.height * i / n)
     ops.fix(1, 1, 1, 1)
-    ops.mass(n + 1, *column.mass)
+    x, y, rotational = column.mass
+    for i, own in enumerate(column.node_masses):
+        top = i + 1 == n
+        ops.mass(i + 2, own + x * top, own * bool(y) + y * top, rotational * top)
     ops.uniaxialMaterial("Concrete04", CORE, *column.core)
     ops.uniaxialMaterial("Concrete04", COVER, *column.cover)
     ops.uniaxialMaterial("ReinforcingSteel", STEEL, *column.steel)
@@ -199,7 +209,8 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
         ops.element("forceBeamColumn", i + 1, i + 1, i + 2, 1, 1)
     ops.timeSeries("Linear", 1)
     ops.pattern("Plain", 1, 1)
-    ops.load(n + 1, 0.0, -column.axial_load, 0.0)
+    for i, own in enumerate(column.node_masses):
+        ops.load(i + 2, 0.0, -own * GRAVITY - (column.axial_load if i + 1 == n else 0.0), 0.0)
     ops.constraints("Plain")
     ops.numberer("Plain")
     ops.system("BandGeneral")

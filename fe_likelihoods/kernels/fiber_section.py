@@ -43,7 +43,7 @@ from .reinforcing_steel import (
     virgin_stress_tangent,
 )
 
-__all__ = ["Sections", "reset", "forces", "commit", "cross_jumps"]
+__all__ = ["Sections", "reset", "forces", "commit", "cross_jumps", "fiber_stress"]
 
 NEAR_JUMP = 0.995
 """A fiber is next to a jump from this share of the jump strain (concrete) or of the damage at fracture (bars)."""
@@ -129,18 +129,22 @@ def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
 
 
 @kernel
+def _bar(strain, memory, steel, failure, virgin, trial):
+    """Return stress and tangent of one bar at a trial strain."""
+    if failure.shape[0] > 0:
+        return bar_fatigue_buckling.stress_tangent(strain, memory, steel, failure, trial)
+    if virgin == 1.0:
+        return monotonic_stress_tangent(strain, steel)
+    return stress_tangent(strain, memory, steel, trial)
+
+
+@kernel
 def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, failure, steel_memory, virgin, trial):
     """Sum over the bars, one after the other, if some are near or beyond yield."""
     n_force, moment, k_axial, k_coupling, k_bending = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(steel_memory.shape[1]):
         yi = bar_y[i]
-        if failure.shape[0] > 0:
-            strain, memory = e0 - yi * kappa, steel_memory[j, i]
-            stress, tangent = bar_fatigue_buckling.stress_tangent(strain, memory, steel, failure, trial)
-        elif virgin[j] == 1.0:
-            stress, tangent = monotonic_stress_tangent(e0 - yi * kappa, steel)
-        else:
-            stress, tangent = stress_tangent(e0 - yi * kappa, steel_memory[j, i], steel, trial)
+        stress, tangent = _bar(e0 - yi * kappa, steel_memory[j, i], steel, failure, virgin[j], trial)
         force = stress * bar_area[i]
         ea = tangent * bar_area[i]
         n_force += force
@@ -350,3 +354,15 @@ def cross_jumps(e0, kappa, j, sections):
                     bar[bar_fatigue_buckling.FRACTURED] = 1.0
                     count += 1
     return count
+
+
+@kernel
+def fiber_stress(e0, kappa, j, i, sections):
+    """Return the stress [Pa] of one fiber of section `j` at a strain; bar k has the number i = -1 - k."""
+    if i < 0:
+        k = -1 - i
+        strain, memory = e0 - sections.bar_y[k] * kappa, sections.steel_memory[j, k]
+        return _bar(strain, memory, sections.steel, sections.failure, sections.virgin[j], sections.trial)[0]
+    memory, constants = sections.concrete_memory[j], sections.concrete[0 if i < sections.core_count else 1]
+    extremes = memory[0, i], memory[1, i], memory[2, i], memory[3, i], memory[4, i]
+    return concrete04.stress_tangent(e0 - sections.y[i] * kappa, *extremes, constants)[0]

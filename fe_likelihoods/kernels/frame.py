@@ -6,6 +6,7 @@ lateral displacement at the top of n elements. A `Column` holds everything that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +19,15 @@ from .jit import kernel
 
 __all__ = [
     "Column",
+    "Recorder",
     "allocate",
     "initialise_column",
     "assemble",
     "commit_sections",
     "cross_jumps",
     "bars_have_fractured",
-    "record_sections",
+    "record",
+    "recorder",
 ]
 
 LARGEST_AXIAL_STRAIN = 0.2
@@ -62,6 +65,39 @@ class Column(NamedTuple):
     state_before: np.ndarray
     vectors: np.ndarray
     matrices: np.ndarray
+
+
+class Recorder(NamedTuple):
+    """What an analysis writes at its samples besides its history; arrays without samples (0, ...) are not written.
+
+    Attributes
+    ----------
+    sections : ndarray (n_recorded, n_sections, 2)
+        Axial strain and curvature [1/m] of every section, from the base up.
+    motion : ndarray (n_recorded, 1 or 3, n_dof)
+        Displacements [m and rad] and, in dynamic analyses, velocities and accelerations relative to the base.
+    stresses : ndarray (n_recorded, n_fibers)
+        Stresses of fibers [Pa].
+    fibers : ndarray (n_fibers, 2) of int
+        Section and number of each of these fibers: from 0 the concrete fibers, from -1 downwards the bars.
+    """
+
+    sections: np.ndarray
+    motion: np.ndarray
+    stresses: np.ndarray
+    fibers: np.ndarray
+
+
+def recorder(
+    column: Column, n_steps: int = 0, *, sections: bool = False, motion: int = 0, fibers: Sequence[Sequence[int]] = ()
+) -> Recorder:
+    """Return a `Recorder` for `n_steps` samples of the sections, of `motion` rows and of the stresses of `fibers`."""
+    return Recorder(
+        np.zeros((n_steps if sections else 0, len(column.sections.virgin), 2)),
+        np.zeros((n_steps if motion else 0, motion, column.vectors.shape[1])),
+        np.zeros((n_steps if len(fibers) else 0, len(fibers))),
+        np.array(fibers, dtype=np.int64).reshape(-1, 2),
+    )
 
 
 def allocate(
@@ -224,16 +260,30 @@ def commit_sections(column):
             fiber_section.commit(state[e, k], state[e, k + 1], e * n_points + m, column.sections)
 
 
-@kernel(inline=True)
-def record_sections(column, out):
-    """Write the axial strain and the curvature [1/m] of every section, from the base up, to `out` (n_sections, 2)."""
+@kernel
+def record(column, u, v, a, sample, out):
+    """Write one sample of a committed state with the motion u, v, a (n_dof,) to the `Recorder` `out`."""
     state = column.elements.state
     n_points = column.elements.points.shape[0]
-    for e in range(state.shape[0]):
-        for m in range(n_points):
-            k = HEAD + PER_SECTION * m
-            out[e * n_points + m, 0] = state[e, k]
-            out[e * n_points + m, 1] = state[e, k + 1]
+    if out.sections.shape[0] > 0:
+        for e in range(state.shape[0]):
+            for m in range(n_points):
+                k = HEAD + PER_SECTION * m
+                out.sections[sample, e * n_points + m, 0] = state[e, k]
+                out.sections[sample, e * n_points + m, 1] = state[e, k + 1]
+    if out.motion.shape[0] > 0:
+        for i in range(u.shape[0]):
+            out.motion[sample, 0, i] = u[i]
+            if out.motion.shape[1] > 1:
+                out.motion[sample, 1, i] = v[i]
+                out.motion[sample, 2, i] = a[i]
+    if out.stresses.shape[0] > 0:
+        for i in range(out.fibers.shape[0]):
+            j = out.fibers[i, 0]
+            k = HEAD + PER_SECTION * (j % n_points)
+            e = j // n_points
+            stress = fiber_section.fiber_stress(state[e, k], state[e, k + 1], j, out.fibers[i, 1], column.sections)
+            out.stresses[sample, i] = stress
 
 
 @kernel

@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import Column, assemble, commit_sections, cross_jumps, record_sections
+from .frame import Column, assemble, commit_sections, cross_jumps, record
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
 from .static import LOOSENING, MAX_CROSSINGS, Position, apply_gravity
@@ -102,7 +102,7 @@ def _record_forces(column, force, out):
 
 
 @kernel
-def newmark(column, dynamics, ground, dt, every, iteration, history, sections, first, energies):
+def newmark(column, dynamics, ground, dt, every, iteration, history, out, first, energies):
     """Apply gravity, then the base acceleration `ground` along x; or continue from a step of an earlier analysis.
 
     Parameters
@@ -118,8 +118,8 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
     iteration : static.Iteration
     history : ndarray (13, n_recorded)
         Written; rows as in `HISTORY_ROWS`.
-    sections : ndarray (n_recorded, n_sections, 2)
-        Written: axial strain and curvature [1/m] of every section. Without samples (0, ...), they are not recorded.
+    out : frame.Recorder
+        Written at the same samples.
     first : int
         0 for an analysis from the beginning. Otherwise `column` and `energies` hold the state of this step
         (`committed_state`), and only later steps are computed and recorded.
@@ -166,8 +166,7 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
         history[5, 0] = 0.0
         history[6, 0] = energies[3]
         _record_forces(column, force, history[7:, 0])
-        if sections.shape[0] > 0:
-            record_sections(column, sections[0])
+        record(column, u, v, a, 0, out)
     smallest = 0.5**halvings
     total_iterations = 0
     kinetic, damped, absorbed, supplied = energies[0], energies[1], energies[2], energies[3]
@@ -268,8 +267,7 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, sections, f
             history[5, m] = absorbed
             history[6, m] = supplied
             _record_forces(column, force, history[7:, m])
-            if sections.shape[0] > 0:
-                record_sections(column, sections[m])
+            record(column, u, v, a, m, out)
     energies[0], energies[1], energies[2], energies[3] = kinetic, damped, absorbed, supplied
     return 0, retries, total_iterations
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import assemble, bars_have_fractured, commit_sections, cross_jumps, initialise_column, record_sections
+from .frame import assemble, bars_have_fractured, commit_sections, cross_jumps, initialise_column, record
 from .jit import kernel
 from .linear_solve import copy_matrix, copy_vector, solve_banded
 
@@ -262,7 +262,7 @@ def apply_gravity(column, position, gravity, iteration):
 
 
 @kernel
-def impose_displacement(column, gravity, targets, iteration, history, sections):
+def impose_displacement(column, gravity, targets, iteration, history, out):
     """Apply gravity, then move the top laterally through `targets`.
 
     Parameters
@@ -275,8 +275,8 @@ def impose_displacement(column, gravity, targets, iteration, history, sections):
     iteration : Iteration
     history : ndarray (9, n_steps)
         Written: ux, uy and theta of the top, lateral force, e0, kappa, N and M of the base section, and base shear.
-    sections : ndarray (n_steps, n_sections, 2)
-        Written: axial strain and curvature [1/m] of every section. Without steps (0, ...), they are not recorded.
+    out : frame.Recorder
+        Written at the same steps, without velocities and accelerations.
 
     Returns
     -------
@@ -313,6 +313,5 @@ def impose_displacement(column, gravity, targets, iteration, history, sections):
         for i in range(0, force.shape[0], 3):
             shear += force[i]
         history[8, step] = shear
-        if sections.shape[0] > 0:
-            record_sections(column, sections[step])
+        record(column, u, u, u, step, out)
     return 0, retries, lowerings

@@ -13,7 +13,8 @@ The type of `loading` selects the analysis:
 * a `DisplacementHistory` is a reversed lateral displacement of the top; the default channel is "force", the lateral
   force that it requires.
 
-Other channels are moments, forces, curvatures, strains and rotations at the places of sensors (`rc_column_outputs`).
+Other channels are forces, moments, motions, curvatures, strains, stresses and rotations at the places of sensors
+(`rc_column_outputs`).
 
 The structural parameters are multiples of the nominal values in `RCColumn.nominal`. Choices that the literature leaves
 open (peak strain of the concrete, softening in tension, geometry, rotational inertia, mesh) change the response of the
@@ -110,8 +111,11 @@ class RCColumn(ThreadedModel):
         Gravity load at the top, positive downwards [N]. Default: the weight of `mass`.
     rotational_inertia : float
         Rotational inertia of the mass [kg m²]. The default is zero.
+    column_mass : float
+        Mass of the column itself [kg], with its weight. Half of each element's share is at either end, so that the
+        nodes below the top have velocities and accelerations. The default is zero: a column without a mass and weight.
     vertical_mass : bool
-        Whether the mass also acts vertically.
+        Whether the masses also act vertically.
     a0 : float
         Rayleigh damping: factor of the mass [1/s].
     a1 : float
@@ -216,6 +220,7 @@ class RCColumn(ThreadedModel):
     mass: float
     axial_load: float | None = None
     rotational_inertia: float = 0.0
+    column_mass: float = 0.0
     vertical_mass: bool = True
     a0: float = 0.0
     a1: float = 0.0
@@ -441,7 +446,8 @@ class RCColumn(ThreadedModel):
 
     @property
     def _sections(self) -> Sections:
-        return Sections(self.height, 0.5 * self.diameter, self.n_elements, gauss_lobatto(self.n_points)[0])
+        points = gauss_lobatto(self.n_points)[0]
+        return Sections(self.height, 0.5 * self.diameter, self.n_elements, points, self.section, self.column_mass > 0.0)
 
     @cached_property
     def _channels(self) -> tuple[Channel, ...]:
@@ -470,7 +476,7 @@ class RCColumn(ThreadedModel):
                 *("diameter", "height", "mass", "tolerance", "element_tolerance", "max_increment"),
                 "collapse_drift",
             ),
-            non_negative=("cover", "rotational_inertia", "a0", "a1", "penetration"),
+            non_negative=("cover", "rotational_inertia", "column_mass", "a0", "a1", "penetration"),
             finite=("axial_load",),
             optional=("max_increment", "axial_load"),
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
-from ..kernels.frame import Column
+from ..kernels.frame import Column, recorder
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from ..kernels.static import Iteration, impose_displacement
 from ..signals.records import DisplacementHistory, Record
@@ -28,6 +28,7 @@ __all__ = [
     "BaseMotion",
     "ColumnHistory",
     "ImposedMotion",
+    "ToRecord",
     "check_loading",
     "check_physical_values",
     "checked_history",
@@ -87,6 +88,24 @@ class ColumnHistory(History):
     lowerings: int = 0
 
 
+class ToRecord(NamedTuple):
+    """What an analysis shall record besides its rows.
+
+    Attributes
+    ----------
+    sections : bool
+        The deformations of all sections.
+    motion : bool
+        The motion of all nodes.
+    fibers : tuple of (int, int)
+        Section and number of the fibers whose stresses are recorded (`fe_likelihoods.kernels.frame.Recorder`).
+    """
+
+    sections: bool = False
+    motion: bool = False
+    fibers: tuple[tuple[int, int], ...] = ()
+
+
 class Analysis(NamedTuple):
     """Result of one analysis.
 
@@ -100,6 +119,12 @@ class Analysis(NamedTuple):
         Number of steps that were repeated with half their size.
     sections : ndarray[n_steps, n_sections, 2]
         Axial strain and curvature [1/m] of every section, from the base up; (0, n_sections, 2) if not recorded.
+    motion : ndarray[n_steps, 1 or 3, n_dof]
+        Displacement, velocity and acceleration of the nodes relative to the base; (0, ...) if not recorded.
+    stresses : ndarray[n_steps, n_fibers]
+        Stresses of the recorded fibers [Pa].
+    ground : ndarray[n_steps] or None
+        Base acceleration [m/s²]; None under imposed displacement.
     lowerings : int
         As of `ColumnHistory`.
     """
@@ -108,6 +133,9 @@ class Analysis(NamedTuple):
     values: np.ndarray
     retries: int
     sections: np.ndarray
+    motion: np.ndarray
+    stresses: np.ndarray
+    ground: np.ndarray | None = None
     lowerings: int = 0
 
 
@@ -143,7 +171,7 @@ class BaseMotion(NamedTuple):
         column: Column,
         dynamics: Dynamics,
         iteration: Iteration,
-        record_sections: bool,
+        recorded: ToRecord,
         first: int,
         energies: np.ndarray,
     ) -> Analysis:
@@ -154,8 +182,7 @@ class BaseMotion(NamedTuple):
         column : Column
         dynamics : Dynamics
         iteration : Iteration
-        record_sections : bool
-            Whether the deformations of all sections are returned too.
+        recorded : ToRecord
         first : int
             0 for an analysis from the beginning. Otherwise the response sample whose state `column` and `energies`
             hold; the histories begin after this sample.
@@ -168,10 +195,12 @@ class BaseMotion(NamedTuple):
             Rows are `HISTORY_ROWS`.
         """
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
-        sections = _allocate_sections(column, self.n_steps if record_sections else 0)
+        out = recorder(
+            column, self.n_steps, sections=recorded.sections, motion=3 * recorded.motion, fibers=recorded.fibers
+        )
         loading = self.acceleration, self.dt, self.substeps
         status, retries, _ = newmark(
-            column, dynamics, *loading, iteration, history, sections, first * self.substeps, energies
+            column, dynamics, *loading, iteration, history, out, first * self.substeps, energies
         )
         if status < -1:
             raise SimulationFailed(
@@ -182,7 +211,10 @@ class BaseMotion(NamedTuple):
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
         start = first + 1 if first else 0
-        return Analysis(HISTORY_ROWS, history[:, start:], retries, _by_section(sections[start:]))
+        motion, stresses, ground = out.motion[start:], out.stresses[start:], self.acceleration[:: self.substeps][start:]
+        return Analysis(
+            HISTORY_ROWS, history[:, start:], retries, _by_section(out.sections[start:]), motion, stresses, ground
+        )
 
 
 class ImposedMotion(NamedTuple):
@@ -205,10 +237,8 @@ class ImposedMotion(NamedTuple):
         finer = history.subdivide(max_increment)
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
 
-    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration, record_sections: bool) -> Analysis:
+    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration, recorded: ToRecord) -> Analysis:
         """Solve the static equilibrium at each target; SimulationFailed if a step does not converge.
-
-        With `record_sections`, the deformations of all sections are returned too.
 
         Returns
         -------
@@ -216,12 +246,13 @@ class ImposedMotion(NamedTuple):
             Rows are `IMPOSED_ROWS`.
         """
         history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
-        sections = _allocate_sections(column, len(self.targets) if record_sections else 0)
-        status, retries, lowerings = impose_displacement(column, gravity, self.targets, iteration, history, sections)
+        n = len(self.targets)
+        out = recorder(column, n, sections=recorded.sections, motion=int(recorded.motion), fibers=recorded.fibers)
+        status, retries, lowerings = impose_displacement(column, gravity, self.targets, iteration, history, out)
         if status:
             raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings, column.sections))
-        kept = sections[self.kept] if record_sections else sections
-        return Analysis(IMPOSED_ROWS, history[:, self.kept], retries, kept, lowerings)
+        kept = [each[self.kept] if len(each) else each for each in (out.sections, out.motion, out.stresses)]
+        return Analysis(IMPOSED_ROWS, history[:, self.kept], retries, *kept, None, lowerings)
 
 
 def check_loading(loading: object, height: float) -> None:
@@ -345,10 +376,6 @@ def set_materials(
 def _by_section(sections: np.ndarray) -> np.ndarray:
     """The same array with the samples of a section side by side in memory: hundreds of sensors are read faster."""
     return np.ascontiguousarray(sections.transpose(1, 2, 0)).transpose(2, 0, 1)
-
-
-def _allocate_sections(column: Column, n_steps: int) -> np.ndarray:
-    return np.zeros((n_steps, len(column.sections.virgin), 2))
 
 
 def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Sections) -> str:

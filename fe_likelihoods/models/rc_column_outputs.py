@@ -2,10 +2,13 @@
 
 An output is named by its quantity and its place, ``quantity@place``, with heights above the base and positions in m:
 
-* ``acceleration``, ``displacement`` and ``force`` of the top;
+* ``acceleration``, ``relative_acceleration``, ``velocity``, ``displacement`` and ``force`` of the top;
+* ``displacement@height``, ``velocity@height``, ``relative_acceleration@height`` and ``acceleration@height`` below the
+  top, relative to the base except for the last one;
 * ``base_moment``, ``base_shear`` and ``axial_force`` at the base;
 * ``curvature@height`` of the section at a height;
 * ``strain@height:position`` of the concrete or of a bar at a position in that section, as a strain gauge measures it;
+* ``bar_stress@height:position`` and ``concrete_stress@height:position``, the stress of a fiber there;
 * ``rotation@lower:upper`` of the section at the upper height relative to the section at the lower height, as a pair of
   displacement transducers over a gauge length measures it.
 
@@ -15,7 +18,9 @@ tension. Plane sections stay plane, so concrete and bars at the same position ha
 
 Outputs at the integration points are section deformations. In between, axial strain and curvature follow the polynomial
 through the points of the element (Neuenhofer & Filippou 1998). The integral of this polynomial over an element is the
-sum that the element uses, so that the rotation between two nodes is the difference of their rotations.
+sum that the element uses, so that the rotation between two nodes is the difference of their rotations. The second
+integral of the curvature is the deflection from the chord of the element. Velocities and accelerations belong to nodes
+with a mass, stresses to the sections, whose fibers have a history.
 ``docs/sensors.rst`` describes the outputs.
 
 References
@@ -34,9 +39,10 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import find_unit
+from .rc_column_section import ReinforcedSection
 from .validation import invalid
 
-__all__ = ["Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
+__all__ = ["Recording", "Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
 
 
 class _Row(NamedTuple):
@@ -58,22 +64,36 @@ _ROWS = {
 }
 _AT_TOP = ("acceleration", "displacement", "force")
 """Outputs at the top, which depend on the type of loading."""
-_LOCATED = {"curvature": ("curvature", "1/m", 1), "strain": ("strain", "1", 2), "rotation": ("rotation", "rad", 2)}
+_LOCATED = {
+    "displacement": ("relative displacement", "m", 1),
+    "velocity": ("relative velocity", "m/s", 1),
+    "relative_acceleration": ("relative acceleration", "m/s2", 1),
+    "acceleration": ("absolute acceleration", "m/s2", 1),
+    "curvature": ("curvature", "1/m", 1),
+    "strain": ("strain", "1", 2),
+    "bar_stress": ("bar stress", "Pa", 2),
+    "concrete_stress": ("concrete stress", "Pa", 2),
+    "rotation": ("rotation", "rad", 2),
+}
 """Outputs with a place: quantity, SI unit, and how many values the place has."""
+_MOTIONS = ("displacement", "velocity", "relative_acceleration", "acceleration")
+"""Outputs of the motion, in the order of the recorded rows; the last one is the third row plus the base motion."""
 
+_SAME_PLACE = 1e-3
+"""How far a sensor may be from a node or a section to belong to it, as a share of the column's height."""
 _ROUNDING = 1e-9
 """How far rounding may put a place outside the column, as a share of the column's height or radius."""
 
 _NUMBER = r"([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?|[+-]?\.\d+(?:[eE][+-]?\d+)?)"
 _PLACE = re.compile(rf"(\w+)@{_NUMBER}(?::{_NUMBER})?")
 _ADVICE = (
-    'names are such as "base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@0.3:-0.5" (height and '
-    'position) and "rotation@0:0.6" (two heights), in m'
+    'names are such as "base_moment", "base_shear", "axial_force", "displacement@2.4", "curvature@0.3", '
+    '"strain@0.3:-0.5" (height and position) and "rotation@0:0.6" (two heights), in m'
 )
 
 
 class Sections(NamedTuple):
-    """Places of the integration points of a column.
+    """Places of the integration points of a column, and what can be recorded there.
 
     Attributes
     ----------
@@ -83,12 +103,18 @@ class Sections(NamedTuple):
         Number of elements, which have equal lengths.
     points : ndarray[n_points]
         Integration points of an element, on [0, 1].
+    section : ReinforcedSection, optional
+        The section, for stresses.
+    has_mass : bool
+        Whether all nodes have a mass, so that the equation of motion determines their accelerations.
     """
 
     height: float
     radius: float
     n_elements: int
     points: np.ndarray
+    section: ReinforcedSection | None = None
+    has_mass: bool = False
 
     def interpolation(self, height: float) -> np.ndarray:
         """Weights (n_sections,) of the sections in the value at `height` [m]."""
@@ -108,6 +134,62 @@ class Sections(NamedTuple):
                 shares = sum(w * self._lagrange(x) for w, x in zip(gauss, xi, strict=True))
                 total += self._spread(element, 0.5 * (b - a) * length * shares)
         return total
+
+    def deflection(self, height: float) -> tuple[int, float, np.ndarray]:
+        """Element, place in it on [0, 1], and weights (n_sections,) [m²] of the curvatures in the deflection there.
+
+        The deflection is across the chord of the element, from it.
+        """
+        element, xi = self._locate(height)
+        nodes, gauss = np.polynomial.legendre.leggauss(len(self.points) + 1)  # exact, of one degree more
+
+        def twice_integrated(upper: float) -> np.ndarray:
+            at = 0.5 * upper * (1.0 + nodes)
+            return sum(0.5 * upper * w * (upper - x) * self._lagrange(x) for w, x in zip(gauss, at, strict=True))
+
+        length = self.height / self.n_elements
+        return element, xi, self._spread(element, length**2 * (twice_integrated(xi) - xi * twice_integrated(1.0)))
+
+    def node_at(self, name: str, height: float) -> int:
+        """Number of the node at a height, from 1; ValueError for the output `name` if there is none."""
+        element = self.height / self.n_elements
+        node = max(1, round(height / element))
+        if abs(node * element - height) > _SAME_PLACE * self.height:
+            raise invalid(
+                f"a height of a node, {_heights(element * np.arange(1, self.n_elements + 1))}",
+                name,
+                "n_elements decides where the nodes are; displacements are interpolated between them",
+            )
+        if node < self.n_elements and not self.has_mass:
+            raise invalid(
+                "a column whose nodes have a mass, for velocities and accelerations below the top",
+                name,
+                "give the mass of the column itself, column_mass [kg]",
+            )
+        return node
+
+    def fiber_at(self, name: str, height: float, position: float, bar: bool) -> tuple[int, int]:
+        """Section and number of a fiber (`fe_likelihoods.kernels.frame.Recorder`) at a place; ValueError as above."""
+        distances = np.abs(section_heights(self) - height)
+        if distances.min() > _SAME_PLACE * self.height:
+            raise invalid(
+                f"a height of a section, {_heights(np.unique(section_heights(self)))}",
+                name,
+                "n_elements and n_points decide where the sections are; stresses are not interpolated",
+            )
+        section = int(np.flatnonzero(distances <= distances.min() + _ROUNDING * self.height)[-1])  # the upper element's
+        core, cover, bars = self.section.fibers()
+        if not bar:
+            first, part = (0, core) if abs(position) <= 0.5 * self.section.core_diameter else (len(core), cover)
+            return section, first + int(np.abs(part[:, 0] + position).argmin())
+        nearest = int(np.abs(bars[:, 0] + position).argmin())
+        if abs(bars[nearest, 0] + position) > 0.5 * self.section.bars.diameter:
+            raise invalid(
+                f"a position on a bar, {_heights(np.unique(np.round(-bars[:, 0], 4)))}",
+                name,
+                "concrete_stress has the concrete",
+            )
+        return section, -1 - nearest
 
     def _locate(self, height: float) -> tuple[int, float]:
         """Element and place in it on [0, 1]; a node between two elements belongs to the upper one."""
@@ -132,6 +214,37 @@ class Sections(NamedTuple):
         return total
 
 
+class Recording(NamedTuple):
+    """What a simulation recorded of the outputs.
+
+    Attributes
+    ----------
+    rows : mapping of str to ndarray[n_steps]
+        Rows of the history, as the kernels record them.
+    deformations : ndarray[n_steps, n_sections, 2]
+        Axial strain at the axis and curvature [1/m] of every section, in the coordinates of the element, whose second
+        axis points against the direction of loading.
+    motion : ndarray[n_steps, 1 or 3, n_dof]
+        Displacement, velocity and acceleration of the nodes relative to the base.
+    ground : ndarray[n_steps] or None
+        Base acceleration [m/s²].
+    stresses : mapping of (int, int) to ndarray[n_steps]
+        Stresses of the recorded fibers [Pa].
+    penetration : float
+        Length of strain penetration below the base [m].
+    length : float
+        Length of an element [m], infinite for linear geometry.
+    """
+
+    rows: Mapping[str, np.ndarray]
+    deformations: np.ndarray
+    motion: np.ndarray
+    ground: np.ndarray | None
+    stresses: Mapping[tuple[int, int], np.ndarray]
+    penetration: float
+    length: float
+
+
 class Output(NamedTuple):
     """One output, with its name resolved.
 
@@ -144,9 +257,17 @@ class Output(NamedTuple):
     factor : float
         Factor of that row.
     strain, curvature : ndarray[n_sections] or None
-        Weights of axial strain and curvature of the sections.
+        Weights of axial strain and curvature of the sections; with `motion`, of the deflection from the chord.
     slip : bool
         Whether the rotation by strain penetration below the base is added.
+    motion : int or None
+        Number of the motion, or None.
+    node : int
+        Node of the motion, from 1: the upper end of the element.
+    xi : float
+        Place of the motion in this element, 1 at the node.
+    fiber : (int, int) or None
+        Section and number of a fiber.
     """
 
     name: str
@@ -157,32 +278,49 @@ class Output(NamedTuple):
     strain: np.ndarray | None = None
     curvature: np.ndarray | None = None
     slip: bool = False
+    motion: int | None = None
+    node: int = 0
+    xi: float = 1.0
+    fiber: tuple[int, int] | None = None
 
-    def evaluate(self, rows: Mapping[str, np.ndarray], deformations: np.ndarray, penetration: float) -> np.ndarray:
-        """Values (n_steps,) of this output.
-
-        Parameters
-        ----------
-        rows : mapping of str to ndarray[n_steps]
-            Rows of the history, as the kernels record them.
-        deformations : ndarray[n_steps, n_sections, 2]
-            Axial strain at the axis and curvature [1/m] of every section, in the coordinates of the element, whose
-            second axis points against the direction of loading.
-        penetration : float
-            Length of strain penetration below the base [m].
-        """
+    def evaluate(self, recording: Recording) -> np.ndarray:
+        """Values (n_steps,) of this output [SI]."""
         if self.row is not None:
-            values = rows[self.row]
+            values = recording.rows[self.row]
             return values if self.factor == 1.0 else self.factor * values
+        if self.fiber is not None:
+            return recording.stresses[self.fiber]
+        if self.motion is not None:
+            return self._motion(recording)
         curvature = self.curvature.copy()
         if self.slip:
-            curvature[0] -= penetration
-        total = np.zeros(len(deformations))
-        # summed in a fixed order: a product of matrices is left to BLAS, whose last bit depends on its threads
-        for part, weights in enumerate((self.strain, curvature)):
-            for section in np.flatnonzero(weights):
-                total += weights[section] * deformations[:, section, part]
+            curvature[0] -= recording.penetration
+        total = np.zeros(len(recording.deformations))
+        _add(total, self.strain, recording.deformations[:, :, 0])
+        _add(total, curvature, recording.deformations[:, :, 1])
         return total
+
+    def _motion(self, recording: Recording) -> np.ndarray:
+        """Motion of a node, or the displacement of a point between two nodes."""
+        absolute = self.motion == _MOTIONS.index("acceleration")
+        upper = recording.motion[:, self.motion - absolute]
+        x = 3 * self.node - 3
+        if self.xi == 1.0:
+            return upper[:, x] + recording.ground if absolute else upper[:, x].copy()
+        top, bottom = upper[:, x : x + 2].T, upper[:, x - 3 : x - 1].T if x else np.zeros((2, len(upper)))
+        slope = (top[0] - bottom[0]) / (recording.length + top[1] - bottom[1])  # of the chord
+        across = np.zeros(len(upper))
+        _add(across, self.curvature, recording.deformations[:, :, 1])
+        return bottom[0] + self.xi * (top[0] - bottom[0]) + across / np.sqrt(1.0 + slope**2)
+
+
+def _add(total: np.ndarray, weights: np.ndarray, values: np.ndarray) -> None:
+    """Add the weighted columns of `values` (n_steps, n_sections), one after the other.
+
+    A product of matrices is left to BLAS, whose last bit depends on its threads.
+    """
+    for section in np.flatnonzero(weights):
+        total += weights[section] * values[:, section]
 
 
 def parse_outputs(names: object, sections: Sections, at_top: Sequence[str]) -> tuple[Output, ...]:
@@ -215,14 +353,19 @@ def parse_outputs(names: object, sections: Sections, at_top: Sequence[str]) -> t
 
 
 def _parse(name: object, sections: Sections, at_top: Sequence[str]) -> Output:
+    moving = "acceleration" in at_top
     if isinstance(name, str) and name in _ROWS and (name in at_top or name not in _AT_TOP):
         quantity, si_unit, row, sign = _ROWS[name]
         return Output(name, quantity, si_unit, row, sign)
     match = _PLACE.fullmatch(name) if isinstance(name, str) else None
     kind = match[1] if match else None
     place = [float(number) for number in match.groups()[1:] if number is not None] if match else []
-    if kind not in _LOCATED or len(place) != _LOCATED[kind][2]:
-        known = (*at_top, "base_moment", "base_shear", "axial_force", "curvature@...", "strain@...", "rotation@...")
+    if name in ("velocity", "relative_acceleration"):
+        kind, place = name, [sections.height]
+    located = [each for each in _LOCATED if moving or each not in _MOTIONS[1:]]
+    if kind not in located or len(place) != _LOCATED[kind][2]:
+        of_top = ("velocity", "relative_acceleration") if moving else ()
+        known = (*at_top, *of_top, "base_moment", "base_shear", "axial_force", *(f"{each}@..." for each in located))
         raise invalid(f"outputs out of {known} for this loading", name, _ADVICE)
     quantity, si_unit, _ = _LOCATED[kind]
     heights = place if kind == "rotation" else place[:1]
@@ -230,16 +373,26 @@ def _parse(name: object, sections: Sections, at_top: Sequence[str]) -> Output:
     if not all(-rounding <= height <= sections.height + rounding for height in heights):
         raise invalid(f"heights between 0 and {sections.height:.6g} m", name, "heights are measured from the base")
     place[: len(heights)] = [min(max(height, 0.0), sections.height) for height in heights]
+    if kind in _MOTIONS:
+        motion = _MOTIONS.index(kind)
+        if kind != "displacement":
+            return Output(name, quantity, si_unit, None, motion=motion, node=sections.node_at(name, place[0]))
+        element, xi, across = sections.deflection(place[0])
+        if abs(xi - 1.0) < _ROUNDING:
+            return Output(name, quantity, si_unit, None, motion=motion, node=element + 1)
+        return Output(name, quantity, si_unit, None, curvature=-across, motion=motion, node=element + 1, xi=xi)
     none = np.zeros(sections.n_elements * len(sections.points))
     if kind == "curvature":
         return Output(name, quantity, si_unit, None, strain=none, curvature=-sections.interpolation(place[0]))
-    if kind == "strain":
+    if kind != "rotation":
         if not abs(place[1]) <= sections.radius * (1.0 + _ROUNDING):
             raise invalid(
                 f"a position in the section, between {-sections.radius:.6g} and {sections.radius:.6g} m",
                 name,
                 "positions are measured from the axis of the column in the direction of loading",
             )
+        if kind != "strain":
+            return Output(name, quantity, si_unit, None, fiber=sections.fiber_at(name, *place, kind == "bar_stress"))
         weights = sections.interpolation(place[0])
         return Output(name, quantity, si_unit, None, strain=weights, curvature=place[1] * weights)
     if not place[0] < place[1]:
@@ -258,17 +411,21 @@ def display_channels(outputs: Sequence[Output], units: Mapping[str, str]) -> tup
 
 def check_units(units: Mapping[str, str]) -> None:
     """Raise ValueError for display units of unknown outputs, or of another dimension."""
+    quantities = {kind: each[0] for kind, each in (_ROWS | _LOCATED).items()}
     for name, unit in units.items():
-        kind = str(name).split("@")[0]
-        known = _ROWS[kind].quantity if kind in _ROWS else _LOCATED[kind][0] if kind in _LOCATED else None
+        known = quantities.get(str(name).split("@")[0])
         if known is None:
             raise invalid(
-                f"display units of channels out of {(*_ROWS, *_LOCATED)}", name, 'such as {"displacement": "in"}'
+                f"display units of channels out of {tuple(quantities)}", name, 'such as {"displacement": "in"}'
             )
         try:
             find_unit(unit, known.split()[-1])
         except ValueError as error:
             raise invalid(f"a display unit of {name}", unit, str(error)) from error
+
+
+def _heights(values: np.ndarray) -> str:
+    return f"{', '.join(f'{value:.4g}' for value in values)} m"
 
 
 def section_heights(sections: Sections) -> np.ndarray:

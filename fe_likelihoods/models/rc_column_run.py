@@ -21,11 +21,12 @@ from .rc_column_analysis import (
     BaseMotion,
     ColumnHistory,
     ImposedMotion,
+    ToRecord,
     check_physical_values,
     checked_history,
     set_materials,
 )
-from .rc_column_outputs import Output
+from .rc_column_outputs import Output, Recording
 from .rc_column_section import ReinforcedSection
 from .validation import check_state
 
@@ -114,24 +115,36 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     confinement = prepared.section.confinement(values["fc"])
     set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue, model.buckling)
     iteration = Iteration(float(model.tolerance), int(model.max_iterations), int(model.halvings))
-    record = any(output.row is None for output in prepared.outputs)
+    fibers = tuple(dict.fromkeys(output.fiber for output in prepared.outputs if output.fiber is not None))
+    recorded = ToRecord(
+        any(output.curvature is not None for output in prepared.outputs),
+        any(output.motion is not None for output in prepared.outputs),
+        fibers,
+    )
+    own = np.full(model.n_elements, model.column_mass / model.n_elements)  # at the nodes
+    own[-1] *= 0.5
     gravity = np.zeros(3 * model.n_elements)
-    gravity[-2] = -(model.axial_load if model.axial_load is not None else values["mass"] * G0)
+    gravity[1::3] = -own * G0
+    gravity[-2] -= model.axial_load if model.axial_load is not None else values["mass"] * G0
     if isinstance(prepared.motion, ImposedMotion):
-        analysis, end = prepared.motion.run(column, gravity, iteration, record), None
+        analysis, end = prepared.motion.run(column, gravity, iteration, recorded), None
     else:
-        mass = np.zeros(3 * model.n_elements)
-        mass[-3:] = values["mass"], values["mass"] * model.vertical_mass, model.rotational_inertia
+        own[-1] += values["mass"]
+        mass = np.zeros((model.n_elements, 3))
+        mass[:, 0], mass[:, 1], mass[-1, 2] = own, own * model.vertical_mass, model.rotational_inertia
         dynamics = Dynamics(
-            gravity, mass, float(values["a0"]), float(values["a1"]), 0.0, model.collapse_drift * model.height
+            gravity, mass.ravel(), float(values["a0"]), float(values["a1"]), 0.0, model.collapse_drift * model.height
         )
         energies = np.zeros(_N_ENERGIES)
         first = 0 if state is None else _restore(column, energies, state, model.n_steps)
-        analysis = prepared.motion.run(column, dynamics, iteration, record, first, energies)
+        analysis = prepared.motion.run(column, dynamics, iteration, recorded, first, energies)
         parts = (part.ravel() for part in committed_state(column))
         end = np.concatenate([[model.n_steps - 1], energies, *parts])
     rows = dict(zip(analysis.names, analysis.values, strict=True))
-    outputs = {o.name: o.evaluate(rows, analysis.sections, values["penetration"]) for o in prepared.outputs}
+    stresses = dict(zip(fibers, analysis.stresses.T, strict=True))
+    length = column.length if column.corotational else np.inf
+    seen = Recording(rows, analysis.sections, analysis.motion, analysis.ground, stresses, values["penetration"], length)
+    outputs = {output.name: output.evaluate(seen) for output in prepared.outputs}
     damage = None
     if model.fatigue is not None:
         damage = column.sections.steel_memory[:, :, bar_fatigue_buckling.DAMAGE].max(axis=0)

@@ -88,8 +88,8 @@ def sensors(model):
         f"strain@0:{-bar}": ([fiber(0, -bar, STEEL)], 1.0, 1.0),
         f"strain@{heights[1]}:{-inner}": ([fiber(1, -inner, CORE)], 1.0, 1.0),
         "strain@0:0": ([at(0, 0)], 1.0, 1.0),
-        f"rotation@0:{half}": ([("node", 2, 3)], -1.0, 1.0),
-        f"rotation@0:{model.height}": ([("node", model.n_elements + 1, 3)], -1.0, 1.0),
+        f"rotation@0:{half}": ([("nodeDisp", 2, 3)], -1.0, 1.0),
+        f"rotation@0:{model.height}": ([("nodeDisp", model.n_elements + 1, 3)], -1.0, 1.0),
     }
 
 
@@ -110,6 +110,26 @@ def test_sensors_under_base_acceleration(record):
     peer = shake(peer_of(model, PAPER), record.acceleration / INCH, record.dt, TOLERANCE, recorders)
     errors = deviations(replace(model, outputs=tuple(wanted)), PAPER, peer.recorded, wanted)
     assert max(errors.values()) < 1e-8, errors
+
+
+def test_motions_and_stresses_over_the_height(record):
+    """Of a column with a mass: its nodes move, and its bars and its concrete are stressed, as in OpenSees."""
+    model = RCColumn.lhpost(record.scale(2.0), column_mass=2.05e4, n_elements=3, **TIGHT)
+    heights, bar = model.height / 3.0 * np.arange(1, 4), model.bar_circle_radius
+    core = model.section.fibers()[0][-3, 0]
+    wanted = {}
+    for node, height in enumerate(heights, 2):
+        for kind, recorder in (("displacement", "Disp"), ("velocity", "Vel"), ("relative_acceleration", "Accel")):
+            wanted[f"{kind}@{height}"] = ([(f"node{recorder}", node, 1)], 1.0, INCH)
+    for name, position, material in (("bar", bar, STEEL), ("bar", -bar, STEEL), ("concrete", -core, CORE)):
+        for section, height in ((0, 0.0), (1, heights[0] / 2.0)):
+            fiber = ("section", section + 1, "fiber", -position / INCH, 0.0, material, "stressStrain", 0)
+            wanted[f"{name}_stress@{height}:{position}"] = ([(1, *fiber)], 1.0, KIP / INCH**2)
+    recorders = [recorder for column, _, _ in wanted.values() for recorder in column]
+    peer = shake(peer_of(model, PAPER), model.loading.acceleration / INCH, record.dt, TOLERANCE, recorders)
+    errors = deviations(replace(model, outputs=tuple(wanted)), PAPER, peer.recorded, wanted)
+    assert max(errors.values()) < 1e-6, errors
+    assert np.abs(peer.recorded[:, list(wanted).index(f"bar_stress@0.0:{bar}")]).max() > 0.3 * 75.2, "control"
 
 
 def test_a_wrong_material_is_detected(record):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.kernels import bar_fatigue_buckling, concrete04
+from fe_likelihoods.kernels.frame import recorder
 from fe_likelihoods.kernels.static import (
     GRAVITY_STEPS,
     LOWERING,
@@ -31,7 +32,6 @@ ROWS = {
     "M": "base_sec_M",
 }
 TOLERANCE = 1e-10
-NO_SECTIONS = np.zeros((0, 1, 2))
 
 
 def push(column, targets, tolerance=TOLERANCE, max_iterations=100, halvings=6, gravity=None):
@@ -40,7 +40,7 @@ def push(column, targets, tolerance=TOLERANCE, max_iterations=100, halvings=6, g
     iteration = Iteration(tolerance, max_iterations, halvings)
     targets = np.array(targets)
     targets.flags.writeable = False  # the type that the models pass; another one would be compiled again
-    return impose_displacement(column, load, targets, iteration, history, NO_SECTIONS), history
+    return impose_displacement(column, load, targets, iteration, history, recorder(column)), history
 
 
 def cases(arrays):

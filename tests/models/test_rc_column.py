@@ -31,7 +31,7 @@ from fe_likelihoods import (
     to_si,
 )
 from fe_likelihoods.kernels import concrete04, reinforcing_steel
-from fe_likelihoods.kernels.frame import allocate
+from fe_likelihoods.kernels.frame import allocate, recorder
 from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from fe_likelihoods.kernels.static import Iteration
 from fe_likelihoods.models.circular_section import gauss_lobatto
@@ -195,7 +195,7 @@ def test_the_system_of_units_does_not_matter(strong, theta):
     ground = strong.acceleration / INCH
     dynamics = Dynamics(gravity, mass, peer.a0, peer.a1, 0.0)
     newmark(
-        kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history, np.zeros((0, 6, 2)), 0, np.zeros(4)
+        kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history, recorder(kernels), 0, np.zeros(4)
     )
     assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
 
@@ -207,7 +207,10 @@ def test_substeps_equal_a_finer_record(strong, column):
     assert 1e-5 < rrmse(column.simulate(NOMINAL), finer).max() < 1e-2
 
 
-@pytest.mark.parametrize("changes", [{}, dict(geometry="linear"), dict(rotational_inertia=2e5), dict(n_elements=4)])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, dict(geometry="linear"), dict(rotational_inertia=2e5), dict(n_elements=4), dict(column_mass=2e4)],
+)
 @pytest.mark.parametrize("scale", [1.0, 4.0])
 def test_energy_is_balanced(strong, changes, scale):
     history = RCColumn.lhpost(strong.scale(scale), **TIGHT, **changes).history(PAPER)
@@ -282,6 +285,7 @@ CHANGED = dict(  # another value of every argument; `loading`, `units` and `outp
     rotational_inertia=1e5,
     fatigue=LowCycleFatigue(),
     buckling=BarBuckling(slenderness=12.0),
+    column_mass=2e4,
     vertical_mass=False,
     a0=0.8,
     a1=0.0003,

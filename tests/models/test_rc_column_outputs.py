@@ -8,11 +8,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import DisplacementHistory, FELikelihood, Measurements, RCColumn, read_columns
+from fe_likelihoods import (
+    DisplacementHistory,
+    FELikelihood,
+    Measurements,
+    RCColumn,
+    TruncatedNormal,
+    material_curves,
+    peak,
+    propagate,
+    rank_sensors,
+    read_columns,
+)
 from fe_likelihoods.models.circular_section import gauss_lobatto
-from fe_likelihoods.models.rc_column_outputs import Sections, parse_outputs
-from fe_likelihoods.models.rc_column_parts import Patches
+from fe_likelihoods.models.rc_column_outputs import Output, Sections, parse_outputs
+from fe_likelihoods.models.rc_column_parts import LowCycleFatigue, Patches
+from fe_likelihoods.models.rc_column_run import prepare_column, run_column
 from fe_likelihoods.problems import bridge_column, bridge_column_data
+from fe_likelihoods.units import G0
 
 SENSORS = ("base_moment", "base_shear", "axial_force", "curvature@0.3", "strain@0.3:-0.55", "rotation@0:0.6")
 
@@ -99,6 +112,108 @@ def test_elastic_cantilever(n_elements, n_points):
     assert values["strain@2:0.3"] - values["strain@2:0"] == pytest.approx(compressed, rel=1e-4)
 
 
+@pytest.mark.parametrize(("n_elements", "n_points"), [(1, 3), (2, 3), (3, 5)])
+def test_elastic_cantilever_bends_as_a_cubic(n_elements, n_points):
+    """Under a force at the top, u(z) = u(H) z² (3 H - z) / (2 H³): at nodes and between them."""
+    height, top = 7.3152, 1e-6
+    heights = (0.0, 0.4, 2.0, 2.4384, 3.6576, 5.5, height)
+    outputs = tuple(f"displacement@{z}" for z in heights)
+    column = pushed(0.0, top, n_elements=n_elements, n_points=n_points, geometry="linear", outputs=outputs)
+    expected = [top * z**2 * (3.0 * height - z) / (2.0 * height**3) for z in heights]
+    np.testing.assert_allclose(column.simulate([1.0])[:, 1], expected, rtol=1e-4, atol=1e-16)
+
+
+@pytest.mark.parametrize(("geometry", "tolerance"), [("linear", 1e-6), ("corotational", 2e-3)])
+@pytest.mark.parametrize("penetration", [0.0, 0.2])
+def test_the_slope_of_the_deflected_shape_is_the_rotation(geometry, tolerance, penetration):
+    """Of a yielding column, also above strain penetration; there is no kink at the node between two elements.
+
+    The corotational element bends about its chord with small rotations, which differ by their squares.
+    """
+    heights, step = (1e-3, 0.5, 3.0, 3.6576 - 0.001, 3.6576 + 0.001, 7.0), 1e-4
+    pairs = [(f"displacement@{z - step}", f"displacement@{z + step}") for z in heights]
+    outputs = (*(name for pair in pairs for name in pair), *(f"rotation@0:{z}" for z in heights))
+    column = pushed(0.0, 0.05, 0.15, outputs=outputs, geometry=geometry, penetration=penetration)
+    values = column.simulate([1.0])[:, -1]
+    slopes, rotations = (values[1:12:2] - values[0:12:2]) / (2.0 * step), values[12:]
+    expected = np.sin(rotations) if geometry == "corotational" else rotations
+    np.testing.assert_allclose(slopes, expected, rtol=0.0, atol=tolerance * rotations[-1])
+    assert rotations[0] > 0.1 * rotations[-1] if penetration else rotations[0] < 0.01 * rotations[-1]
+
+
+def test_motions_below_the_top():
+    """Newmark's identities between displacement, velocity and acceleration of every node, and those of the top."""
+    names = ("displacement", "velocity", "relative_acceleration", "acceleration")
+    record = bridge_column_data().record.trim(6.0, 8.0)
+    height = RCColumn.lhpost(record).height
+    outputs = (*names, *(f"{name}@{z}" for z in (height / 2.0, height) for name in names))
+    column = RCColumn.lhpost(record, outputs=outputs, column_mass=2e4)
+    u, v, a, absolute = np.moveaxis(column.simulate(np.ones(5)).reshape(3, 4, -1), 1, 0)
+    for shift, rate in ((u, v), (v, a)):
+        mean = 0.5 * record.dt * (rate[:, 1:] + rate[:, :-1])
+        np.testing.assert_allclose(np.diff(shift), mean, rtol=0.0, atol=1e-12 * np.abs(shift).max())
+    np.testing.assert_array_equal(absolute, a + record.acceleration)
+    for each in (u, v, a, absolute):
+        np.testing.assert_array_equal(each[0], each[2])
+        assert np.abs(each[1] - each[2]).max() > 0.1 * np.abs(each[2]).max()
+
+
+def test_the_weight_of_the_column_acts():
+    column = pushed(0.0, 0.0, outputs=("axial_force",), axial_load=1e6, column_mass=3e4, n_elements=3)
+    assert column.simulate([1.0])[0, 0] == pytest.approx(-1e6 - 2.5e4 * G0, rel=1e-9)  # half an element is at the base
+
+
+@pytest.mark.parametrize("changes", [{}, dict(fatigue=LowCycleFatigue(), mesh=Patches())])
+def test_stresses_balance_the_forces_of_the_section(changes):
+    """The stresses of all fibers of the base add up to axial force and moment: elastic, cracked and yielding."""
+    column = pushed(*np.linspace(0.0, 0.2, 30), *np.linspace(0.2, -0.1, 30), axial_load=2e6, **changes)
+    core, cover, bars = column.section.fibers()
+    fibers = np.concatenate([core, cover, bars])
+    numbers = [*range(len(core) + len(cover)), *(-1 - k for k in range(len(bars)))]
+    outputs = tuple(Output(str(k), "stress", "Pa", None, fiber=(0, k)) for k in numbers)
+    run = run_column(column, prepare_column(column, outputs), np.ones(1), None)
+    forces = np.array([run.outputs[str(k)] for k in numbers]) * fibers[:, 1:]
+    force, moment = run.history["base axial force"], run.history["base moment"]
+    np.testing.assert_allclose(forces.sum(axis=0), force, rtol=1e-9)
+    np.testing.assert_allclose(-(forces * fibers[:, :1]).sum(axis=0), moment, atol=1e-9 * np.abs(moment).max())
+    assert np.abs(moment).max() > 3e6, "control: bars yield"
+
+
+def test_stresses_are_of_the_nearest_fiber():
+    """The stress of the material's law at the strain of the bar or fiber, and of a bar that yields."""
+    bar = RCColumn.lhpost(bridge_column_data().record).bar_circle_radius
+    column = pushed(0.0, 1e-5, 0.15, axial_load=1e5)
+    core, cover, bars = column.section.fibers()
+    cases = [(f"bar_stress@0:{bar:.3f}", 2, bars, 0.0), (f"bar_stress@0.001:{-bar}", 2, bars, 0.0)]
+    cases += [("concrete_stress@3.66:0.3", 0, core, column.height / 2.0), ("concrete_stress@0:0.6", 1, cover, 0.0)]
+    for name, material, fibers, height in cases:
+        position = float(name.partition(":")[2])
+        y = fibers[np.abs(fibers[:, 0] + position).argmin(), 0]
+        stress, strain = replace(column, outputs=(name, f"strain@{height}:{-y}")).simulate([1.0])
+        law = material_curves(column, [1.0], concrete=[strain[1]], steel=[strain[1]])[material]
+        assert stress[1] == pytest.approx(law.stress[-1], rel=1e-9) and strain[1] != 0.0, name
+        if name.endswith(str(-bar)):
+            assert strain[2] > 2.0 * column.steel.fy / column.steel.es
+            assert stress[2] == pytest.approx(column.steel.fy, rel=0.05)
+
+
+def test_new_sensors_are_data_predictions_and_candidates(rng):
+    record = bridge_column_data().record.trim(6.0, 8.0)
+    bar = RCColumn.lhpost(record).bar_circle_radius
+    places = ("displacement@1.8", "velocity@3.66", "acceleration@3.66", f"bar_stress@0:{bar:.3f}")
+    column = RCColumn.lhpost(record, outputs=places, column_mass=2e4, substeps=4)
+    truth = Measurements(column.channels, column.dt, column.simulate(np.ones(5)))
+    likelihood = FELikelihood(column, truth)
+    sigmas, theta = truth.values.std(axis=1) * 0.05, 1.0 + 0.1 * rng.standard_normal(5)
+    assert likelihood(np.append(np.ones(5), sigmas)) > likelihood(np.append(theta, sigmas)) + 1.0
+    samples = 1.0 + 0.05 * rng.standard_normal((6, 5))
+    drift = propagate(column, samples, quantity=peak("displacement@1.8"), noise=False, progress=False)
+    peaks = [np.abs(column.simulate(each)[0]).max() for each in samples]
+    np.testing.assert_allclose(drift.sd, np.std(peaks, ddof=0), rtol=0.2)
+    ranking = rank_sensors(column, {name: TruncatedNormal(1.0, 0.2) for name in column.parameter_names}, draws=2)
+    assert set(ranking.chosen) == set(places) and (ranking.alone > 0.0).all()
+
+
 def test_gravity_is_part_of_strains_and_axial_force():
     column = pushed(0.0, 0.0, outputs=("strain@0:0.5", "strain@0:-0.5", "axial_force", "curvature@1"), axial_load=2e6)
     right, left, force, curvature = column.simulate([1.0])[:, 0]
@@ -175,6 +290,14 @@ def test_sensors_are_read_from_a_table_with_their_units(shaken, tmp_path):
         ("curvature@-0.1", "heights between 0 and 7.3152 m"),
         ("curvature@nan", "outputs out of"),
         ("rotation@0:9", "heights between 0 and"),
+        ("displacement@7.4", "heights between 0 and 7.3152 m"),
+        ("displacement@1:0.3", "outputs out of"),
+        ("velocity@3.6", "a height of a node, 3.658, 7.315 m; got 'velocity@3.6'"),
+        ("acceleration@0", "a height of a node"),
+        ("acceleration@3.6576", "a column whose nodes have a mass.*give the mass of the column itself, column_mass"),
+        ("bar_stress@0.5:0.5", "a height of a section, 0, 1.829, 3.658, 5.486, 7.315 m"),
+        ("bar_stress@0:0.45", "a position on a bar, -0.5"),
+        ("concrete_stress@0:0.7", "between -0.6096 and 0.6096 m"),
         ("rotation@0.6:0.6", "a lower and a higher section"),
         ("strain@0.3:0.62", "between -0.6096 and 0.6096 m"),
         (3.0, "outputs out of"),
@@ -188,6 +311,9 @@ def test_wrong_names_are_rejected(shaken, name, words):
 def test_the_loading_decides_which_outputs_of_the_top_there_are():
     with pytest.raises(ValueError, match="outputs out of .'force'"):
         pushed(0.0, 0.01, outputs=("acceleration",))
+    for name in ("velocity", "acceleration@7.3152"):
+        with pytest.raises(ValueError, match="outputs out of .'force'.*'displacement@...', 'curvature@...'"):
+            pushed(0.0, 0.01, outputs=(name,))
     sections = Sections(7.0, 0.5, 1, gauss_lobatto(3)[0])
     with pytest.raises(ValueError, match="once"):
         parse_outputs(("base_moment", "base_moment"), sections, ("force",))

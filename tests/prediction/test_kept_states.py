@@ -105,6 +105,11 @@ def whole(model, events, theta):
         {},
         {"substeps": 3, "n_elements": 1},
         {"outputs": ("base_moment", "strain@0.1:0.4", "rotation@0:0.5"), "geometry": "linear"},
+        {
+            "outputs": ("displacement@1.5", "acceleration@3.66", "velocity@3.66", "bar_stress@0:0.52"),
+            "column_mass": 2e4,
+            "substeps": 2,
+        },
     ],
 )
 def test_column_goes_on_with_the_same_bits(changes):
