@@ -22,7 +22,6 @@ than this noise. Another noise gives other ranks: the levels below are assumed. 
 import argparse
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -116,10 +115,7 @@ six = for_decision.chosen
 figure, (left, right) = plt.subplots(
     1, 2, figsize=(11, 6.4), sharey=True, width_ratios=(1.4, 1.0), layout="constrained"
 )
-plot_sensors(replace(column, outputs=six), left)
-for text in left.texts:
-    if text.get_text() in six:
-        text.set_text(f"{six.index(text.get_text()) + 1}. {text.get_text()}")
+plot_sensors(column, left, six)
 left.set_title("the six sensors, with their ranks")
 for x in positions:
     alone = [for_decision.alone[for_decision.candidates.index(gauges[height, x])] for height in HEIGHTS]

@@ -178,7 +178,7 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
     from ..models.linear_structure import LinearStructure
     from ..models.linear_structure_parts import ShearFrame
 
-    return LinearStructure(ShearFrame(**values), record)
+    return LinearStructure(ShearFrame(**values), record, outputs=names)
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:

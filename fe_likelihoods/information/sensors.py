@@ -30,7 +30,7 @@ from ..priors.distributions import Distribution
 from ..priors.points import as_rows
 from ..priors.priors import Prior
 from ..signals.channels import Channel
-from ..simulation.model import Model, most_responses, simulate_batch
+from ..simulation.model import Model, derivatives_batch, most_responses, simulate_batch
 from ..text_tables import number, text_table
 
 if TYPE_CHECKING:
@@ -40,6 +40,7 @@ __all__ = ["SensorRanking", "Slopes", "information_of", "rank_sensors", "slopes_
 
 SHARE = 0.05  # of the channel's RMS, the default noise
 STEP = 0.1  # of differences, in standard deviations
+MAP_STEP = 1e-4  # of coordinates, for the derivatives of the parameters
 FEWEST = 10  # samples for each parameter
 
 
@@ -189,7 +190,9 @@ def slopes_at(
     target: Callable[[np.ndarray], Any] | None = None,
     pool: Any = None,
 ) -> Slopes:
-    """Derivatives of responses by forward differences, from d + 1 simulations for each point.
+    """Derivatives of responses at points, from d + 1 simulations for each of them.
+
+    They are forward differences; a model with ``jacobian`` takes one simulation and one call of it for each point.
 
     Parameters
     ----------
@@ -206,6 +209,11 @@ def slopes_at(
     Returns
     -------
     Slopes
+
+    Raises
+    ------
+    ValueError
+        If the target is not one number, or ``jacobian`` fails (`fe_likelihoods.simulation.model.derivatives_batch`).
     """
     m, d = coords.shape
     n_channels, n_steps = len(model.channels), model.n_steps
@@ -215,9 +223,12 @@ def slopes_at(
     points = prior.from_normal((coords[:, None] + unit * steps[:, None]).reshape(-1, d)).reshape(m, d + 1, d)
     size = max(1, most_responses(model) // (d + 1))
     for start in range(0, m, size):
-        part = points[start : start + size]
-        batch = simulate_batch(model, part.reshape(-1, d), pool)
-        responses = batch.response.reshape(len(part), d + 1, n_channels, n_steps)
+        part = slice(start, start + size)
+        if _is_differentiable(model):
+            responses = _linearised(model, prior, coords[part], steps[part], pool)
+        else:
+            batch = simulate_batch(model, points[part].reshape(-1, d), pool)
+            responses = batch.response.reshape(-1, d + 1, n_channels, n_steps)
         for k, response in enumerate(responses, start):
             if not np.isfinite(response).all():
                 continue
@@ -227,6 +238,26 @@ def slopes_at(
             values = np.zeros(d + 1) if target is None else np.array([_number(target(each)) for each in response])
             gradients[k] = (values[1:] - values[0]) / steps[k]
     return Slopes(products, squares, gradients)
+
+
+def _is_differentiable(model: Model) -> bool:
+    return getattr(model, "jacobian", None) is not None
+
+
+def _linearised(model: Model, prior: Prior, coords: np.ndarray, steps: np.ndarray, pool: Any) -> np.ndarray:
+    """Responses (m, d + 1, n_channels, n_steps) at points and one step away, by the model's own derivatives."""
+    thetas, unit = prior.from_normal(coords), MAP_STEP * np.eye(coords.shape[1])
+    ahead, behind = (
+        prior.from_normal((coords[:, None] + sign * unit).reshape(-1, len(unit))).reshape(-1, *unit.shape)
+        for sign in (1.0, -1.0)
+    )
+    responses = simulate_batch(model, thetas, pool).response
+    good = np.isfinite(responses).all(axis=(1, 2))
+    changes = np.full((len(coords), len(unit), *responses.shape[1:]), np.nan)
+    by_theta = derivatives_batch(model, thetas[good], pool)
+    changes[good] = np.einsum("nzp,npct->nzct", (ahead - behind)[good] / (2.0 * MAP_STEP), by_theta)
+    changes *= steps[:, :, None, None]
+    return responses[:, None] + np.concatenate([np.zeros_like(changes[:, :1]), changes], axis=1)
 
 
 def _number(value: Any) -> float:
@@ -289,9 +320,11 @@ def rank_sensors(
         Number of independent samples that a channel is worth, if errors are correlated in time
         (`fe_likelihoods.effective_samples`), for all channels or by name as for `noise`. Default: all samples.
     draws : int
-        Number m of draws. It takes m (d + 1) simulations of d parameters, and as many of a `target_model`.
+        Number m of draws. It takes m (d + 1) simulations of d parameters, and as many of a `target_model`; of a model
+        with a method ``jacobian``, m simulations and m calls of it, which count as simulations.
     step : float
-        Step of the differences, in standard deviations of what is known.
+        Step of the differences, in standard deviations of what is known; for a model with ``jacobian``, of the target's
+        differences.
     seed : int
         Seed of the draws.
     pool : object with ``map(function, items)``, optional
@@ -345,10 +378,10 @@ def rank_sensors(
         if function is None:
             raise ValueError(f'target must be one number of the response, such as peak("top"); got {target!r}')
     slopes = slopes_at(model, known, coords, steps, function if other is model else None, pool)
-    gradients, simulations = slopes.gradients, coords.size + draws
+    gradients, simulations = slopes.gradients, draws * (2 if _is_differentiable(model) else known.dim + 1)
     if function is not None and other is not model:
         gradients = slopes_at(other, known, coords, steps, function, pool).gradients
-        simulations *= 2
+        simulations += draws * (2 if _is_differentiable(other) else known.dim + 1)
     good = np.isfinite(slopes.mean_squares).all(axis=1) & np.isfinite(gradients).all(axis=1)
     if good.sum() < 2:
         raise ValueError(

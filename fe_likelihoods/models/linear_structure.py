@@ -22,6 +22,7 @@ A. K. Chopra, Dynamics of Structures, 4th edition, Prentice Hall, 2012.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +33,55 @@ from .equivalent_linear import EquivalentLinear
 from .linear_system import Parts, complex_modes, superpose
 from .user_model import ExternalModel
 
-__all__ = ["LinearStructure"]
+__all__ = ["LinearStructure", "Sensor"]
+
+
+_MOTIONS = ("displacement", "velocity", "relative_acceleration")
+
+
+class Sensor(NamedTuple):
+    """A channel of a `LinearStructure`.
+
+    Attributes
+    ----------
+    name, quantity : str
+        Name and quantity of the channel.
+    row : int
+        Number of the channel of the parts at its place.
+    to : int or None
+        Number of the channel of the parts that it is relative to; None: relative to the supports, or absolute.
+    motion : int or None
+        0 for a displacement, 1 for a velocity, 2 for a relative acceleration; None for an absolute acceleration.
+    """
+
+    name: str
+    quantity: str
+    row: int
+    to: int | None = None
+    motion: int | None = None
+
+
+def _sensors(parts: Parts, outputs: Sequence[str]) -> tuple[Sensor, ...]:
+    """Resolve the names of outputs; ValueError as for `LinearStructure`."""
+    names, found = tuple(parts.channel_names), []
+    for output in outputs:
+        kind, _, place = str(output).partition("@")
+        of, _, to = (place, "", "") if place in names else place.partition(":")
+        if output in names:
+            found.append(Sensor(output, "absolute acceleration", names.index(output)))
+        elif kind in _MOTIONS and of in names and (not to or (to in names and to != of and parts.n_supports == 1)):
+            quantity = f"relative {kind.split('_')[-1]}"
+            row, other = names.index(of), names.index(to) if to else None
+            found.append(Sensor(output, quantity, row, other, _MOTIONS.index(kind)))
+        else:
+            raise ValueError(
+                f"LinearStructure: expected outputs out of {', '.join(names)}, one of {', '.join(_MOTIONS)} with @ and "
+                f"one of them, such as displacement@{names[-1]}, or, on one support, with two of them, such as "
+                f"displacement@{names[-1]}:{names[0]}; got {output!r}"
+            )
+    if isinstance(outputs, str) or len({each.name for each in found}) < len(found):
+        raise ValueError(f"LinearStructure: expected a sequence of outputs, each once; got {outputs!r}")
+    return tuple(found)
 
 
 class LinearStructure(ExternalModel):
@@ -53,6 +102,11 @@ class LinearStructure(ExternalModel):
         Time of the last sample of the channels, from the first sample of the supports [s]; between two samples, the
         earlier one is the last. Default: the end of the records. Later motion changes the response only if the
         properties depend on its amplitude (`EquivalentLinear`).
+    outputs : sequence of str, optional
+        Names of the channels. ``"roof"``, a channel of `parts`, is the absolute acceleration there.
+        ``"displacement@roof"``, ``"velocity@roof"`` and ``"relative_acceleration@roof"`` are relative to the support,
+        or to the quasi-static motion R g of several supports; ``"displacement@roof:floor 2"`` is relative to another
+        channel, the drift of the storeys between them. Default: the absolute accelerations of all channels of `parts`.
     lags : sequence of int
         Supports, counted from 0, whose recorder has a clock with an unknown lag. Each has a parameter, such as
         ``lag_2`` [s]: positive where its record is later than the other records and the measured response. Lags belong
@@ -61,13 +115,16 @@ class LinearStructure(ExternalModel):
     Raises
     ------
     ValueError
-        If a lag is of no support, all supports have one, there are no supports, their steps or lengths differ, `parts`
-        has another number of supports, or fewer than two samples are between `lead` and `until`.
+        If an output is unknown or repeated, a lag is of no support, all supports have one, there are no supports, their
+        steps or lengths differ, `parts` has another number of supports, or fewer than two samples are between `lead`
+        and `until`.
 
     Examples
     --------
     >>> model = LinearStructure(BridgeDeck("ch7"), [footing, south_end, north_end])
     >>> (acceleration,) = model.simulate([3.7, 0.09, 0.8])
+    >>> frame = ShearFrame({"floor 1": 1, "roof": 2}, [1.0, 1.0], [900.0, 900.0])
+    >>> drifts = LinearStructure(frame, base, outputs=("displacement@floor 1", "displacement@roof:floor 1"))
     """
 
     path_dependent = False
@@ -80,6 +137,7 @@ class LinearStructure(ExternalModel):
         lead: float = 0.0,
         until: float | None = None,
         lags: Sequence[int] = (),
+        outputs: Sequence[str] | None = None,
     ) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
         if not supports or not all(isinstance(support, Record) for support in supports):
@@ -104,24 +162,32 @@ class LinearStructure(ExternalModel):
                 "them, because a lag of all clocks is a lag of the sensors (time_shifts of FELikelihood); got "
                 f"{lags!r}"
             )
-        channels = tuple(Channel(name, "absolute acceleration", unit) for name in parts.channel_names)
+        names = tuple(parts.channel_names)
+        self.outputs = None if outputs is None or tuple(outputs) == names else tuple(outputs)
+        self.sensors = _sensors(parts, names if outputs is None else outputs)
+        units = {"displacement": "mm", "velocity": "mm/s"}
+        channels = tuple(
+            Channel(each.name, each.quantity, units.get(each.quantity.split()[-1], unit)) for each in self.sensors
+        )
         self._window = sample_window("the supports", first.n_steps, first.dt, lead, until)
-        names = (*parts.parameter_names, *(f"lag_{k}" for k in lags))
-        super().__init__(names, channels, first.dt, self._window.stop - self._window.start)
+        parameters = (*parts.parameter_names, *(f"lag_{k}" for k in lags))
+        super().__init__(parameters, channels, first.dt, self._window.stop - self._window.start)
         self.parts = parts
         self.supports = supports
         self.unit = unit
         self.lead = float(lead)
         self.lags = lags
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(repr(parts), self._window.start, [s.fingerprint for s in supports], *lags)
+        self.fingerprint = self._digest(
+            repr(parts), self._window.start, [s.fingerprint for s in supports], *lags, *(self.outputs or ())
+        )
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other support accelerations; errors as for a new structure.
 
         The lead is kept, `until` is not.
         """
-        return type(self)(self.parts, record, self.unit, self.lead, lags=self.lags)
+        return type(self)(self.parts, record, self.unit, self.lead, None, self.lags, self.outputs)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
@@ -165,7 +231,7 @@ class LinearStructure(ExternalModel):
         last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
         until = last * self.dt
         if self.lags or isinstance(self.parts, EquivalentLinear):  # later motion counts: a late one, or its level
-            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.lags)
+            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.lags, self.outputs)
         return self.with_record([support.trim(0.0, until) for support in self.supports])
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
@@ -176,8 +242,19 @@ class LinearStructure(ExternalModel):
         else:
             system = self.parts.assemble(theta)
         modes = complex_modes(system)
-        out = np.einsum("cs,st->ct", system.direct, motion)
-        superpose(modes, modes.shapes[:, 2] @ system.shape.T, motion, self.dt, out)
+        weights, direct = system.shape, system.direct
+        if self.outputs is not None:
+            weights = np.array(
+                [weights[each.row] - (0.0 if each.to is None else weights[each.to]) for each in self.sensors]
+            )
+            direct = direct[[each.row for each in self.sensors]]
+        shapes = modes.shapes[:, 2] @ weights.T
+        for c, each in enumerate(self.sensors):
+            if each.motion is not None:
+                shapes[:, c] = modes.shapes[:, each.motion] @ weights[c]
+                direct[c] = -weights[c] @ system.influence if each.motion == 2 else 0.0
+        out = np.einsum("cs,st->ct", direct, motion)
+        superpose(modes, shapes, motion, self.dt, out)
         return out[:, self._window]
 
     def _under_clocks(self, lags: np.ndarray) -> np.ndarray:

@@ -172,22 +172,30 @@ class RCColumn(ThreadedModel):
     The channels are the following outputs. Heights H are measured from the base and positions X from the axis of the
     column in the direction of loading [m].
 
-    ==================  ==========================================================================================
-    ``"acceleration"``  absolute acceleration of the top [m/s²], under a `Record` (default)
-    ``"displacement"``  displacement of the top relative to the base [m], under a `Record` (default)
-    ``"force"``         lateral force at the top [N], under a `DisplacementHistory` (default)
-    ``"base_moment"``   bending moment of the base section [N m]
-    ``"base_shear"``    restoring force that the column transmits to its base, without damping forces [N]
-    ``"axial_force"``   axial force of the base section [N]
-    ``"curvature@H"``   curvature of the section at height H [1/m]
-    ``"strain@H:X"``    strain at position X in that section, of the concrete or of a bar
-    ``"rotation@H:J"``  rotation of the section at height J relative to that at H [rad]; for H = 0 relative to the
-                        foundation, including the rotation by strain penetration
-    ==================  ==========================================================================================
+    ===========================  ===================================================================================
+    ``"acceleration"``           absolute acceleration of the top [m/s²], under a `Record` (default)
+    ``"displacement"``           displacement of the top relative to the base [m], under a `Record` (default)
+    ``"velocity"``               velocity of the top relative to the base [m/s], under a `Record`
+    ``"relative_acceleration"``  acceleration of the top relative to the base [m/s²], under a `Record`
+    ``"force"``                  lateral force at the top [N], under a `DisplacementHistory` (default)
+    ``"base_moment"``            bending moment of the base section [N m]
+    ``"base_shear"``             restoring force that the column transmits to its base, without damping forces [N]
+    ``"axial_force"``            axial force of the base section [N]
+    ``"displacement@H"``         displacement at height H relative to the base [m]
+    ``"velocity@H"``             velocity of the node at height H [m/s], under a `Record`; below the top with
+                                 `column_mass`. So are ``relative_acceleration@H`` and ``acceleration@H`` [m/s²]
+    ``"curvature@H"``            curvature of the section at height H [1/m]
+    ``"strain@H:X"``             strain at position X in that section, of the concrete or of a bar
+    ``"bar_stress@H:X"``         stress of the bar at position X of an element's section at height H [Pa]
+    ``"concrete_stress@H:X"``    stress of the concrete fiber nearest to position X of such a section [Pa]
+    ``"rotation@H:J"``           rotation of the section at height J relative to that at H [rad]; for H = 0 relative
+                                 to the foundation, including the rotation by strain penetration
+    ===========================  ===================================================================================
 
     Curvatures, rotations, moments and shear forces are positive where the column bends towards positive displacements.
-    Strains and axial forces are positive in tension and include the effect of gravity. Strains and curvatures belong to
-    a section at the heights `section_heights`, and are interpolated in between (``docs/sensors.rst``).
+    Strains, stresses and axial forces are positive in tension and include the effect of gravity. Strains and curvatures
+    belong to a section at the heights `section_heights`, and are interpolated in between, as displacements are between
+    nodes (``docs/sensors.rst``). Velocities and accelerations belong to nodes, and stresses to sections.
 
     Each value of theta is a multiple of a nominal value (`nominal`). The parameters are:
 

@@ -6,6 +6,7 @@ are drawn in the display units of the model. Moments have units of force times l
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from ..models.base import History
     from ..models.isolated_bridge import IsolatedBridge
+    from ..models.linear_structure import LinearStructure
     from ..models.rc_column import RCColumn
     from ..models.rc_column_parts import Patches
 
@@ -81,59 +83,119 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def plot_sensors(column: RCColumn, axes: Axes | None = None) -> Axes:
-    """Plot where the sensors of a column are: its elevation with every channel at its place.
+def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ranks: Sequence[str] = ()) -> Axes:
+    """Plot where the sensors of a column or of a building are: its elevation with every channel at its place.
 
     Parameters
     ----------
-    column : RCColumn
-        The column, such as `fe_likelihoods.RCColumn`; its channels have the names of its outputs.
+    model : RCColumn or LinearStructure
+        The column, or a building whose parts have floors or heights (`ShearFrame`, `GroupedFrame`,
+        `ShearFlexuralBeam`); its channels have the names of its outputs.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
+    ranks : sequence of str
+        Channels, the best first, such as ``rank_sensors(...).chosen``: they are numbered, and the labels of all other
+        channels are left out. Default: labels of all channels.
 
     Returns
     -------
     matplotlib Axes
-        The axes with the figure; lengths in metres.
-    """
-    from matplotlib.patches import Rectangle
+        The axes with the figure; lengths in metres, floors by their number, or shares of the height.
 
+    Raises
+    ------
+    ValueError
+        If a rank is of no channel, or the structure has no heights.
+    """
+    names, ranks = [channel.name for channel in model.channels], list(ranks)
+    if unknown := [name for name in ranks if name not in names]:
+        raise ValueError(f"ranks has the unknown channels {', '.join(unknown)}; the channels are {', '.join(names)}")
     axes = new_axes(axes, (6.8, 6.4))
-    radius, height = 0.5 * column.diameter, column.height
-    axes.add_patch(Rectangle((-radius, 0.0), 2.0 * radius, height, facecolor="#e9ebee", edgecolor="0.5"))
-    axes.add_patch(Rectangle((-2.2 * radius, -0.05 * height), 4.4 * radius, 0.05 * height, facecolor="0.6"))
-    axes.add_patch(Rectangle((-1.4 * radius, height), 2.8 * radius, 0.06 * height, facecolor="0.8", edgecolor="0.5"))
-    axes.hlines(np.unique(column.section_heights), -radius, radius, color="0.65", linestyle=":", linewidth=1.0)
-    places = sorted((_draw_sensor(name, axes, radius, height) for name in (c.name for c in column.channels)), key=_rank)
+    draw = _draw_building if hasattr(model, "parts") else _draw_column
+    radius, height, sensor = draw(model, axes)
+    places = sorted(
+        (_draw_sensor(axes, radius, *sensor(name), bool(ranks) and name not in ranks) for name in names), key=_rank
+    )
+    places = [each for each in places if not ranks or each[2] in ranks]
     ends = _label_heights([z for _, z, _ in places], height)
     for (x, z, name), end in zip(places, ends, strict=True):
+        label = f"{ranks.index(name) + 1}. {name}" if ranks else name
         axes.plot([x, 2.4 * radius, 2.8 * radius], [z, end, end], color=GREY, linewidth=0.6, zorder=1)
-        axes.text(2.85 * radius, end, name, va="center", fontsize="small")
+        axes.text(2.85 * radius, end, label, va="center", fontsize="small")
     axes.set(xlim=(-2.4 * radius, 6.5 * radius), ylim=(-0.07 * height, 1.1 * height))
-    axes.set(xlabel="position in the direction of loading [m]", ylabel="height above the base [m]")
-    axes.set_xticks([-radius, 0.0, radius], [f"{x:.3g}" for x in (-radius, 0.0, radius)])
-    axes.set_title("dotted: sections of the elements", fontsize="small")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     return axes
 
 
-def _draw_sensor(name: str, axes: Axes, radius: float, height: float) -> tuple[float, float, str]:
-    """Draw one sensor by its name, such as "strain@0.3:0.5"; return the place at which its label points, and it."""
-    kind, _, place = name.partition("@")
-    values = [float(number) for number in place.split(":")] if place else []
-    if kind == "strain":
-        axes.plot(values[1], values[0], "o", color=ORANGE, markersize=5, zorder=3)
-        return values[1], values[0], name
+Drawn = tuple[float, float, Callable[[str], tuple[str, list[float], str]]]
+"""Half the width, the height, and a function from a channel to its kind, its place and its name."""
+
+
+def _draw_column(column: RCColumn, axes: Axes) -> Drawn:
+    from matplotlib.patches import Rectangle
+
+    radius, height = 0.5 * column.diameter, column.height
+    axes.add_patch(Rectangle((-radius, 0.0), 2.0 * radius, height, facecolor="#e9ebee", edgecolor="0.5"))
+    axes.add_patch(Rectangle((-2.2 * radius, -0.05 * height), 4.4 * radius, 0.05 * height, facecolor="0.6"))
+    axes.add_patch(Rectangle((-1.4 * radius, height), 2.8 * radius, 0.06 * height, facecolor="0.8", edgecolor="0.5"))
+    axes.hlines(np.unique(column.section_heights), -radius, radius, color="0.65", linestyle=":", linewidth=1.0)
+    axes.set(xlabel="position in the direction of loading [m]", ylabel="height above the base [m]")
+    axes.set_xticks([-radius, 0.0, radius], [f"{x:.3g}" for x in (-radius, 0.0, radius)])
+    axes.set_title("dotted: sections of the elements", fontsize="small")
+
+    def sensor(name: str) -> tuple[str, list[float], str]:
+        kind, _, place = name.partition("@")
+        values = [float(number) for number in place.split(":")] if place else []
+        at_top = kind in ("acceleration", "relative_acceleration", "velocity", "displacement", "force")
+        return kind, values or [height if at_top else 0.0], name
+
+    return radius, height, sensor
+
+
+def _draw_building(model: LinearStructure, axes: Axes) -> Drawn:
+    parts = getattr(model.parts, "parts", model.parts)  # of an EquivalentLinear
+    places = dict(getattr(parts, "floors", None) or getattr(parts, "heights", None) or ())
+    if not places:
+        raise ValueError(
+            f"expected a building whose parts have floors or heights; got {type(parts).__name__}: its channels have no "
+            "known places"
+        )
+    floors = hasattr(parts, "floors")
+    height, radius = (len(parts.masses), 0.25 * len(parts.masses)) if floors else (1.0, 0.25)
+    axes.vlines([-radius, radius], 0.0, height, color="0.5", linewidth=1.5)
+    axes.hlines(np.arange(1, height + 1) if floors else [height], -radius, radius, color="0.5", linewidth=3.0)
+    axes.hlines(0.0, -2.0 * radius, 2.0 * radius, color="0.4", linewidth=4.0)
+    axes.set_ylabel("floor" if floors else "height, as a share of the building's")
+    axes.set_xticks([])
+    names = list(places)
+
+    def sensor(name: str) -> tuple[str, list[float], str]:
+        its = next(each for each in model.sensors if each.name == name)
+        ends = [places[names[k]] for k in (its.to, its.row) if k is not None]
+        return "rotation" if len(ends) == 2 else "motion", sorted(ends), name
+
+    return radius, float(height), sensor
+
+
+def _draw_sensor(
+    axes: Axes, radius: float, kind: str, place: list[float], name: str, faint: bool
+) -> tuple[float, float, str]:
+    """Draw one sensor at its place, faintly or not; return the place at which its label points, and its name."""
+    alpha = 0.35 if faint else 1.0
+    if kind in ("strain", "bar_stress", "concrete_stress"):
+        axes.plot(place[1], place[0], "o", color=ORANGE, markersize=5, zorder=3, alpha=alpha)
+        return place[1], place[0], name
     if kind == "curvature":
-        axes.plot([-radius, radius], [values[0]] * 2, color=BLUE, linewidth=2.0, zorder=2)
-        return radius, values[0], name
+        axes.plot([-radius, radius], [place[0]] * 2, color=BLUE, linewidth=2.0, zorder=2, alpha=alpha)
+        return radius, place[0], name
     if kind == "rotation":
-        axes.plot([1.2 * radius] * 2, values, color=ORANGE, marker="_", markersize=9, linewidth=1.6, zorder=2)
-        return 1.2 * radius, 0.5 * (values[0] + values[1]), name
-    z = height if kind in ("acceleration", "displacement", "force") else 0.0
-    axes.plot(0.0, z, "s", color="0.25", markersize=5, zorder=3)
-    return 0.0, z, name
+        axes.plot(
+            [1.2 * radius] * 2, place, color=ORANGE, marker="_", markersize=9, linewidth=1.6, zorder=2, alpha=alpha
+        )
+        return 1.2 * radius, 0.5 * (place[0] + place[1]), name
+    axes.plot(0.0, place[0], "s", color="0.25", markersize=5, zorder=3, alpha=alpha)
+    return 0.0, place[0], name
 
 
 def _label_heights(heights: list[float], height: float) -> list[float]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from fe_likelihoods import (
     Channel,
@@ -120,6 +120,46 @@ def test_standard_errors_cover_another_set_of_draws():
     error = np.hypot(first.alone_error, second.alone_error)
     assert (np.abs(first.alone - second.alone) < 4.0 * error).all() and (error > 0.01).all()
     assert 0 < first.failed < 40 and f"{first.failed} more were left out" in str(first)
+
+
+def test_derivatives_of_the_model_replace_differences():
+    """Of an oscillator with bounded and correlated parameters: the slopes are those of fine differences."""
+    motion = problems.table_motion().trim(0.0, 4.0).resample(0.02)
+    model = LinearOscillator(motion, 0.5)
+    without = FunctionModel(model.simulate, model.parameter_names, model.channels, model.dt, model.n_steps)
+    design, target = model.with_record(motion.scale(2.0)), peak("displacement")
+    prior = Prior({("stiffness", "damping"): multivariate_normal([1.0, 1.0], [[0.04, 0.03], [0.03, 0.09]])})
+    bounded = Prior({"stiffness": TruncatedNormal(1.0, 0.2), "damping": TruncatedNormal(1.0, 0.3)})
+    for known in (prior, bounded):
+        coords = 0.5 * np.random.default_rng(1).standard_normal((4, 2))
+        fine = slopes_at(without, known, coords, np.full((4, 2), 1e-5), lambda response: response[0, 50])
+        own = slopes_at(model, known, coords, np.full((4, 2), 1e-5), lambda response: response[0, 50])
+        for one, other in zip(own, fine, strict=True):
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=2e-4 * np.abs(other).max())
+    exact, rough = (
+        rank_sensors(each, bounded, target=target, target_model=design, draws=10, step=0.01)
+        for each in (model, without)
+    )
+    assert exact.chosen == rough.chosen and (exact.simulations, rough.simulations) == (40, 50)
+    np.testing.assert_allclose(exact.target_left, rough.target_left, rtol=0.03)
+
+
+def test_failed_draws_of_a_model_with_derivatives_are_left_out():
+    def respond(theta):
+        if theta[0] > 2.5:
+            raise SimulationFailed("too large")
+        return np.stack([theta[0] * SHAPES[0], theta[0] ** 2 * SHAPES[1]])
+
+    def slopes(theta):
+        return np.stack([SHAPES[0], 2.0 * theta[0] * SHAPES[1]])[None]
+
+    models = [FunctionModel(respond, ("x",), CHANNELS[:2], 0.02, 40, jacobian=each) for each in (slopes, None)]
+    own, rough = (rank_sensors(each, {"x": norm(1.0, 1.0)}, noise={"a": 0.1, "b": 0.1}, draws=100) for each in models)
+    assert 0 < own.failed and own.simulations == 200
+    np.testing.assert_allclose(own.alone, rough.alone, rtol=0.05)
+    wrong = FunctionModel(respond, ("x",), CHANNELS[:2], 0.02, 40, jacobian=lambda theta: slopes(theta)[0])
+    with pytest.raises(ValueError, match="jacobian to return finite derivatives"):
+        rank_sensors(wrong, {"x": norm(1.0, 1.0)}, draws=3)
 
 
 @pytest.mark.slow

@@ -105,6 +105,56 @@ def test_two_storeys_under_a_step_follow_their_modes():
     np.testing.assert_allclose(same, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
+def test_floors_move_in_equilibrium(three):
+    """M x'' + C u' + K u = 0 holds between the channels of all floors; drifts are differences."""
+    floors, theta = {"f1": 1, "f2": 2, "f3": 3}, np.array([900.0, 800.0, 700.0, 0.05, 0.04, 0.03])
+    parts = ShearFrame(floors, [1.0, 1.2, 0.8], [1.0, 1.0, 1.0])
+    kinds = ("displacement", "velocity", "relative_acceleration")
+    names = (*(f"{kind}@{floor}" for kind in kinds for floor in floors), *floors)
+    model = LinearStructure(parts, three[0], outputs=names)
+    u, v, a, absolute = model.simulate(theta).reshape(4, 3, -1)
+    found = parts.assemble(theta)
+    forces = found.mass @ absolute, found.damping @ v + found.stiffness @ u
+    np.testing.assert_allclose(forces[0], -forces[1], rtol=0, atol=1e-11 * np.abs(forces[0]).max())
+    np.testing.assert_allclose(absolute - three[0].acceleration, a, rtol=0, atol=1e-12 * np.abs(absolute).max())
+    np.testing.assert_array_equal(absolute, LinearStructure(parts, three[0]).simulate(theta))
+    drifts = LinearStructure(parts, three[0], outputs=("displacement@f3:f1", "velocity@f2:f1", "f2"))
+    rows = drifts.simulate(theta)
+    np.testing.assert_allclose(
+        rows, [u[2] - u[0], v[1] - v[0], absolute[1]], rtol=0, atol=1e-12 * np.abs(absolute).max()
+    )
+    assert [(each.quantity, each.unit) for each in drifts.channels] == [
+        ("relative displacement", "mm"),
+        ("relative velocity", "mm/s"),
+        ("absolute acceleration", "g"),
+    ]
+    np.testing.assert_array_equal(drifts.first(2.0).simulate(theta), rows[:, :101])
+    np.testing.assert_array_equal(drifts.with_record(three[1]).with_record(three[0]).simulate(theta), rows)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(drifts)).simulate(theta), rows)
+
+
+def test_relative_motion_on_several_supports_is_dynamic(three):
+    """Relative to the motion that follows the supports slowly: the weighted oscillator."""
+    base, first, second = (record.acceleration for record in three)
+    outputs = ("displacement@m", "velocity@s", "relative_acceleration@s")
+    weighted = 0.3 * base + 0.35 * (first + second)
+    rows = LinearStructure(BridgeDeck("m", "s"), three, outputs=outputs).simulate([3.0, 0.08, 0.7, 0.6])
+    alone = respond(weighted, DT, 2 * math.pi * 3.0, 0.08)
+    expected = [alone.displacement, 0.6 * alone.velocity, 0.6 * (alone.acceleration - weighted)]
+    for row, values in zip(rows, expected, strict=True):
+        np.testing.assert_allclose(row, values, rtol=0, atol=1e-11 * np.abs(values).max())
+
+
+def test_drifts_are_data(three):
+    from fe_likelihoods import FELikelihood, Measurements
+
+    parts, theta = ShearFrame({"low": 1, "top": 2}, [1.0, 1.0], [1.0, 1.0]), np.array([900.0, 700.0, 0.05, 0.04])
+    model = LinearStructure(parts, three[0], outputs=("displacement@low", "displacement@top:low"))
+    likelihood = FELikelihood(model, Measurements(model.channels, DT, model.simulate(theta)))
+    assert likelihood.parameter_names[-1] == "sigma_displacement@top:low"
+    assert likelihood([*theta, 1e-3, 1e-3]) > likelihood([950.0, *theta[1:], 1e-3, 1e-3]) + 1.0
+
+
 def test_a_sampled_sine_converges_at_second_order():
     """The only error is the linear interpolation between samples."""
     parts, forcing = ShearFrame({"top": 3}, [1, 1, 1.3], [1, 1, 1]), 9.0
@@ -202,10 +252,12 @@ def test_fingerprint_depends_on_parts_and_supports(three):
         LinearStructure(BridgeDeck("m"), three[::-1]),
         LinearStructure(BridgeDeck("m"), three, lead=1.0),
         model.with_record([three[0].scale(2.0), *three[1:]]),
+        LinearStructure(BridgeDeck("m"), three, outputs=("displacement@m",)),
         LinearStructure(ShearFrame({"m": 1}, [1], [1]), three[0]),
         LinearStructure(ShearFrame({"m": 1}, [1], [2]), three[0]),
     ]
-    assert len({model.fingerprint, *(other.fingerprint for other in others)}) == 8
+    assert len({model.fingerprint, *(other.fingerprint for other in others)}) == 9
+    assert LinearStructure(BridgeDeck("m"), three, outputs=("m",)).fingerprint == model.fingerprint
 
 
 @pytest.mark.parametrize(
@@ -225,6 +277,10 @@ def test_fingerprint_depends_on_parts_and_supports(three):
         (lambda r: ShearFrame({"top": 2}, [1, 1], [1]), "a stiffness for each of 2"),
         (lambda r: ShearFrame({"top": 2}, [1, -1], [1, 1]), "positive mass or stiffness"),
         (lambda r: ShearFrame({"top": 2}, [1, 1], [1, 1], [1, 2]), "fewer than 2"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, outputs=("n",)), "expected outputs out of m, one of.*; got 'n'"),
+        (lambda r: LinearStructure(BridgeDeck("m", "s"), r, outputs=("displacement@m:s",)), "on one support"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, outputs=("strain@m",)), "one of displacement, velocity"),
+        (lambda r: LinearStructure(BridgeDeck("m"), r, outputs=("m", "m")), "each once"),
         (lambda r: LinearStructure(ShearFrame((), [1, 1], [1, 1]), r[0]), "channels must be a tuple of one or more"),
     ],
 )
