@@ -38,8 +38,8 @@ def column(tmp_path):
     base = [f"{t:.2f},{a!r}" for t, a in zip(record.time, record.acceleration.tolist(), strict=True)]
     (tmp_path / "base.csv").write_text("\n".join(["time_s,acc", *base]))
 
-    def problem(rows: list[str], text: str = COLUMN):
-        (tmp_path / "top.csv").write_text("\n".join(["time_s,top [mm]", *rows]))
+    def problem(rows: list[str], text: str = COLUMN, unit: str = "mm"):
+        (tmp_path / "top.csv").write_text("\n".join([f"time_s,top [{unit}]", *rows]))
         (tmp_path / "own.toml").write_text(text)
         return make_problem(read_job(tmp_path / "own.toml"))
 
@@ -95,3 +95,20 @@ def test_the_template_is_the_ready_made_posterior():
     point = usual.prior.mean()
     assert found.posterior.log_prob(point) == pytest.approx(usual.log_prob(point), rel=1e-12)
     assert found.truth["Ec"] == 0.8
+
+
+def test_sensors_below_the_top_and_drifts_of_floors_are_channels(column):
+    """The names of the columns are the outputs of the built-in structure."""
+    rows = [f"{0.01 * k:.2f},{k % 89}" for k in range(201)]
+    text = COLUMN.replace("mesh = 10", "mesh = 10\ncolumn_mass = 2e4")
+    for name, unit in (("displacement@1.2", "mm"), ("velocity@2.5", "cm/s"), ("acceleration@2.5", "g")):
+        found = column(rows, text.replace("displacement =", f'"{name}" =').replace("[mm]", f"[{unit}]"), unit)
+        (channel,) = found.posterior.likelihood.model.channels
+        assert channel.name == name and found.posterior.parameter_names[-1] == f"sigma_{name}"
+    with pytest.raises(ValueError, match=r"a height of a node, 2.5, 5 m; got 'velocity@1.2'"):
+        column(rows, text.replace("displacement =", '"velocity@1.2" ='))
+    frame = "[model]\nkind = 'frame'\nmasses = [1.0, 1.0]\nstiffnesses = [62.0, 62.0]\nfloors = {low = 1, top = 2}\n"
+    priors = "".join(f'{what}_{i} = "normal(1, 0.2)"\n' for what in ("stiffness", "damping") for i in (1, 2))
+    text = frame + COLUMN[COLUMN.index("[record]") : COLUMN.index("Ec =")] + priors
+    model = column(rows, text.replace("displacement =", '"displacement@top:low" =')).posterior.likelihood.model
+    assert [channel.name for channel in model.channels] == ["displacement@top:low"]
