@@ -76,7 +76,11 @@ class Run(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """One line of the table of `coverage`: counts of verdicts, percentages, means."""
+    """One line of the table of `coverage`: counts of verdicts, percentages, means.
+
+    Alarms are warnings and the verdict "not usable": `false_alarms` counts them in the `right` runs, `missed` counts
+    the other runs without any.
+    """
 
     problem: str
     budget: int
@@ -89,8 +93,9 @@ class Coverage(NamedTuple):
     means_covered: float | None
     simulations: float | None
     ESS: float | None
-    wrong_converged: int
-    wrong_usable: int
+    right: int
+    false_alarms: int
+    missed: int
 
 
 def few_simulations(
@@ -187,7 +192,8 @@ def coverage(
 
 
 def _coverage(name: str, budget: int, runs: int) -> Coverage:
-    status, wrong, evidence, means, simulations, effective = [], [], [], [], [], []
+    status, evidence, means, simulations, effective = [], [], [], [], []
+    right = false_alarms = missed = 0
     for seed in range(1, runs + 1):
         data = 1 + seed % DATA_SETS
         posterior, labels = _posterior(name, data)
@@ -197,8 +203,10 @@ def _coverage(name: str, budget: int, runs: int) -> Coverage:
         outcome = run(posterior, 1000 + seed, budget)
         errors = compare(outcome, known, labels)
         status.append("failed" if outcome.failed else outcome.status)
-        if errors.judgement == "WRONG":
-            wrong.append(status[-1])
+        alarm = bool(outcome.failed or outcome.warnings or outcome.status == "not usable")
+        right += not (outcome.failed or errors.wrong)
+        false_alarms += alarm and not (outcome.failed or errors.wrong)
+        missed += errors.wrong and not alarm
         if outcome.failed or outcome.status == "not usable":
             continue
         evidence.append(100.0 * (abs(errors.log_evidence_z) < 2.0))
@@ -208,7 +216,7 @@ def _coverage(name: str, budget: int, runs: int) -> Coverage:
         effective.append(outcome.effective_sample_size)
     counts = (status.count(each) for each in ("failed", "not usable", "usable", "converged"))
     averages = (float(np.mean(each)) if each else None for each in (evidence, means, simulations, effective))
-    return Coverage(name, budget, runs, *counts, *averages, wrong.count("converged"), wrong.count("usable"))
+    return Coverage(name, budget, runs, *counts, *averages, right, false_alarms, missed)
 
 
 # ---------------------------------------------------------------- references
@@ -248,8 +256,8 @@ def load() -> dict[str, dict[str, Any]]:
 
 
 def key_of(name: str, seed: int) -> str:
-    """Key of a problem and seed in the file: measured data have one reference for all seeds."""
-    return f"{name} {1 if PROBLEMS[name].measured else seed}"
+    """Key of a problem and seed: measured data have one reference, and derivatives do not change a posterior."""
+    return f"{name.removesuffix('_jacobian')} {1 if PROBLEMS[name].measured else seed}"
 
 
 def references(repeats: int, problems: tuple[str, ...] = tuple(PROBLEMS)) -> Iterator[Row]:

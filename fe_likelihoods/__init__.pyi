@@ -40,6 +40,7 @@ from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
 from .prediction.annual_risk import annual_risk
 from .prediction.averaging import average_predictions
+from .prediction.few_runs import propagate_few
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
 from .prediction.new_event import event_ratios, predict_new_event
@@ -154,6 +155,7 @@ __all__ = [
     "predict_new_event",
     "problems",
     "propagate",
+    "propagate_few",
     "rank_sensors",
     "read_columns",
     "read_imposed_test",

@@ -77,6 +77,8 @@ class Errors(NamedTuple):
         Largest relative error of a standard deviation.
     share : float
         Largest error of the share of a mode.
+    wrong : bool
+        Whether an error exceeds what the run states, whatever its verdict.
     judgement : str
         "right", "refused" (the verdict is "not usable"), "WRONG", "no error" (a standard error is infinite or NaN), or
         the exception that ended the run.
@@ -88,6 +90,7 @@ class Errors(NamedTuple):
     mean_z: float
     sd: float
     share: float
+    wrong: bool
     judgement: str
 
 
@@ -165,7 +168,7 @@ def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.
     Errors
     """
     if outcome.failed:
-        return Errors(*[np.nan] * 6, outcome.failed)
+        return Errors(*[np.nan] * 6, False, outcome.failed)
     evidence = outcome.log_evidence - reference.log_evidence
     evidence_se = np.hypot(outcome.log_evidence_error, reference.log_evidence_error)
     mean = np.abs(outcome.mean - reference.mean)
@@ -196,5 +199,6 @@ def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.
         float((mean / mean_se).max()),
         float(sd.max()),
         float(share),
+        bool(wrong),
         judgement,
     )
