@@ -37,6 +37,7 @@ from . import (
     overhead,
     peers,
     samplers,
+    sensor_ranks,
     sequential,
     starts,
     startup,
@@ -54,6 +55,8 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "simulation": column.simulation,
     "batch": column.batch,
     "sensors": column.sensors,
+    "sensor_variances": sensor_ranks.variances,
+    "sensor_heights": sensor_ranks.heights,
     "bridge": bridge.simulation,
     "bridge_steps": bridge_steps.steps,
     "imports": startup.imports,
@@ -122,6 +125,8 @@ QUICK: dict[str, dict[str, Any]] = {
     "level_ratios": {"data_sets": 2},
     "fragility_bands": {"data_sets": 2},
     "annual_rates": {"data_sets": 2},
+    "sensor_variances": {"cases": ("oscillator",), "tests": 2},
+    "sensor_heights": {"draws": 2},
     "stiffness_loss": {"twins": 4, "file": "results/stiffness_loss_quick.jsonl"},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""
