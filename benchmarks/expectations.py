@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fe_likelihoods import Posterior, Prediction, peak, propagate_few
+from fe_likelihoods import Posterior, peak, propagate_few
+from fe_likelihoods.prediction.prediction import Prediction
 from samplers import SamplingWarning, SMCSampler
 
 from .few_simulations_problems import PROBLEMS, oscillator
