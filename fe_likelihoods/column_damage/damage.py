@@ -136,6 +136,8 @@ class Damage(NamedTuple):
         State of the structure at the beginning, "virgin" or "end".
     uncertainty : str
         Which uncertainties the probabilities contain.
+    remarks : tuple of str
+        What speaks against the prediction (`Prediction.remarks`), such as residual drifts of a column that still moves.
     """
 
     events: tuple[str, ...]
@@ -155,6 +157,7 @@ class Damage(NamedTuple):
     n_collapsed: int
     from_state: str
     uncertainty: str
+    remarks: tuple[str, ...] = ()
 
     @property
     def failures(self) -> str:
@@ -191,7 +194,8 @@ class Damage(NamedTuple):
         width = max([20, *(len(cell) for _, cells in rows for cell in cells)]) + 2
         lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
         closing = [f"The probabilities contain {self.uncertainty}."]
-        return "\n".join([*lines, "", *closing, *([f"{self.failures}."] if self.failures else [])])
+        closing += [f"{self.failures}."] if self.failures else []
+        return "\n".join([*lines, "", *closing, *(f"CAUTION: {remark}" for remark in self.remarks)])
 
     def plot(self, events: Sequence[str] | None = None) -> Figure:
         """Draw the column with its probabilities, see `fe_likelihoods.plots.damage.plot_damage`."""
@@ -335,6 +339,7 @@ def damage(
         n_collapsed=len(prediction.collapsed),
         from_state=prediction.from_state,
         uncertainty=_contents(states, errors, weights is not None),
+        remarks=prediction.remarks,
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..prediction.quantities import ChannelQuantity, MeanOfLast
 from ..signals.events import Events
 from ..signals.records import Record
 from ..signals.sampling import same_step
@@ -160,15 +161,26 @@ class DamageMeasures:
             named |= {name: strains[..., k] for k, name in enumerate(STRAIN_MEASURES)}
         return named
 
+    @property
+    def final_values(self) -> dict[str, ChannelQuantity]:
+        """Residual displacements by name, for the remark on a structure that still moves; empty if not measured."""
+        names = [f"{self.sensors.displacement} after {event}" for event in self.events]
+        return dict(zip(names, self._residual, strict=True)) if "residual drift" in self.measures else {}
+
+    @property
+    def _residual(self) -> list[ChannelQuantity]:
+        """Residual displacement after each event."""
+        mean = MeanOfLast(max(1, round(self.settle / self.dt)))
+        return [ChannelQuantity(self.sensors.displacement, mean, slice(w.first, w.rest)) for w in self.windows]
+
     def _structure(self, response: np.ndarray) -> np.ndarray:
         """Measures of the whole structure, shape (n_events, n_measures)."""
         u = response[self.rows[self.sensors.displacement]] if self.sensors.displacement else None
         found: dict[str, np.ndarray] = {}
         if u is not None:
             found["peak drift"] = np.array([np.abs(u[w.first : w.stop]).max() for w in self.windows]) / self.height
-            averaged = max(1, round(self.settle / self.dt))
             found["residual drift"] = np.array(
-                [abs(u[max(w.first, w.rest - averaged) : w.rest].mean()) / self.height for w in self.windows]
+                [abs(each.evaluate([u], self.dt)) / self.height for each in self._residual]
             )
         if self.sensors.force:
             force = response[self.rows[self.sensors.force]]

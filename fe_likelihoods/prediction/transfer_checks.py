@@ -55,6 +55,7 @@ _TOO_LARGE = 0.75  # multiple of the response that fits best, below which the re
 _WORSE = 1.1  # RRMSE of the response divided by the RRMSE of its best multiple, beyond which this is said
 _NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 _LAST, _UNSETTLED = 2.0, 0.1  # seconds at the end; half the range there by the final value, beyond which it is told
+_NO_MOTION = 0.01  # half the range by the largest response, up to which it does not matter
 _SAME = 1e-6  # difference of two responses, relative to their norm, up to which a motion changes nothing
 _OTHER_LEVEL = 1.3  # ratio of the residuals to the noise of the same sample, beyond which it is no sample of a fit
 Calibrated = list[dict[str, np.ndarray]]  # measured histories of the channels [SI], of each event
@@ -87,38 +88,42 @@ class Ends:
     Parameters
     ----------
     quantities : iterable of object
-        Predicted quantities; those by `final_value` are examined.
+        Predicted quantities; those by `final_value` are examined, and `final_values` of others by name.
     model : Model
         The model that predicts. Tests with imposed deformations are not examined.
     """
 
     def __init__(self, quantities: Iterable[Any], model: Any) -> None:
-        several = [one for each in quantities for one in (each if isinstance(each, list | tuple) else [each])]
-        final = [one for one in several if isinstance(getattr(one, "function", None), MeanOfLast)]
+        final: dict[str, ChannelQuantity] = {}
+        for each in quantities if motions_of(model) else ():
+            final |= getattr(each, "final_values", {})
+            several = each if isinstance(each, list | tuple) else [each]
+            final |= {one.channel: one for one in several if isinstance(getattr(one, "function", None), MeanOfLast)}
         names = [channel.name for channel in model.channels]
-        self._final = {one.channel: (names.index(one.channel), one) for one in final if motions_of(model)}
-        self._steps, self._dt = max(2, round(_LAST / model.dt)), model.dt
-        self._found: dict[str, list[tuple[float, float]]] = {name: [] for name in self._final}
+        self._final = {name: (names.index(one.channel), one.part, one.function) for name, one in final.items()}
+        self._steps = max(2, round(_LAST / model.dt))
+        self._found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in self._final}
 
     def add(self, responses: np.ndarray, reasons: Sequence[str]) -> None:
         """Add responses (m, n_channels, n_steps) that did not fail."""
-        for name, (row, quantity) in self._final.items():
-            for response, reason in zip(responses, reasons, strict=True):
-                if not reason:
-                    value = abs(quantity.evaluate([response[row]], self._dt))
-                    self._found[name].append((0.5 * float(np.ptp(response[row, -self._steps :])), value))
+        for name, (row, part, function) in self._final.items():
+            for response in (each[row, part] for each, reason in zip(responses, reasons, strict=True) if not reason):
+                samples = min(function.samples, len(response))  # the mean of so many, which ends at each of the last
+                means = np.convolve(response[-(self._steps + samples - 1) :], np.full(samples, 1.0 / samples), "valid")
+                self._found[name].append((0.5 * np.ptp(means), abs(function(response)), np.abs(response).max()))
 
     def remark(self) -> str:
         """Remark on final values during a vibration, by medians over the samples; empty if there are none."""
         medians = {name: np.median(found, axis=0) for name, found in self._found.items() if found}
-        moving = [f"{name} (+- {a / v:.0%})" for name, (a, v) in medians.items() if v > 0.0 and a > _UNSETTLED * v]
+        limits = {name: max(_UNSETTLED * value, _NO_MOTION * largest) for name, (_, value, largest) in medians.items()}
+        moving = [f"{name} (+- {a / v:.0%})" for name, (a, v, _) in medians.items() if v > 0.0 and a > limits[name]]
         if not moving:
             return ""
         return (
             f"the structure still moves in the last {_LAST:g} s, by a part of its final value: {', '.join(moving)}. A "
             "residual value is what is left after free vibration: append rest to the record, "
             'record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0), or take the mean over whole '
-            "periods, final_value(channel, samples=...)"
+            "periods, final_value(channel, samples=...) or damage_measures(settle=...)"
         )
 
 

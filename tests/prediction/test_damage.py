@@ -13,6 +13,7 @@ from fe_likelihoods import (
     DisplacementHistory,
     EventRatios,
     Events,
+    FunctionModel,
     IsolatedBridge,
     LinearOscillator,
     RCColumn,
@@ -92,6 +93,27 @@ def test_energy_drifts_and_index_of_a_loop():
     omega = np.sqrt(model.k / model.m)
     np.testing.assert_allclose(found["period"], 2.0 * np.pi / omega, rtol=1e-4)
     np.testing.assert_allclose(found["damping"], model.c / (2.0 * model.m * omega), rtol=1e-4)
+
+
+def test_residual_drifts_of_a_structure_that_still_moves_are_said(rng):
+    """An oscillator of 1 Hz beside a displacement that stays: free vibration of 8 or 60 s after each event."""
+    motion = Record("EQ", 0.02, rng.standard_normal(500))
+    for rests, moves in ((8.0, True), (60.0, False)):
+        events = Events([motion, motion, Record("rest", 0.02, [0.0, 0.0])], rest=rests, names=["EQ1", "EQ2", "rest"])
+        wave = LinearOscillator(events).simulate([1.0, 1.0])[1]
+        channels = [Channel("u", "relative displacement", "m")]
+        stays = 0.02 * np.abs(wave).max()
+        model = FunctionModel(lambda theta, u=wave + stays: [theta[0] * u], ["g"], channels, 0.02, len(wave))
+        model.record = events
+        for settle in (0.1, 1.0):  # a mean over a period is known while the structure vibrates
+            measures = damage_measures(model, displacement="u", settle=settle)
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                found = damage(propagate(model, np.ones((5, 1)), quantity=measures, progress=False), [], noise=False)
+            remarks = [remark for remark in found.remarks if "still moves in the last 2 s" in remark]
+            assert len(remarks) == len(told) == (moves and settle < 1.0)
+            assert all("u after EQ1 (+- " in remark and "u after EQ2 (+- " in remark for remark in remarks)
+            assert ("CAUTION" in str(found)) == bool(remarks)
 
 
 def test_period_and_damping_are_those_of_a_linear_oscillator():

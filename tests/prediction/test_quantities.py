@@ -161,16 +161,18 @@ def test_a_final_value_during_a_vibration_is_said_and_after_rest_it_is_not(rng):
         wave = LinearOscillator(record).simulate([1.0, 1.0])[1]
         return wave + 0.2 * np.abs(wave).max()
 
-    for motion, expected in ((record, 1), (rest, 0)):
+    free = record.followed_by(Record("rest", 0.02, [0.0, 0.0]), rest=8.0)
+    last, period = final_value("top"), final_value("top", samples=50)
+    for motion, quantity, expected in ((record, last, 1), (rest, last, 0), (free, last, 1), (free, period, 0)):
         channels = [Channel("top", "displacement", "mm")]
         model = FunctionModel(
             lambda theta, motion=motion: [theta[0] * drifting(motion)], ["g"], channels, 0.02, motion.n_steps
         )
         model.record = motion
-        for quantity in (final_value("top"), {"end": [final_value("top"), peak("top")]}):
+        for wanted in (quantity, {"end": [quantity, peak("top")]}):
             with warnings.catch_warnings(record=True) as found:
                 warnings.simplefilter("always")
-                propagate(model, np.ones((5, 1)), quantity=quantity, progress=False)
+                propagate(model, np.ones((5, 1)), quantity=wanted, progress=False)
             said = [str(each.message) for each in found]
             assert sum("still moves in the last 2 s" in text and "top (+- " in text for text in said) == expected
         with warnings.catch_warnings():  # the peak of the same response has no such remark
