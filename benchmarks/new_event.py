@@ -10,8 +10,6 @@ of their medians as parameters, and the ratios of its events there (`event_ratio
 *Twins*: log peaks that scatter by a known standard deviation between events, of gains and of ratios that are correlated
 with them (-0.5); 200 data sets per repeat.
 
-*One at a time*: each Painter Street earthquake from the ten others by their `Hierarchy`: histories, and peaks.
-
 The rows are the shares of numbers within their 50 and 90 % intervals, in the mean and in the worst of twenty subsets,
 with the number of the pooled ones, the median ratio of the ends of the 90 % interval, and the mean interval score of
 the logarithm. The measurements are real and no part of the project: set FE_SHARED. What is missing has a row.
@@ -26,10 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fe_likelihoods import (
-    Channel,
     EventRatios,
     FELikelihood,
-    FunctionModel,
     Measurements,
     arias_intensity,
     event_ratios,
@@ -83,8 +79,7 @@ def new_event(repeats: int = 1, data_sets: int = 200, subsets: int = 20) -> list
         rows += found
         if structure is not None:
             rows += _subsets(name, structure, repeats * subsets)
-    rows += _columns(repeats * subsets) + _one_at_a_time()
-    return rows + _twins(repeats * data_sets)
+    return rows + _columns(repeats * subsets) + _twins(repeats * data_sets)
 
 
 def scored(ratios: EventRatios, measured: np.ndarray, predicted: np.ndarray) -> Scored:
@@ -215,13 +210,6 @@ def _columns(most: int) -> list[Row]:
     return rows + _subsets("columns", Structure(likelihoods, medians, [peak("force")]), most)
 
 
-def _one_at_a_time() -> list[Row]:
-    """Each Painter Street earthquake from the ten others: peaks, and histories with noise."""
-    records, _ = transfer.read_events()
-    fits = {name: transfer._calibrate(each, "relative", 1) for name, each in records.items() if len(records) > 3}
-    return transfer._held_out("Painter Street, others", fits, 1) if fits else []
-
-
 def _twins(data_sets: int) -> list[Row]:
     """Rows of twins with known scatters, from 1, 3, 5 and 11 events; their worst data sets are not judged."""
     rows = []
@@ -240,12 +228,5 @@ def _twin(events: int, spread: float | None, seed: int, new: int = 20) -> Scored
     parts = np.linalg.cholesky([[1.0, _CORRELATION], [_CORRELATION, 1.0]]) @ rng.standard_normal((2, events + new))
     weights = np.array([_OF_GAINS, np.sqrt(1.0 - _OF_GAINS**2)])
     gains, ratios = parts * weights[:, None] * spread / np.sqrt(1.0 + 2.0 * _CORRELATION * weights.prod())
-    channels = [Channel("top", "displacement", "m")]
-    model = FunctionModel(lambda theta: [theta[0] * np.array([0.0, 1.0])], ["gain"], channels, 0.1, 2)
-    peaks = np.exp(gains + ratios)
-    likelihoods = {
-        f"EQ{k}": FELikelihood(model, Measurements(channels, model.dt, [[0.0, value]]))
-        for k, value in enumerate(peaks[:events])
-    }
-    known = event_ratios({"gain": float(np.exp(gains[:events].mean()))}, likelihoods, peak("top"))
-    return scored(known, peaks[events:], np.full(new, known.at["gain"]))
+    peaks, gain = np.exp(gains + ratios), float(np.exp(gains[:events].mean()))
+    return scored(EventRatios(peaks[:events] / gain), peaks[events:], np.full(new, gain))
