@@ -22,6 +22,7 @@ from . import (
     executors,
     expectations,
     expected,
+    failing_columns,
     few_simulations,
     fit_gate,
     growth,
@@ -99,6 +100,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "transfer_frame": measured_tests.frame,
     "transfer_meloland": measured_tests.meloland,
     "transfer_columns": measured_columns.columns,
+    "failing_columns": failing_columns.failing_columns,
     "stiffness_loss": stiffness_loss.stiffness_losses,
     "strain_penetration": strain_penetration.evidence,
 }
@@ -122,6 +124,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "hierarchy_warnings": {"problems": 3},
     "new_event": {"data_sets": 2, "subsets": 2},
     "fit_gate": {"cases": 1, "events": 1},
+    "failing_columns": {"draws": 10, "every": 12},
     "level_ratios": {"data_sets": 2},
     "fragility_bands": {"data_sets": 2},
     "annual_rates": {"data_sets": 2},

@@ -1,11 +1,31 @@
 """Benchmarks of transfer with measured tests: what they say without data, and the scores of a known case."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import measured_columns, measured_tests, measured_transfer, strain_penetration, tested_column
-from fe_likelihoods import Channel, FunctionModel, GaussianNoise, LogNormal, Measurements, arias_intensity, peak
+from benchmarks import (
+    failing_columns,
+    measured_columns,
+    measured_tests,
+    measured_transfer,
+    strain_penetration,
+    tested_column,
+)
+from fe_likelihoods import (
+    Channel,
+    DisplacementHistory,
+    FunctionModel,
+    GaussianNoise,
+    LogNormal,
+    LowCycleFatigue,
+    Measurements,
+    RCColumn,
+    arias_intensity,
+    peak,
+)
 
 BENCHMARKS = (
     measured_columns.columns,
@@ -74,6 +94,38 @@ def test_further_column_tests_are_found_by_their_row_in_the_table(tmp_path, monk
     assert "no 'esu' of Lehman_815" in incomplete
     assert "modulus ec above the strength" in mixed
     assert "no row whose TSN and Test make the name '2099_Unknown'" in unknown
+
+
+def test_coefficients_of_fatigue_are_found_and_predict_another_series(tmp_path, monkeypatch):
+    """Synthetic tests of one column whose bars have known coefficients."""
+    amplitudes = [sign * drift for drift in np.arange(0.02, 0.125, 0.01) for sign in (1.0, -1.0)]
+    drift = np.interp(np.arange(0.0, len(amplitudes) + 1.0, 0.1), np.arange(len(amplitudes) + 1), [0.0, *amplitudes])
+    history = DisplacementHistory("cycles", 7.3152 * drift)
+    options = {"penetration": 0.3, "geometry": "linear", "mesh": 8, "max_increment": 0.05}
+    column = RCColumn.lhpost(history, parameters=("Ec",), **options)
+
+    def test(name, cf):
+        force = replace(column, fatigue=LowCycleFatigue(cf=cf)).simulate([1.0])
+        return tested_column.Specimen(name, column, Measurements(column.channels, column.dt, 1.1 * force), {})
+
+    truth = {"One A": 0.14, "One B": 0.16, "Two": 0.22}
+    found = tested_column.Found(tuple(test(*each) for each in truth.items()), {"x.csv": "no row"})
+    monkeypatch.setattr(tested_column, "FOLDER", tmp_path)
+    monkeypatch.setattr(tested_column, "specimens", lambda every: found)
+    rows = failing_columns.failing_columns(draws=10)
+    assert (rows[0].case, rows[0].note) == ("LEFT OUT", "x.csv: no row")
+    for name, cf in truth.items():
+        (row,) = (row for row in rows if (row.what, row.case) == ("Cf", name))
+        earlier, later = map(float, row.note.split(" to "))
+        assert earlier <= cf <= later and earlier < row.value < later < 1.25 * earlier
+    middle = (np.prod([np.sqrt(0.14 * 0.16), 0.22, 0.26])) ** (1 / 3)
+    (row,) = (row for row in rows if row.what == "median Cf of a new column")
+    assert row.value == pytest.approx(middle, rel=0.06)
+    (row,) = (row for row in rows if (row.what, row.case) == ("peak force within 50%", "without its series"))
+    assert row.value == 1.0 and row.note.startswith("3 of 3: "), "all forces are 1.1 times the simulated ones"
+    monkeypatch.setattr(tested_column, "specimens", lambda every: found._replace(specimens=found.specimens[:2]))
+    *_, last = failing_columns.failing_columns(draws=10)
+    assert last.case == "SKIPPED" and str(tmp_path) in last.note
 
 
 def test_scores_of_a_measured_transfer_prefer_the_noise_that_follows_the_motion(rng, monkeypatch):

@@ -23,6 +23,7 @@ from fe_likelihoods import (
     read_imposed_test,
     to_si,
 )
+from fe_likelihoods.prediction.quantities import find_failure
 
 PROPERTIES = "properties_circular_columns.csv"
 
@@ -96,7 +97,7 @@ def read_column(folder: Path, history: str, every: int, parameters: tuple[str, .
     moves = np.flatnonzero(np.diff(displacement))
     turns = moves[1:][np.diff(np.sign(np.diff(displacement)[moves])) != 0]
     kept = np.unique(np.concatenate([np.arange(0, len(displacement), every), turns, [len(displacement) - 1]]))
-    half, failure = np.searchsorted(kept, [len(displacement) // 2, find_failure(displacement, force)]).tolist()
+    half, failure = np.searchsorted(kept, [len(displacement) // 2, find_failure(force, displacement)]).tolist()
     name = test.replace("_", " ")
     model = RCColumn(
         loading=DisplacementHistory(name, displacement[kept], history),
@@ -129,16 +130,3 @@ def _properties(folder: Path, history: str) -> tuple[str, dict[str, float]]:
     row = rows[stem]
     name = row.pop("Test")
     return name, {key: float(value) for key, value in row.items() if value and value.strip()}
-
-
-def find_failure(displacement: np.ndarray, force: np.ndarray) -> int:
-    """First sample of the first excursion to the largest displacement so far with less than 80 % of the peak force."""
-    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
-    reached = 0.0
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        largest = np.abs(displacement[start:stop]).max()
-        if largest > 0.97 * reached and reached > 0.01 * np.abs(displacement).max():
-            if np.abs(force[start:stop]).max() < 0.8 * np.abs(force).max() and start > np.argmax(np.abs(force)):
-                return start
-        reached = max(reached, largest)
-    return len(displacement)

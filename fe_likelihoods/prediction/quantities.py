@@ -7,6 +7,8 @@ displacement.
 .. math:: I_A = \frac{\pi}{2 g} \int a^2\, dt, \qquad W = \int F\, du.
 """
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -23,15 +25,19 @@ __all__ = [
     "MeanOfLast",
     "Quantity",
     "arias_intensity",
+    "displacement_before_failure",
     "dissipated_energy",
     "evaluator",
     "final_value",
+    "find_failure",
     "measured_quantity",
     "peak",
     "rms",
 ]
 
 _WORK = {"force": ("energy", "kJ"), "moment": ("energy", "kJ"), "stress": ("stress", "MPa")}  # dimension and unit
+
+_AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as which an excursion goes; of all, at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,15 +186,44 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
     --------
     >>> propagate(posterior, samples, quantity=dissipated_energy("force", test.history.displacement), noise=True)
     """
-    if not isinstance(displacement, str):
-        displacement = np.array(displacement, dtype=float)
-        if displacement.ndim != 1 or not np.isfinite(displacement).all():
-            raise ValueError(
-                "dissipated_energy: expected the name of a channel, or finite displacements (n_steps,) [SI]; got an "
-                f"array of shape {displacement.shape}"
-            )
-        displacement.flags.writeable = False
+    displacement = _displacement(displacement, "dissipated_energy")
     return ChannelQuantity(force, _work, part, (displacement,), describe=_of_force, name="energy")
+
+
+def displacement_before_failure(force: str, displacement: str | ArrayLike, loss: float = 0.2) -> ChannelQuantity:
+    """Return the quantity "largest displacement before the force fails to reach 80 % of its peak".
+
+    A structure has failed in the first excursion (between two changes of sign of the displacement) that goes as far as
+    any before it, comes after the largest force, and reaches less than ``1 - loss`` times this force. A structure that
+    does not fail has the largest displacement of the whole history: continue the history to see more. Under a large
+    axial load the force also falls by P-Delta, without any damage: use the base moment divided by the height
+    (``geometry="linear"`` of `RCColumn`).
+
+    Parameters
+    ----------
+    force : str
+        Name of the channel of the lateral force.
+    displacement : str or (n_steps,) array_like
+        Name of the displacement channel that belongs to it, or the imposed displacement of a test [m], with one value
+        per force sample.
+    loss : float
+        Lost share of the largest force, between 0 and 1.
+
+    Raises
+    ------
+    ValueError
+        If the displacement is neither a name nor finite values (n_steps,), or the loss is not between 0 and 1. When the
+        quantity is used: if the channel is no force, or has another number of samples.
+
+    Examples
+    --------
+    >>> propagate(column, draws, quantity=displacement_before_failure("force", column.loading.displacement))
+    """
+    if not 0.0 < loss < 1.0:
+        raise ValueError(f"displacement_before_failure: loss must be between 0 and 1; got {loss!r}")
+    displacement = _displacement(displacement, "displacement_before_failure")
+    function = functools.partial(_before_failure, loss=loss)
+    return ChannelQuantity(force, function, others=(displacement,), describe=_of_failure, name="failure")
 
 
 def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
@@ -285,6 +320,38 @@ def _work(force: np.ndarray, displacement: np.ndarray) -> float:
     return float(0.5 * (force[1:] + force[:-1]) @ np.diff(displacement))
 
 
+def find_failure(force: np.ndarray, displacement: np.ndarray, loss: float = 0.2) -> int:
+    """First sample of the excursion in which a structure fails (`displacement_before_failure`); n_steps if none."""
+    size, largest_force = np.abs(displacement), np.abs(force).max()
+    ends = [0, *(np.flatnonzero(np.diff(np.sign(displacement)) != 0) + 1), len(displacement)]
+    reached = 0.0
+    for start, stop in itertools.pairwise(ends):
+        largest = size[start:stop].max()
+        if largest > _AS_FAR * reached and reached > _MOVED * size.max() and start > np.argmax(np.abs(force)):
+            if np.abs(force[start:stop]).max() < (1.0 - loss) * largest_force:
+                return int(start)
+        reached = max(reached, largest)
+    return len(displacement)
+
+
+def _before_failure(force: np.ndarray, displacement: np.ndarray, loss: float) -> float:
+    return float(np.abs(displacement[: find_failure(force, displacement, loss)]).max())
+
+
+def _displacement(displacement: str | ArrayLike, of: str) -> str | np.ndarray:
+    """The name of a channel, or a copy of finite displacements (n_steps,) that does not change."""
+    if isinstance(displacement, str):
+        return displacement
+    values = np.array(displacement, dtype=float)
+    if values.ndim != 1 or not np.isfinite(values).all():
+        raise ValueError(
+            f"{of}: expected the name of a channel, or finite displacements (n_steps,) [SI]; got an array of shape "
+            f"{values.shape}"
+        )
+    values.flags.writeable = False
+    return values
+
+
 def _of_acceleration(channel: Channel) -> Channel:
     if channel.dimension != "acceleration":
         raise ValueError(f"arias_intensity needs an acceleration; channel {channel.name!r} is {channel.quantity!r}")
@@ -297,6 +364,12 @@ def _of_force(channel: Channel) -> Channel:
             f"dissipated_energy needs a channel of {', '.join(_WORK)}; channel {channel.name!r} is {channel.quantity!r}"
         )
     return Channel(f"energy of {channel.name}", *_WORK[channel.dimension])
+
+
+def _of_failure(channel: Channel) -> Channel:
+    if channel.dimension != "force":
+        raise ValueError(f"displacement_before_failure needs a force; channel {channel.name!r} is {channel.quantity!r}")
+    return Channel(f"displacement before failure of {channel.name}", "displacement", "mm")
 
 
 def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_steps: int | None = None) -> Evaluator:

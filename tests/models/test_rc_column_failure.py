@@ -10,6 +10,7 @@ import pytest
 from fe_likelihoods import (
     BarBuckling,
     DisplacementHistory,
+    EventRatios,
     FELikelihood,
     HalfNormal,
     LowCycleFatigue,
@@ -21,12 +22,15 @@ from fe_likelihoods import (
     TruncatedNormal,
     material_curves,
     moment_curvature,
+    propagate,
 )
 from fe_likelihoods.kernels import bar_fatigue_buckling
+from fe_likelihoods.prediction.quantities import displacement_before_failure, find_failure
 from fe_likelihoods.problems import bridge_column_data
 from fe_likelihoods.simulation.model import is_collapse
 from fe_likelihoods.units import G0
 from tests.kernels import golden
+from tutorials.tested_columns import read_column
 
 WEAK = LowCycleFatigue(cf=0.09, cd=0.389)
 SLENDER = BarBuckling(slenderness=10.0)
@@ -162,6 +166,45 @@ def test_the_fatigue_coefficient_is_found_from_a_test_to_fracture(column):
     values = np.array([posterior([cf, 2e3]) for cf in (0.8, 0.9, 1.0, 1.1, 1.2)])
     assert np.argmax(values) == 2
     assert values[2] - np.sort(values)[-2] > 100.0
+
+
+def test_the_prior_of_fatigue_is_the_population_of_columns_and_bars():
+    """Geometric mean of three columns of a series, a column of another one, and bars."""
+    series = (0.161 * 0.138 * 0.138) ** (1 / 3)
+    population = EventRatios(np.array([series, 0.207, 0.26]), prior_sd=0.25, prior_events=6)
+    for fatigue in (LowCycleFatigue(), LowCycleFatigue(cf=0.1)):
+        (prior,) = fatigue.prior().values()
+        probabilities = [0.05, 0.25, 0.5, 0.75, 0.95]
+        stated = fatigue.cf * prior.ppf(probabilities)
+        np.testing.assert_allclose(stated, population.quantile(probabilities), rtol=0.05)
+
+
+def test_a_column_that_is_not_tested_fails_at_an_uncertain_drift():
+    """The constants of the literature let it fail after a drift of 10 %; the population says how sure that is."""
+    history, changes = cycles(0.02, 0.04, 0.06, 0.08, 0.1, 0.12, points=20), {"max_increment": 0.02, "penetration": 0.3}
+    model = RCColumn.lhpost(
+        history, fatigue=LowCycleFatigue(), parameters=("Cf",), geometry="linear", **changes
+    )  # the force of "corotational" geometry falls by the axial load, too
+    samples = {name: prior.ppf([0.05, 0.5, 0.95]) for name, prior in model.fatigue.prior().items()}
+    drift = displacement_before_failure("force", history.displacement)
+    found = propagate(model, samples, quantity=drift, progress=False)
+    np.testing.assert_allclose(found.values / model.height, [0.06, 0.1, 0.12], rtol=1e-6)
+    assert found.channels[0].dimension == "displacement"
+
+
+@pytest.mark.parametrize("history", ["2017_Lehman_415", "2013_Hose_SRPH1", "2019_Lehman_1015", "2020_Lehman_407"])
+def test_measured_columns_fail_within_the_prior_of_fatigue(shared, history):
+    """Displacement paths until failure of real columns, at the 5 and 95 % quantiles of `Cf`; others are nominal."""
+    column = read_column(shared / "measured" / "rc_column_cyclic", f"{history}.csv", 8, ("Ec",))
+    model = replace(column.model, fatigue=LowCycleFatigue(), parameters=("Cf",))
+    displacement = model.loading.displacement
+
+    def path(force):
+        return np.abs(np.diff(displacement[: find_failure(force, displacement)])).sum()
+
+    (prior,) = model.fatigue.prior().values()
+    low, literature, high = (path(model.simulate([cf])[0]) for cf in (prior.ppf(0.05), 1.0, prior.ppf(0.95)))
+    assert low < path(column.force) < literature <= high
 
 
 def test_a_drift_beyond_the_limit_is_a_collapse():

@@ -12,8 +12,10 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import (
     arias_intensity,
+    displacement_before_failure,
     dissipated_energy,
     final_value,
+    find_failure,
     measured_quantity,
     peak,
     rms,
@@ -150,6 +152,38 @@ def test_displacements_are_finite_and_one_history_and_pairs_are_measured_at_the_
     with pytest.raises(ValueError, match="force, drift are measured at different times"):
         measured_quantity(WORK, late)
     assert final_value("drift").channel_names == ["drift"]
+
+
+def test_the_displacement_before_failure_is_the_largest_one_with_80_percent_of_the_force():
+    """Cycles of 1, 2, 3 and 3 mm; the force of each excursion is known."""
+    displacement = np.concatenate([a * np.sin(np.linspace(0.0, 2.0 * np.pi, 81)[:-1]) for a in (1.0, 2.0, 3.0, 3.0)])
+
+    def forces(*excursions):
+        return np.concatenate([f * np.abs(np.sin(np.linspace(0.0, np.pi, 41)[:-1])) for f in excursions])
+
+    shape = np.sign(displacement + 1e-12)
+    for excursions, expected in (
+        ((8, 8, 10, 10, 9, 9, 9, 9), 3.0),  # no failure: the whole history
+        ((8, 8, 10, 10, 7, 9, 9, 9), 2.0),
+        ((8, 8, 10, 10, 9, 7, 7, 7), 3.0),
+        ((7, 7, 10, 10, 9, 9, 9, 7), 3.0),  # less force before the largest one is no failure
+        ((8, 8, 10, 10, 8.1, 9, 9, 9), 3.0),
+    ):
+        force = shape * forces(*excursions)
+        for given in (displacement, "u"):
+            quantity = displacement_before_failure("f", given)
+            assert quantity.evaluate([force, displacement], 1.0) == pytest.approx(expected, rel=1e-2)
+        assert find_failure(force, displacement) <= len(force)
+    assert displacement_before_failure("f", "u", loss=0.05).evaluate([force, displacement], 1.0) == pytest.approx(2.0)
+    measured = Measurements([Channel("f", "lateral force", "kN")], 1.0, [force])
+    assert measured_quantity(displacement_before_failure("f", displacement), measured) == pytest.approx(3.0)
+    with pytest.raises(ValueError, match="needs a force; channel 'f' is 'displacement'"):
+        shown = Measurements([Channel("f", "displacement", "mm")], 1.0, [force])
+        measured_quantity(displacement_before_failure("f", displacement), shown)
+    with pytest.raises(ValueError, match="loss must be between 0 and 1; got 20"):
+        displacement_before_failure("f", "u", 20)
+    with pytest.raises(ValueError, match="displacement_before_failure: expected the name of a channel, or finite"):
+        displacement_before_failure("f", [[1.0]])
 
 
 def test_a_final_value_during_a_vibration_is_said_and_after_rest_it_is_not(rng):
