@@ -37,6 +37,7 @@ from . import (
     opensees_memory,
     overhead,
     peers,
+    rare_events,
     samplers,
     sensor_ranks,
     sequential,
@@ -93,6 +94,8 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "level_ratios": decisions.level_ratios,
     "fragility_bands": decisions.fragility_bands,
     "annual_rates": decisions.annual_rates,
+    "rare_events": rare_events.rare_events,
+    "rare_column": rare_events.rare_column,
     "noises": noises.noises,
     "transfer": transfer.transfer,
     "measured_peaks": measured_peaks.measured_peaks,
@@ -130,6 +133,8 @@ QUICK: dict[str, dict[str, Any]] = {
     "annual_rates": {"data_sets": 2},
     "sensor_variances": {"cases": ("oscillator",), "tests": 2},
     "sensor_heights": {"draws": 2},
+    "rare_events": {"seeds": 2},
+    "rare_column": {"threshold": 0.06, "simulations": 500, "seeds": 1},
     "stiffness_loss": {"twins": 4, "file": "results/stiffness_loss_quick.jsonl"},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""

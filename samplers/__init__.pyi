@@ -2,6 +2,7 @@ from . import presets
 from .cost import estimate_cost
 from .judgement.verdict import Verdict
 from .moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove
+from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals
 from .reporting.model_comparison import compare_models
@@ -32,6 +33,7 @@ __all__ = [
     "plot_marginals",
     "plot_run",
     "presets",
+    "subset_simulation",
     "summary",
     "to_arviz",
 ]

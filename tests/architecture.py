@@ -57,7 +57,7 @@ ORDER = {
     ),
     "samplers": (
         ("cost",),
-        ("smc", "tmcmc"),
+        ("rare_events", "smc", "tmcmc"),
         ("tempered",),
         ("results",),
         ("reporting",),

@@ -36,6 +36,7 @@ from ..proposals.mixture import (
 from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
 __all__ = [
+    "ConditionalMove",
     "DrawsWithDensity",
     "GuideMove",
     "MixtureMove",
@@ -255,6 +256,41 @@ class RandomWalkMove(_GaussianFit):
         if self.adapt:
             target = 0.23 + 0.21 / state.coords.shape[1] if self.target is None else self.target
             self._log_factor += float(np.mean(accepted)) - target
+
+
+class ConditionalMove(MHMove):
+    r"""Steps that leave the standard normal distribution unchanged: :math:`u' = \sqrt{1 - s^2}\, u + s\, e`, e normal.
+
+    For standard normal parameters that are restricted to a region: the acceptance depends on the region, not on the
+    number of parameters.
+
+    Parameters
+    ----------
+    scale : float
+        Initial s, above 0 and at most 1. ``tune`` adapts it.
+    target : float
+        Desired acceptance; Papaioannou et al. (2015) recommend 0.44.
+
+    References
+    ----------
+    Papaioannou, I., Betz, W., Zwirglmaier, K. & Straub, D. (2015), MCMC algorithms for subset simulation, Probabilistic
+    Engineering Mechanics 41, doi:10.1016/j.probengmech.2015.06.006
+    """
+
+    def __init__(self, scale: float = 0.6, target: float = 0.44):
+        if not 0.0 < scale <= 1.0:
+            raise ValueError(f"scale must be above 0 and at most 1; got {scale}")
+        super().__init__(self._draw)
+        self.scale = scale
+        self.target = target
+
+    def _draw(self, coords, random):
+        proposed = math.sqrt(1.0 - self.scale**2) * coords + self.scale * random.standard_normal(coords.shape)
+        return proposed, 0.5 * np.sum(proposed**2 - coords**2, axis=1)
+
+    def tune(self, state: State, accepted: np.ndarray) -> None:
+        """Increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
+        self.scale = min(self.scale * math.exp(float(np.mean(accepted)) - self.target), 1.0)
 
 
 class StudentTMove(_GaussianFit):

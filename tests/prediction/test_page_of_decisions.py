@@ -31,3 +31,5 @@ def test_the_page_has_the_numbers_of_its_code(tmp_path, monkeypatch):
         assert abs(printed(name, text)[0] - each) <= 0.5 * error
     (perfect,) = re.findall(r"before the decision is worth ([\d.]+)", text)
     assert abs(float(perfect) - value.perfect) < 0.5 * value.perfect_error
+    (rare,) = re.findall(r"The probability to exceed 0.09 is ([\d.]+)", text)
+    assert abs(float(rare) - found["rare"].probability) < 0.5 * float(rare) * found["rare"].coefficient_of_variation
