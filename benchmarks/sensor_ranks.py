@@ -19,6 +19,7 @@ import numpy as np
 from fe_likelihoods import (
     FELikelihood,
     GaussianNoise,
+    GroupedFrame,
     LinearOscillator,
     LinearStructure,
     LogNormal,
@@ -26,7 +27,6 @@ from fe_likelihoods import (
     Posterior,
     Prior,
     RCColumn,
-    ShearFrame,
     TruncatedNormal,
     peak,
     problems,
@@ -68,13 +68,12 @@ def _oscillator() -> _Case:
 
 def _frame() -> _Case:
     motion = problems.table_motion().trim(0.0, 6.0).resample(0.02)
-    floors = {f"floor {i}": i for i in range(1, 5)}
-    drifts = tuple(f"displacement@floor {i}:floor {i - 1}" for i in range(2, 5))
-    frame = ShearFrame(floors, [1.0] * 4, [1500.0] * 4)
+    floors = {f"floor {i}": i for i in range(1, 4)}
+    drifts = tuple(f"displacement@floor {i}:floor {i - 1}" for i in range(2, 4))
+    frame = GroupedFrame(floors, [1.0] * 3, [1500.0] * 3, groups=[1, 2, 3])
     model = LinearStructure(frame, motion, outputs=(*floors, "displacement@floor 1", *drifts))
     prior = Prior(
-        {f"stiffness_{i}": TruncatedNormal(1.0, 0.2) for i in range(1, 5)}
-        | {f"damping_{i}": LogNormal(0.03, 0.3) for i in range(1, 5)}
+        {f"stiffness_{i}": TruncatedNormal(1.0, 0.2) for i in range(1, 4)} | {"damping": LogNormal(0.03, 0.3)}
     )
     middle = prior.from_normal(np.zeros(prior.dim))
     sd = 0.2 * model.simulate(middle).std(axis=1)
