@@ -224,6 +224,8 @@ class EmulatedPosterior:
         d = runs.shape[1]
         levels = (np.arange(_COMPARED) + 0.5) / _COMPARED
         points = np.unique(self._pool[np.searchsorted(np.cumsum(self._weights), levels)][:, :d], axis=0)
+        if len(points) < 2:
+            return points[:0]
         distances, near = cKDTree(points).query(points, min(len(points), 2 * _NEIGHBOURS))
         inwards = points[near].mean(axis=1) - points  # at an end, all near points are on one side
         length = np.maximum(np.linalg.norm(inwards, axis=1), 1e-300)

@@ -37,7 +37,7 @@ from .modes import (
 )
 from .stacked import is_joint
 from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
-from .target import ResponseTarget
+from .target import SCALES, ResponseTarget
 
 __all__ = ["ResponseGuide"]
 
@@ -64,7 +64,7 @@ _NOT_A_MODE = (
     "use more starts"
 )
 _LARGE = 10.0  # error of an emulated log-likelihood, beyond which its size does not matter
-_CLEARLY = 0.75  # ratio of such errors at which the emulators take logarithms of the parameters
+_CLEARLY = 0.75  # ratio of such errors at which the emulators take a function of the parameters
 _FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
 _SINGLE = 0.95  # share of one parameter in a direction from which it is not a combination
 _SMOOTH = 0.5  # mean error of the emulated log-likelihood, below which a response is smooth
@@ -77,6 +77,7 @@ _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
 )
+_MOST_BENT = 6  # parameters of a posterior that is followed beyond its ends
 _MOST_CURVES, _ENDS = 24, 2  # steps along a curved posterior, and its ends from which each step is made
 _OPEN_ENDS = (
     "the posterior is curved, and it was not followed to all of its ends: fix one of the parameters that the data do "
@@ -318,18 +319,20 @@ class ResponseGuide:
             self._wide = self._wide_mixture()
 
     def _choose_scale(self) -> None:
-        """Take logarithms of the parameters if left-out runs are predicted clearly better with them.
+        """Take logarithms or reciprocals of the parameters if left-out runs are predicted clearly better with them.
 
-        A ridge of equal products is straight in logarithms; other responses are often closer to linear in parameters.
-        The scale is not changed later, because draws of the guide are weighted by densities that depend on it.
+        A ridge of equal products is straight in logarithms, and flexibilities of springs add; other responses are often
+        closer to linear in parameters. The scale is not changed later, because draws of the guide are weighted by
+        densities that depend on it.
         """
-        errors, regions = [], list(self._regions)
-        for taken in (True, False):
-            self._target.take_logarithms(taken)
+        errors, regions = {}, list(self._regions)
+        for scale in SCALES:
+            self._target.take_scale(scale)
             self._fit_emulators()
-            errors.append(self._left_out_error())
+            errors[scale] = self._left_out_error()
             self._regions = list(regions)
-        self._target.take_logarithms(errors[0] <= _CLEARLY * errors[1])
+        best = min(errors, key=errors.get)
+        self._target.take_scale(best if errors[best] <= _CLEARLY * errors[SCALES[0]] else SCALES[0])
 
     def _left_out_error(self) -> float:
         """Mean error of the log-likelihood of runs that the emulators were not fitted to, each at most `_LARGE`."""
@@ -375,8 +378,9 @@ class ResponseGuide:
         """Simulate beyond the ends of a curved posterior until it ends there.
 
         It is not begun while the emulator is inaccurate: of a rough response, the emulated posterior is rough as well.
+        Nor is it in many dimensions, where nearly all draws of a normal density look like ends.
         """
-        if not self._curves and not self._left_out_error() < _SMOOTH:
+        if self._target.n_structural > _MOST_BENT or (not self._curves and not self._left_out_error() < _SMOOTH):
             return
         while self._emulated is not None and self._emulated.curved:
             points = self._emulated.beyond(_ENDS, np.concatenate([self._plausible(), self._beyond]))

@@ -35,11 +35,12 @@ _WIDTHS = 7.0, 3.0, 1.0, 0.3, 0.1  # half widths of the grids on which noise par
 _WIDTHS_AROUND_START = 1.0, 0.1
 _GRID = np.linspace(-1.0, 1.0, 41)
 _SLOPE_STEP = 1e-4
+SCALES = "parameters", "logarithms", "reciprocals"
 _LARGEST_FACTOR = 30.0  # between the ends of the prior's central 95 %, up to which a parameter is a factor
 _MAP_STEP = 1e-5  # of coordinates, for the derivatives of the parameters
 _SMALL_STEP = 1e-4  # share of a step from which its direction in scaled parameters is found
 _LOG_LIMITS = -690.0, 690.0
-_SMALLEST = 1e-300  # positive parameters are at least this before their logarithm is taken
+_SMALLEST = 1e-300  # positive parameters are at least this before their logarithm or reciprocal is taken
 _AT_BOUND = 8.5  # from about 8.3, parameters are rounded to a bound that is not zero
 _NEWTON_STEPS = 12
 _NEWTON_GAIN = 1e-4
@@ -188,8 +189,13 @@ class ResponseTarget:
         check_quadratic(self.statistic, self.measured)
         low, self._median, high = self._prior.from_normal(np.array([[-2.0], [0.0], [2.0]]) * np.ones(self.ndim))
         logarithmic = np.array(self._prior.logarithmic)
-        # without and with logarithms of parameters that the prior keeps away from zero
-        self._scales = logarithmic, logarithmic | (low > 0.0) & (high < _LARGEST_FACTOR * low)
+        factors = (low > 0.0) & (high < _LARGEST_FACTOR * low)  # the prior keeps them away from zero
+        nothing = np.zeros(self.ndim, bool)
+        self._scales = {
+            "parameters": (logarithmic, nothing),
+            "logarithms": (logarithmic | factors, nothing),
+            "reciprocals": (logarithmic & ~factors, factors),
+        }
         self._noise_prior = self._prior_of_noise()
         # of the noise coordinates over the noise parameters, at the median
         self._median_volume = 0.0
@@ -197,8 +203,8 @@ class ResponseTarget:
             zero, at = np.zeros((1, self.n_noise)), self._median[None, self.n_structural :]
             self._median_volume = float(np.squeeze(self._noise_prior.logpdf(at)) - self.log_prior(zero)[0])
         elif self.n_noise:  # the volume of structural parameters alone is not known
-            self._scales = (np.zeros(self.ndim, bool),) * 2
-        self.take_logarithms(True)
+            self._scales = dict.fromkeys(self._scales, (nothing, nothing))
+        self.take_scale("logarithms")
         self.archive = Archive(self.statistic, self.measured.shape)
         self._simulated: set[bytes] = set()
         self.differentiable = getattr(self.model, "jacobian", None) is not None
@@ -301,20 +307,24 @@ class ResponseTarget:
         full[:, : self.n_structural] = thetas
         return _finite(self._prior.to_normal(full)[:, : self.n_structural])
 
-    def take_logarithms(self, taken: bool) -> None:
-        """Let scaled parameters be logarithms where the prior keeps parameters away from zero, or only where it is
-        lognormal."""
-        self._logarithmic = np.flatnonzero(self._scales[int(taken)][: self.n_structural])
+    def take_scale(self, name: str) -> None:
+        """Let scaled parameters be one of `SCALES` where the prior keeps parameters away from zero.
+
+        Other parameters are not transformed, except that those with a lognormal prior are logarithms.
+        """
+        logarithmic, reciprocal = (each[: self.n_structural] for each in self._scales[name])
+        self._logarithmic, self._reciprocal = np.flatnonzero(logarithmic), np.flatnonzero(reciprocal)
 
     def scaled_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters (n, n_structural), or their logarithms where the prior keeps them away from zero.
+        """Structural parameters (n, n_structural), or a function of those that the prior keeps away from zero.
 
-        A product of parameters, such as a stiffness E I, is linear in logarithms. Responses are smooth functions of
-        these, but not of the coordinates, which go to infinity as a parameter goes to
-        a prior bound.
+        A product of parameters, such as a stiffness E I, is linear in logarithms. Displacements of springs in series
+        are linear in reciprocals, whose sign is changed so that they increase with the parameter. Responses are smooth
+        functions of these, but not of the coordinates, which go to infinity as a parameter goes to a prior bound.
         """
         parameters = self.structural_parameters(coords)
         parameters[:, self._logarithmic] = np.log(np.maximum(parameters[:, self._logarithmic], _SMALLEST))
+        parameters[:, self._reciprocal] = -1.0 / np.maximum(parameters[:, self._reciprocal], _SMALLEST)
         return parameters
 
     def line(self, first: np.ndarray, last: np.ndarray, shares: np.ndarray) -> np.ndarray:
@@ -325,6 +335,7 @@ class ResponseTarget:
     def _from_scaled(self, scaled: np.ndarray) -> np.ndarray:
         """Coordinates (n, n_structural) of scaled parameters (n, n_structural), which are overwritten."""
         scaled[:, self._logarithmic] = np.exp(scaled[:, self._logarithmic])
+        scaled[:, self._reciprocal] = -1.0 / np.minimum(scaled[:, self._reciprocal], -_SMALLEST)
         return self.structural_coordinates(scaled)
 
     def moved(self, coords: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -353,9 +364,13 @@ class ResponseTarget:
         full = np.repeat(self._median[None], len(scaled), axis=0)
         full[:, :d] = scaled[:, :d]
         full[:, self._logarithmic] = np.exp(np.clip(full[:, self._logarithmic], *_LOG_LIMITS))
+        possible = (full[:, self._reciprocal] < 0.0).all(axis=1)
+        full[:, self._reciprocal] = -1.0 / np.minimum(full[:, self._reciprocal], -_SMALLEST)
         coords, log_volume = self._to_coordinates(full)
         coords[:, d:] = scaled[:, d:]
-        return coords, log_volume + np.log(full[:, self._logarithmic]).sum(axis=1) - self._median_volume
+        stretch = np.log(full[:, self._logarithmic]).sum(axis=1)
+        stretch += 2.0 * np.log(full[:, self._reciprocal]).sum(axis=1)
+        return coords, np.where(possible, log_volume + stretch, -np.inf) - self._median_volume
 
     def log_prior(self, coords: np.ndarray) -> np.ndarray:
         """Standard normal log-density (n,) of coordinates (n, k)."""

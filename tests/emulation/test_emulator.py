@@ -7,7 +7,7 @@ import pytest
 from fe_likelihoods import FELikelihood, HalfNormal, LogNormal, SimulationFailed, TruncatedNormal, Uniform
 from fe_likelihoods.emulation.emulator import TrainingSet, fit_emulator
 from fe_likelihoods.emulation.gaussian_process import predict
-from fe_likelihoods.emulation.target import ResponseTarget
+from fe_likelihoods.emulation.target import SCALES, ResponseTarget
 
 from .problems import free_vibration, vibration
 
@@ -98,6 +98,23 @@ def test_a_parameter_that_varies_by_factors_enters_by_its_logarithm():
     np.testing.assert_allclose(scaled[:, 0], np.log(target.structural_parameters(coords)[:, 0]))
     wide = ResponseTarget(vibration(damping=TruncatedNormal(1.0, 1.0)))  # reaches down to zero
     np.testing.assert_allclose(wide.scaled_parameters(coords)[:, 1], wide.structural_parameters(coords)[:, 1])
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_scaled_parameters_can_be_undone_and_their_volume_is_known(scale):
+    target = ResponseTarget(vibration(damping=LogNormal(0.8, 0.3)))
+    target.take_scale(scale)
+    coords = np.random.default_rng(1).standard_normal((50, target.ndim))
+    scaled = target.scaled(coords)
+    back, log_volume = target.unscaled(scaled)
+    np.testing.assert_allclose(back, coords, atol=1e-6)
+    slopes = np.ones(len(coords))
+    for i in range(target.n_structural):
+        step = 1e-5 * np.eye(target.ndim)[i]
+        slopes *= (target.scaled(coords + step) - target.scaled(coords - step))[:, i] / 2e-5
+    assert (slopes > 0.0).all()
+    np.testing.assert_allclose(log_volume, -np.log(slopes), atol=1e-5)
+    assert target.unscaled(np.full((1, target.ndim), 1e5))[1] == -np.inf or scale != "reciprocals"
 
 
 def test_uncertainty_enters_through_the_expected_likelihood():

@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import FELikelihood, Posterior
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModel,
+    GaussianNoise,
+    HalfNormal,
+    Measurements,
+    Posterior,
+    TruncatedNormal,
+)
 from fe_likelihoods.emulation.guide import ResponseGuide
 from samplers import SMCSampler, TMCMCSampler
 from tests.faults import guided_run
@@ -155,3 +164,32 @@ def test_a_channel_with_an_offset_of_a_million_times_its_noise():
         assert np.abs(error).max() < 0.1 * case.noise
     assert results[0][1] == results[1][1] <= 500
     assert abs(results[0][0] - results[1][0]) < 1e-4
+
+
+def test_springs_in_series_are_emulated_in_flexibilities():
+    """The displacements are linear in the reciprocals of the stiffnesses, so few runs give the whole posterior."""
+    n = 6
+    force = np.random.default_rng(3).standard_normal((n, 40)) + 1.0
+    model = FunctionModel(
+        lambda stiffness: np.cumsum(force / stiffness[:, None], axis=0)[[2, 5]],
+        [f"k_{i}" for i in range(n)],
+        [Channel("middle", "displacement", "m"), Channel("top", "displacement", "m")],
+        0.1,
+        40,
+        version="springs",
+    )
+    rng = np.random.default_rng(4)
+    clean = model.simulate(rng.normal(1.0, 0.15, n))
+    measured = Measurements(model.channels, model.dt, clean + 0.3 * rng.standard_normal(clean.shape), "SYNTHETIC")
+    prior = {name: TruncatedNormal(1.0, 0.2) for name in model.parameter_names}
+    prior |= {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels}
+    posterior = Posterior(FELikelihood(model, measured, GaussianNoise(model.channels)), prior).marginal()
+    sampler = SMCSampler(100, n, posterior, vectorize=True, seed=1, guide=posterior.guide())
+    sampler.run_mcmc(None, 0)
+    (emulator,) = sampler.guide.emulators
+    assert np.abs(np.subtract(*emulator.left_out_statistics())).max() < 1e-6  # with logarithms: 0.1
+    assert sampler.verdict.simulations < 250
+    draws = posterior.sample_prior(40_000, 1)
+    weights = np.exp(posterior(draws) - posterior.log_prior(draws) - sampler.log_evidence)
+    error = weights.std() / np.sqrt(len(draws))
+    assert abs(weights.mean() - 1.0) < 3.0 * np.hypot(error, sampler.log_evidence_error)
