@@ -56,6 +56,7 @@ _IN_MODULES = {
     "prediction.fragility": "Fragility peak_ground_acceleration",
     "prediction.fragility_curve": "fit_fragility",
     "prediction.prediction": "Prediction",
+    "prediction.quantities": "displacement_before_failure find_failure",
     "prediction.reliability": "Exceedance",
     "prediction.score_tables": "HistoryScores QuantityScores",
     "prediction.scores": "Share crps_normal crps_samples log_score_normal",
