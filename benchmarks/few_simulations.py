@@ -37,7 +37,7 @@ from tests.statistics.hard_posteriors import CASES
 
 from .few_simulations_peers import PEERS
 from .few_simulations_problems import PROBLEMS, Problem
-from .importance_reference import by_importance
+from .importance_reference import by_importance, by_reciprocals
 from .processes import in_process
 from .rows import Row
 
@@ -273,7 +273,10 @@ def references(repeats: int, problems: tuple[str, ...] = tuple(PROBLEMS)) -> Ite
 
 def _make_reference(name: str, problem: Problem, seed: int) -> Row:
     posterior, start = problem.posterior(seed), time.perf_counter()
-    if problem.reference_draws:
+    if problem.reciprocals:
+        method = "importance sampling in reciprocals from the known mode"
+        found = by_reciprocals(posterior, problem.starts(posterior)[0], draws=problem.reference_draws, seed=seed)
+    elif problem.reference_draws:
         method = "importance sampling from the known modes"
         found = by_importance(
             posterior,

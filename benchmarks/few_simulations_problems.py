@@ -55,6 +55,8 @@ class Problem(NamedTuple):
     reference_draws, reference_rounds : int
         Draws per round of the reference by importance sampling, and rounds. No draws: the reference is a longer run of
         the default sampler, where importance sampling from a known mode fails (many local modes).
+    reciprocals : bool
+        Whether the reference is by importance sampling in the reciprocals of the parameters.
     exact : callable, optional
         Function of the posterior that returns its `Reference` by quadrature, at once.
     """
@@ -69,6 +71,7 @@ class Problem(NamedTuple):
     measured: bool = False
     reference_draws: int = 400
     reference_rounds: int = 8
+    reciprocals: bool = False
     exact: Callable[[Posterior], Any] | None = None
 
 
@@ -204,9 +207,9 @@ PROBLEMS |= {
         partial(many_stiffnesses.shear_building, storeys, jacobian=bool(suffix)),
         lambda posterior: np.ones((1, posterior.ndim)),
         goal,
-        walkers=2000 if storeys > 10 else 500,
-        reference_draws=40 * storeys**2 if storeys == 10 else 0,
+        reference_draws=10_000 if storeys > 10 else 40 * storeys**2,
         reference_rounds=6,
+        reciprocals=storeys > 10,
     )
     for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
     for suffix in ("", "_jacobian")

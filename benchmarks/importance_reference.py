@@ -18,7 +18,7 @@ from scipy.special import gammaln
 
 from tests.statistics.brute_force import Reference
 
-__all__ = ["by_importance", "find_mode"]
+__all__ = ["by_importance", "by_reciprocals", "find_mode"]
 
 _FREEDOM = 6.0
 _DIFFERENCE = 1e-3  # relative step of the finite differences
@@ -30,16 +30,16 @@ class _Component(NamedTuple):
     mean: np.ndarray
     factor: np.ndarray  # Cholesky factor of the scale matrix
 
-    def draw(self, n, rng):
-        z = rng.standard_normal((n, len(self.mean))) / np.sqrt(rng.chisquare(_FREEDOM, n) / _FREEDOM)[:, None]
+    def draw(self, n, rng, freedom=_FREEDOM):
+        z = rng.standard_normal((n, len(self.mean))) / np.sqrt(rng.chisquare(freedom, n) / freedom)[:, None]
         return self.mean + z @ self.factor.T
 
-    def logpdf(self, x):
+    def logpdf(self, x, freedom=_FREEDOM):
         d = len(self.mean)
         squares = np.square(np.linalg.solve(self.factor, (x - self.mean).T)).sum(axis=0)
-        constant = gammaln(0.5 * (_FREEDOM + d)) - gammaln(0.5 * _FREEDOM) - 0.5 * d * np.log(_FREEDOM * np.pi)
+        constant = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(freedom * np.pi)
         constant -= np.log(np.diag(self.factor)).sum()
-        return constant - 0.5 * (_FREEDOM + d) * np.log1p(squares / _FREEDOM)
+        return constant - 0.5 * (freedom + d) * np.log1p(squares / freedom)
 
 
 class _Proposal:
@@ -56,7 +56,7 @@ class _Proposal:
         parts = [c.draw(k, rng) for c, k in zip(self.components, counts[:-1], strict=True)]
         return np.concatenate([*parts, self.prior.rvs(int(counts[-1]), rng)])
 
-    def logpdf(self, x):
+    def logpdf(self, x, freedom=_FREEDOM):
         parts = [np.log(w) + c.logpdf(x) for w, c in zip(self.weights, self.components, strict=True)]
         return np.logaddexp.reduce([*parts, np.log(_PRIOR_WEIGHT) + self.prior.logpdf(x)], axis=0)
 
@@ -232,6 +232,48 @@ def by_importance(
         if number < adapting - 1:
             softened = _soften(log_weights, max(60.0, 10.0 * posterior.ndim))
             components = _refit(points, softened, label(points), rng) or components
+    return _weighted(points, log_weights, label)
+
+
+def by_reciprocals(
+    posterior: Any, start: np.ndarray, *, draws: int = 20_000, rounds: int = 5, seed: int = 1
+) -> Reference:
+    """Reference of a posterior of positive parameters with one mode that is nearly normal in their reciprocals.
+
+    With dozens of stiffnesses, a mixture that is fitted to the parameters loses its draws (an effective sample size of
+    40 from 12 000 draws in 20 dimensions); in reciprocals one component suffices. Only the last round gives the result.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Without noise parameters.
+    start : (d,) float
+        Point near the mode.
+    draws, rounds, seed : int
+        Draws per round, number of rounds, seed.
+
+    Returns
+    -------
+    Reference
+    """
+    rng = np.random.default_rng([seed, 17])
+    mode, covariance = find_mode(posterior, start)
+    component = _Component(1.0, 1.0 / mode, np.linalg.cholesky(covariance / np.outer(mode, mode) ** 2))
+    for number in range(rounds):
+        reciprocals = component.draw(draws, rng, 20.0 * len(mode))
+        points = 1.0 / reciprocals
+        log_weights = posterior(points) + 2.0 * np.log(np.abs(points)).sum(axis=1)
+        log_weights -= component.logpdf(reciprocals, 20.0 * len(mode))
+        if number < rounds - 1:
+            w = _soften(log_weights, max(60.0, 10.0 * len(mode)))
+            mean = w @ reciprocals
+            factor = np.linalg.cholesky((reciprocals - mean).T @ (w[:, None] * (reciprocals - mean)))
+            component = _Component(1.0, mean, 1.03 * factor)
+    return _weighted(points, log_weights, lambda x: np.zeros(len(x), dtype=int))
+
+
+def _weighted(points: np.ndarray, log_weights: np.ndarray, label: Callable[[np.ndarray], np.ndarray]) -> Reference:
+    """Reference from weighted draws."""
     weights = np.exp(log_weights - log_weights.max())
     ess = weights.sum() ** 2 / (weights**2).sum()
     log_evidence = float(log_weights.max() + np.log(weights.mean()))
