@@ -77,7 +77,7 @@ _SHORT_OF_THE_RIDGE = (
     "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
     "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
 )
-_MOST_BENT = 6  # parameters of a posterior that is followed beyond its ends
+_MOST_BENT = 10  # parameters of a posterior that is followed beyond its ends
 _MOST_CURVES, _ENDS = 24, 2  # steps along a curved posterior, and its ends from which each step is made
 _OPEN_ENDS = (
     "the posterior is curved, and it was not followed to all of its ends: fix one of the parameters that the data do "

@@ -364,6 +364,9 @@ def rank_sensors(
             f"n_sensors must be from 1 to {len(candidates)}, draws at least 2, and step positive; got {n_sensors}, "
             f"{draws} and {step}"
         )
+    for what, each in (("noise", noise), ("effective_samples", effective_samples)):
+        if each is not None:
+            _by_channel(each, model.channels, what)  # errors come before the simulations
     coords, precision = _draw(known, given, samples, draws, seed)
     sd = np.sqrt(np.diag(np.linalg.inv(precision)))
     steps = step * sd * np.where(coords > 0.0, -1.0, 1.0)  # towards the median, where the prior has its parameters

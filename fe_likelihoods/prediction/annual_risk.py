@@ -37,6 +37,9 @@ from .reliability import check_level
 __all__ = ["AnnualRisk", "annual_rate", "annual_risk"]
 
 
+FAR = 0.5  # share of a rate outside the hazard curve or the records, above which a caution says so
+
+
 class AnnualRisk(NamedTuple):
     """Annual rates of damage states, and the annual loss; ``str`` is a table and a sentence.
 
@@ -93,6 +96,11 @@ class AnnualRisk(NamedTuple):
             cells = number(self.rate[k]), number(self.standard_error[k], 2), ends, number(self.probability[k])
             rows.append((name, *cells, f"{self.outside[k]:.0%}"))
         lines = [text_table(rows)]
+        if far := [name for name, share in zip(self.states, self.outside, strict=True) if share > FAR]:
+            lines.append(
+                f"CAUTION: most of the rate of {', '.join(far)} comes from intensities outside the hazard curve or the "
+                "records. Is the hazard curve in the unit of the fragilities?"
+            )
         if np.isfinite(self.loss):
             lines.append(
                 f"Expected loss per year: {number(self.loss)} ± {number(self.loss_error, 2)} (Monte Carlo), "
@@ -212,7 +220,7 @@ def annual_risk(
     ------
     ValueError
         For an impossible hazard curve (`annual_rate`), a fragility without a curve, states that are not ordered from
-        slight to severe, or losses of other states.
+        slight to severe, or losses of other states, negative ones, or ones that decrease with severity.
 
     Examples
     --------
@@ -225,6 +233,14 @@ def annual_risk(
     amounts = losses if isinstance(losses, Mapping) or losses is None else dict.fromkeys(names, losses)
     if not given or (amounts is not None and set(amounts) != set(names)):
         raise ValueError(f"expected a loss for each state, {', '.join(names) or 'of one or more'}; got {losses!r}")
+    if wrong := [name for name, each in given.items() if not isinstance(each, Fragility | FragilityCurve)]:
+        raise ValueError(f"expected a Fragility or FragilityCurve for each state; got something else for {wrong}")
+    amount = np.array([] if amounts is None else [amounts[name] for name in names], dtype=float)
+    if not (np.isfinite(amount).all() and (amount >= 0.0).all() and (np.diff(amount) >= 0.0).all()):
+        raise ValueError(
+            "expected losses that are finite, not negative, and not smaller in severer states (the loss of a state is "
+            f"the whole loss of an event that ends in it); got {losses!r}"
+        )
     curves = {name: each.curve if isinstance(each, Fragility) else each for name, each in given.items()}
     if missing := [name for name, curve in curves.items() if curve is None]:
         raise ValueError(
@@ -248,10 +264,9 @@ def annual_risk(
     of_events = all(curve.drawn is not None for curve in curves.values())
     draws = _of_curves(intensity, rate, [curve.drawn for curve in curves.values()]) if of_events else resampled
     said = "what is unknown of the ratios, the events and the parameters" if of_events else "the Monte Carlo error only"
-    values = (
-        np.full(len(names), np.nan) if amounts is None else np.array([amounts[name] for name in names], dtype=float)
-    )
-    weights = np.diff(values, prepend=0.0)  # sum of losses (rate of a state less the rate of the next) by rates
+    weights = np.diff(
+        amount if len(amount) else np.full(len(names), np.nan), prepend=0.0
+    )  # sum of losses (rate of a state less the rate of the next) by rates
     lower, upper = _interval(draws, rates, level)
     loss = float(rates @ weights)
     loss_lower, loss_upper = _interval((draws @ weights)[:, None], np.array([loss]), level)

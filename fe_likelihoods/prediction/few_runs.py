@@ -77,6 +77,11 @@ def propagate_few(
     ValueError
         For a sample without weights, too few simulations, noise, or a quantity that is a history.
 
+    Notes
+    -----
+    Thirty draws show nothing of a rare part of the posterior: where the quantity changes only there (a collapse or a
+    threshold with a probability below about 3 / `simulations`), mean and errors are too small, without a sign.
+
     Examples
     --------
     >>> few = SMCSampler(30, posterior.ndim, posterior, vectorize=True, guide=posterior.guide())
@@ -136,6 +141,11 @@ def propagate_few(
     shape = np.shape(drawn.mean)
     mean, variance, standard_error = (x.reshape(shape) for x in (result[0], np.square(result[1]), error[0]))
     remarks = drawn.remarks
+    if equal := bool((values == values[0]).all(axis=0).any()):
+        remarks += (
+            f"all {len(values)} simulated values of a number are equal, so nothing is known of its scatter: a rare "
+            f"event with a probability below about {3.0 / len(values):.0%} may not be among them",
+        )
     if unexplained > ROUGH:
         remarks += (
             f"the emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "
@@ -148,7 +158,7 @@ def propagate_few(
         standard_error=standard_error,
         quantiles=result[2:].reshape(-1, *shape),
         quantile_error=error[2:].reshape(-1, *shape),
-        effective_sample_size=float(np.min(variance / np.square(standard_error))),
+        effective_sample_size=float(len(values) if equal else np.min(variance / np.square(standard_error))),
         remarks=remarks,
     )
 

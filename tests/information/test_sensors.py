@@ -240,6 +240,16 @@ def test_errors_say_what_to_do(arguments, message):
         rank_sensors(LINEAR, PRIOR, **{"noise": NOISE, "draws": 2} | arguments)
 
 
+@pytest.mark.parametrize("arguments", [{"noise": -0.1}, {"effective_samples": 0.0}, {"effective_samples": {"q": 3.0}}])
+def test_levels_and_numbers_of_samples_are_checked_before_a_simulation(arguments):
+    def response(theta):
+        raise AssertionError("simulated")
+
+    model = FunctionModel(response, LINEAR.parameter_names, LINEAR.channels, LINEAR.dt, LINEAR.n_steps)
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        rank_sensors(model, PRIOR, **{"noise": NOISE} | arguments)
+
+
 def test_all_draws_fail():
     def fail(theta):
         raise SimulationFailed("no")

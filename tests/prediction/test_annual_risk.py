@@ -121,6 +121,7 @@ def test_a_rate_beyond_the_hazard_curve_is_extrapolated(record, rng):
     inside = annual_rate(*HAZARD, *found.curve[:2], *table)
     assert short.outside[0] == pytest.approx(1.0 - inside / short.rate[0]) and short.outside[0] > 0.5
     assert f"{short.outside[0]:.0%}" in str(short)
+    assert "in the unit of the fragilities?" in str(short) and "CAUTION" not in str(whole)
 
 
 @pytest.mark.parametrize(
@@ -130,6 +131,9 @@ def test_a_rate_beyond_the_hazard_curve_is_extrapolated(record, rng):
         (((2.0, 1.0), (0.2, 0.1)), "increasing positive intensities"),
         (((1.0,), (0.2,)), "two or more intensities"),
         ((INTENSITY, RATE, {"b": 1.0}), "a loss for each state, a, b"),
+        ((INTENSITY, RATE, {"a": np.nan, "b": 1.0}), "losses that are finite"),
+        ((INTENSITY, RATE, {"a": -1.0, "b": 1.0}), "not negative"),
+        ((INTENSITY, RATE, {"a": 2.0, "b": 1.0}), "not smaller in severer states"),
     ],
 )
 def test_impossible_arguments_are_refused(arguments, message):

@@ -72,6 +72,12 @@ def test_a_quantity_without_structure_gains_nothing_and_says_so(sample):
     assert all(any("unexplained" in remark for remark in each.remarks) for each in found)
 
 
+def test_equal_values_have_a_remark(sample):
+    found = propagate_few(model_of(lambda theta: max(theta[0], 5.0)), sample, quantity=first, progress=False)
+    assert found.mean == pytest.approx(5.0) and found.effective_sample_size == 30
+    assert any("values of a number are equal" in each for each in found.remarks)
+
+
 def test_several_numbers_and_failures(sample):
     def function(theta):
         if theta[0] > 1.15:
