@@ -136,6 +136,8 @@ class EmulatedPosterior:
         Largest log-density in the pool.
     effective_share : float
         Effective sample size of the pool divided by its size.
+    largest_weight : float
+        Largest normalised weight of a point of the pool.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:
@@ -356,3 +358,4 @@ class EmulatedPosterior:
         effective = effective_sample_size(self._log_weights)
         self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / _POOL, 0.0)))
         self.effective_share = effective / _POOL
+        self.largest_weight = float(self._weights.max())

@@ -11,6 +11,7 @@ from fe_likelihoods import (
     FunctionModel,
     GaussianNoise,
     HalfNormal,
+    LogNormal,
     Measurements,
     Posterior,
     TruncatedNormal,
@@ -193,3 +194,24 @@ def test_springs_in_series_are_emulated_in_flexibilities():
     weights = np.exp(posterior(draws) - posterior.log_prior(draws) - sampler.log_evidence)
     error = weights.std() / np.sqrt(len(draws))
     assert abs(weights.mean() - 1.0) < 3.0 * np.hypot(error, sampler.log_evidence_error)
+
+
+@pytest.mark.slow  # 20 seconds
+def test_a_banana_in_eight_dimensions_has_a_concern():
+    """No ellipsoids cover its emulated posterior, so that its ends are missing: sd 0.75 of the true one (seed 1)."""
+    n = 8
+    model = FunctionModel(
+        lambda x: np.append(15.0 * (x[1] - 0.6 * x[0] ** 2), 3.0 * x[2:])[None],
+        [f"x{i}" for i in range(n)],
+        [Channel("y", "displacement", "m")],
+        0.1,
+        n - 1,
+        version="banana",
+    )
+    measured = Measurements(model.channels, 0.1, np.random.default_rng(1).standard_normal((1, n - 1)), "SYNTHETIC")
+    prior = {name: TruncatedNormal(0.0, 1.0, -10.0, 10.0) for name in model.parameter_names}
+    posterior = Posterior(FELikelihood(model, measured), prior | {"sigma_y": LogNormal(1.0, 0.2)})
+    sampler = SMCSampler(100, n + 1, posterior, vectorize=True, seed=1, guide=posterior.guide(), max_simulations=1500)
+    with pytest.warns(UserWarning, match="draws in memory cover it badly"):
+        sampler.run_mcmc(None, 0)
+    assert sampler.verdict.status == "usable"
