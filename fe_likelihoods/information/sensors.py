@@ -364,9 +364,9 @@ def rank_sensors(
             f"n_sensors must be from 1 to {len(candidates)}, draws at least 2, and step positive; got {n_sensors}, "
             f"{draws} and {step}"
         )
-    for what, each in (("noise", noise), ("effective_samples", effective_samples)):
-        if each is not None:
-            _by_channel(each, model.channels, what)  # errors come before the simulations
+    levels = _by_channel(noise, model.channels, "noise")
+    counts = model.n_steps if effective_samples is None else effective_samples
+    independent = np.minimum(_by_channel(counts, model.channels, "effective_samples") / model.n_steps, 1.0)
     coords, precision = _draw(known, given, samples, draws, seed)
     sd = np.sqrt(np.diag(np.linalg.inv(precision)))
     steps = step * sd * np.where(coords > 0.0, -1.0, 1.0)  # towards the median, where the prior has its parameters
@@ -392,10 +392,8 @@ def rank_sensors(
             "narrow the prior, or see why simulations fail (rehearse)"
         )
     rms = np.sqrt(slopes.mean_squares[good].mean(axis=0))
-    levels = _noise_levels(noise, model.channels, rms)
-    weights = np.where(rms > 0.0, 1.0 / np.where(levels > 0.0, levels, np.inf) ** 2, 0.0)
-    if effective_samples is not None:
-        weights *= np.minimum(_by_channel(effective_samples, model.channels, "effective_samples") / model.n_steps, 1.0)
+    levels = levels if isinstance(noise, Mapping) else levels * rms  # zero for a share of a channel without response
+    weights = independent * np.where(rms > 0.0, 1.0 / np.where(levels > 0.0, levels, np.inf) ** 2, 0.0)
     products = slopes.products[good] * weights[:, None, None]
     start = precision + products[:, [names.index(name) for name in installed]].sum(axis=1)
     places = [names.index(name) for name in candidates]
@@ -451,12 +449,6 @@ def _by_channel(given: float | Mapping[str, float], channels: Sequence[Channel],
     if wrong := [name for name, value in zip(names, values, strict=True) if not value > 0.0]:
         raise ValueError(f"{what} must be a positive number for every channel; give one for {', '.join(wrong)}")
     return values
-
-
-def _noise_levels(noise: float | Mapping[str, float], channels: Sequence[Channel], rms: np.ndarray) -> np.ndarray:
-    """Standard deviation (n_channels,) of the noise [SI]; zero for a share of a channel without response."""
-    levels = _by_channel(noise, channels, "noise")
-    return levels if isinstance(noise, Mapping) else levels * rms
 
 
 def _mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
