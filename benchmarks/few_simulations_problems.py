@@ -20,15 +20,11 @@ from fe_likelihoods import (
     TruncatedNormal,
     problems,
 )
-from fe_likelihoods.signals.readers import read_csv
 from tests import opensees_frame
 
 from . import many_stiffnesses, tested_column
-from .targets import SHARED
 
 __all__ = ["PROBLEMS", "Problem", "oscillator"]
-
-REAL_RECORD = SHARED / "records" / "loma_prieta_1989_apeel2_redwood_city_43.csv"
 
 
 class Problem(NamedTuple):
@@ -40,38 +36,24 @@ class Problem(NamedTuple):
         Description.
     posterior : callable
         Function of the seed.
-    starts : callable
-        Function of the posterior that returns points near every mode (n_modes, d), for the reference.
     goal : int
         Simulations of the whole record in which 100 effective samples are wanted.
     labels : callable, optional
         Function of samples (n, ndim) that returns the number of the mode (n,).
     needs : callable
         Returns why the problem cannot be run here, or an empty string.
-    walkers : int
-        Of the default sampler.
     measured : bool
         Whether the data are measured ones, the same for every seed, so that all seeds have one reference.
-    reference_draws, reference_rounds : int
-        Draws per round of the reference by importance sampling, and rounds. No draws: the reference is a longer run of
-        the default sampler, where importance sampling from a known mode fails (many local modes).
-    reciprocals : bool
-        Whether the reference is by importance sampling in the reciprocals of the parameters.
     exact : callable, optional
         Function of the posterior that returns its `Reference` by quadrature, at once.
     """
 
     what: str
     posterior: Callable[[int], Posterior]
-    starts: Callable[[Posterior], np.ndarray]
     goal: int
     labels: Callable[[np.ndarray], np.ndarray] | None = None
     needs: Callable[[], str] = str
-    walkers: int = 500
     measured: bool = False
-    reference_draws: int = 400
-    reference_rounds: int = 8
-    reciprocals: bool = False
     exact: Callable[[Posterior], Any] | None = None
 
 
@@ -127,89 +109,44 @@ def column_one_in_four(seed: int) -> Posterior:
     return column(seed, every=4)
 
 
-def column_real_record(seed: int) -> Posterior:
-    """Bridge column under a measured ground motion; the responses are synthetic."""
-    return problems.bridge_column(record=read_csv(REAL_RECORD), seed=seed, noise="marginal")
-
-
-def _twin_truth(posterior: Posterior) -> np.ndarray:
-    return np.array([list(problems.ISOLATED_BRIDGE_TRUTH["twin"].values())])
-
-
-def _means_truth(posterior: Posterior) -> np.ndarray:
-    truth = np.array(list(problems.ISOLATED_BRIDGE_TRUTH["means"].values()))
-    return np.stack([truth, posterior.likelihood.model.exchange_piers(truth)])
-
-
-def _column_truth(posterior: Posterior) -> np.ndarray:
-    return np.array([[problems.BRIDGE_COLUMN_MEANS[name] for name in posterior.likelihood.model.parameter_names]])
-
-
 def _pier_with_more_friction(samples: np.ndarray) -> np.ndarray:
     return (samples[:, 1] >= samples[:, 4]).astype(int)
 
 
-def _real_record() -> str:
-    return "" if REAL_RECORD.exists() else f"the record {REAL_RECORD} is missing: set FE_SHARED to its folder"
-
-
-def _oscillator_truth(posterior: Posterior) -> np.ndarray:
-    return np.array([[1.15, 0.8]])
-
-
 PROBLEMS = {
-    "oscillator": Problem("linear oscillator, 2 parameters", oscillator, _oscillator_truth, 100, reference_rounds=3),
-    "twin": Problem("isolated bridge, 10 parameters", bridge_twin, _twin_truth, 280),
+    "oscillator": Problem("linear oscillator, 2 parameters", oscillator, 100),
+    "twin": Problem("isolated bridge, 10 parameters", bridge_twin, 280),
     "means": Problem(
         "isolated bridge, means of both piers: 10 parameters, 2 modes",
         bridge_means,
-        _means_truth,
         800,
         labels=_pier_with_more_friction,
-        reference_draws=600,
     ),
-    "column4": Problem("bridge column, one sample in 4, 5 parameters", column_one_in_four, _column_truth, 400),
-    "column": Problem("bridge column, all data, 5 parameters", column, _column_truth, 750),
-    "real": Problem(
-        "bridge column, measured record, 5 parameters", column_real_record, _column_truth, 750, needs=_real_record
-    ),
+    "column4": Problem("bridge column, one sample in 4, 5 parameters", column_one_in_four, 400),
+    "column": Problem("bridge column, all data, 5 parameters", column, 750),
     "opensees": Problem(
-        "OpenSees frame of fiber beams, 5 parameters",
-        opensees_frame.posterior,
-        opensees_frame.truth,
-        500,
-        needs=opensees_frame.missing,
-        walkers=100,
-        reference_draws=150,
+        "OpenSees frame of fiber beams, 5 parameters", opensees_frame.posterior, 500, needs=opensees_frame.missing
     ),
     "lehman_white": Problem(
         "tested column (Lehman 415), 7 parameters, white noise",
         tested_column.white,
-        tested_column.start,
         800,
         needs=tested_column.missing,
         measured=True,
-        reference_draws=0,
     ),
     "lehman_ar1": Problem(
         "tested column (Lehman 415), 7 parameters and 2 of autoregressive noise",
         tested_column.autoregressive,
-        tested_column.start,
         800,
         needs=tested_column.missing,
         measured=True,
-        reference_draws=0,
     ),
 }
 PROBLEMS |= {
     f"shear{storeys}{suffix}": Problem(
         f"shear building, {storeys} stiffnesses, 4 accelerations{', derivatives' if suffix else ''}",
         partial(many_stiffnesses.shear_building, storeys, jacobian=bool(suffix)),
-        lambda posterior: np.ones((1, posterior.ndim)),
         goal,
-        reference_draws=10_000 if storeys > 10 else 40 * storeys**2,
-        reference_rounds=6,
-        reciprocals=storeys > 10,
     )
     for storeys, goal in ((10, 200), (20, 400), (30, 600), (50, 1000))
     for suffix in ("", "_jacobian")
@@ -218,7 +155,6 @@ PROBLEMS |= {
     name: Problem(
         f"only the product E h^3 is identified, {name}",
         partial(many_stiffnesses.ridge, name),
-        lambda posterior: np.array([[1.3, 0.9]]),
         500,
         exact=partial(many_stiffnesses.ridge_reference, name),
     )

@@ -5,25 +5,7 @@ import pytest
 
 from benchmarks import few_simulations
 from benchmarks.few_simulations_problems import PROBLEMS
-from benchmarks.importance_reference import by_importance, find_mode
 from benchmarks.many_stiffnesses import shear_building, shear_truth
-from tests.statistics.brute_force import reference
-from tests.statistics.hard_posteriors import CASES
-
-
-@pytest.mark.parametrize("name", ["few_samples", "sampled_noise"])
-def test_importance_sampling_from_a_known_mode_agrees_with_brute_force(name):
-    case = CASES[name]
-    known, posterior = reference(case, 2, draws=20_000), case.posterior(2, name)
-    mode, covariance = find_mode(posterior, np.ones(len(case.prior)))
-    d = len(case.prior)
-    assert np.all(np.abs(mode - known.mean[:d]) < 0.6 * known.sd[:d])
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), known.sd[:d], rtol=0.4)
-    found = by_importance(posterior, np.ones((1, d)), draws=300, rounds=5)
-    error = np.hypot(found.log_evidence_error, known.log_evidence_error)
-    assert abs(found.log_evidence - known.log_evidence) < 3.5 * error
-    assert np.all(np.abs(found.mean - known.mean) < 4.0 * np.hypot(found.mean_error, known.mean_error))
-    assert found.effective_sample_size > 400
 
 
 def test_stored_references_are_complete_and_precise():

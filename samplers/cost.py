@@ -5,7 +5,7 @@ factor g. For a Gaussian posterior in d dimensions, the share :math:`(\sqrt{2 g 
 size is kept. Annealing by moves keeps a given share of the walkers, which determines g. The growth of recycling was
 measured on Gaussian posteriors: :math:`\ln g = \min(1.7, 2.9 d^{-0.55})`. The number of stages is
 :math:`-\ln \beta_1 / \ln g`; the first exponent :math:`\beta_1` is inversely proportional to the spread of the
-log-likelihood over the prior. The constants are means over ``python -m benchmarks expected``.
+log-likelihood over the prior. The constants are means over study `expected` of docs/results.rst.
 
 The wall time is the number of evaluations times the mean duration, divided by the number of workers.
 """

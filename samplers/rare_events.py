@@ -184,7 +184,7 @@ def subset_simulation(
     Notes
     -----
     A level makes n simulations (about 6 n for another density), a probability of 10^-k takes k levels. The estimate has
-    a bias of order 1/n, because thresholds are quantiles of the points (``python -m benchmarks rare_events`` has its
+    a bias of order 1/n, because thresholds are quantiles of the points (study `rare_events` of docs/results.rst has its
     size). A region that no point of the first levels is near is missed, without a sign in the stated error.
 
     Examples

@@ -24,7 +24,7 @@ from fe_likelihoods import (
     problems,
 )
 
-__all__ = ["NAMES", "TRUTH", "frame", "missing", "posterior", "truth"]
+__all__ = ["NAMES", "TRUTH", "frame", "missing", "posterior"]
 
 NAMES = ("E", "fy", "hardening", "damping", "base")
 TRUTH = (0.95, 1.1, 1.3, 0.8, 1.4)
@@ -133,11 +133,6 @@ def posterior(seed: int) -> Posterior:
     prior |= {f"sigma_{c.name}": HalfNormal(float(scale)) for c, scale in zip(CHANNELS, rms[:, 0], strict=True)}
     measured = Measurements(CHANNELS, structure.dt, values, f"SYNTHETIC, seed {seed}")
     return Posterior(FELikelihood(structure, measured, pool=2), prior).marginal()
-
-
-def truth(posterior: Posterior) -> np.ndarray:
-    """Point near the only mode."""
-    return np.array([TRUTH])
 
 
 def missing() -> str:

@@ -304,7 +304,7 @@ for shaking, stem in (("shaking 1", "calibration"), ("shaking 3", "prediction"))
 #   as well as in the first. The first floor in the third shaking has the largest error: 27 to 30 %.
 # * **90 % bands.** Most of the width of a band is sigma, which is nearly the same under all noises. With white noise
 #   and a roof like the floors, the interval scores of the bands in the later shakings are 0.55 to 1.6 times the root
-#   mean square of the channel, their widths 0.48 to 0.72 (``python -m benchmarks transfer_frame``). The printed
+#   mean square of the channel, their widths 0.48 to 0.72 (study `transfer_frame` of docs/results.rst). The printed
 #   table has the scores and the coverage of every noise. The band of the response alone, the uncertainty of the
 #   parameters, is not a band for measurements.
 # * **Limits.** The frame is not linear: its frequency is 3.80 Hz at small and 3.68 Hz at large amplitudes, and the

@@ -350,8 +350,8 @@ def plot_loops(path: Path, name: str) -> None:
 # drifts and in other columns.
 #
 # With white errors the band with noise of the second half contains 51 % of the samples. It is 0.23 and its interval
-# score 1.2 times the root mean square of the force: the misses cost four times the width of the band (``python -m
-# benchmarks transfer_columns``). The printed table has the interval scores of the other error models. None of
+# score 1.2 times the root mean square of the force: the misses cost four times the width of the band (study
+# `transfer_columns` of docs/results.rst). The printed table has the interval scores of the other error models. None of
 # them describes an error that grows with drift. After failure all predictions fail, because the bars of this model do
 # not break.
 

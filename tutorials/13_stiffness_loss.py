@@ -203,8 +203,8 @@ fig.savefig(args.out / "probabilities.png", dpi=150)
 # Are such probabilities right?
 # -----------------------------
 #
-# One building shows little. ``python -m benchmarks stiffness_loss`` repeats the comparison for 50 buildings with losses
-# of 0, 10, 20 and 30 %, whose bases rotate on soft soil or that bend, which the model does not contain either:
+# One building shows little. The study `stiffness_loss` (docs/results.rst) repeats the comparison for 50 buildings with
+# losses of 0, 10, 20 and 30 %, whose bases rotate on soft soil or that bend, which the model does not contain either:
 # :doc:`/stiffness_loss` has the table and the reliability diagram.
 
 summary = {

@@ -18,7 +18,7 @@ __all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "ends_withi
 _HYPER_SAMPLES = 100
 _RESAMPLINGS = 12
 _DRAWS = 500
-# Limits of the warnings, chosen with `python -m benchmarks hierarchy_warnings`, where the exact result is known.
+# Limits of the warnings, chosen with study `hierarchy_warnings` of docs/results.rst, where the exact result is known.
 _LARGEST_ERROR = 0.2  # of the mean of a hyper-parameter, in posterior standard deviations
 _FEWEST_EFFECTIVE = ((20.0, 0.15), (1.0, 0.0))  # if the error of a mean is above the second number
 _LARGEST_SHAPES = ((LARGEST_SHAPE, 0.1), (0.8, 0.0))  # Pareto shape, if the error of a mean is above the second number

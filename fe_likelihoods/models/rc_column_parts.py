@@ -18,7 +18,7 @@ from .validation import check_fields, check_integer, invalid
 
 __all__ = ["BarBuckling", "Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel", "hardening_fault"]
 
-_MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by ``python -m benchmarks failing_columns``
+_MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by study `failing_columns` of docs/results.rst
 
 
 @dataclass(frozen=True)

@@ -288,7 +288,7 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
     assert (shift > 0.3) == is_named and (checks.mean_errors["mean_a"] > 0.2) == is_named
 
 
-# the seeds of problems of `python -m benchmarks hierarchy_warnings`
+# the seeds of problems of study `hierarchy_warnings` of docs/results.rst
 @pytest.mark.parametrize("seed", [328, 359, 415])
 def test_right_results_have_no_warning(seed):
     """Weighted samples, a chain, many samples: the population is narrow, and the result right all the same."""
