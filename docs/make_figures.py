@@ -28,8 +28,10 @@ from fe_likelihoods import (
     TruncatedNormal,
     material_curves,
     moment_curvature,
+    plot_hysteresis,
     plot_material,
     plot_moment_curvature,
+    plot_section,
     plot_sensors,
     problems,
     rank_sensors,
@@ -72,9 +74,9 @@ def model_figures() -> dict:
     posterior = problems.bridge_column(every=8)
     column = posterior.likelihood.model
     strong = replace(column, loading=column.loading.scale(2.5))
-    loops = strong.plot_hysteresis([problems.BRIDGE_COLUMN_MEANS[name] for name in column.parameter_names])
+    loops = plot_hysteresis(strong, [problems.BRIDGE_COLUMN_MEANS[name] for name in column.parameter_names])
     loops.suptitle("bridge column under 2.5 times the synthetic motion", fontsize="medium")
-    bearings = problems.isolated_bridge().likelihood.model.plot_hysteresis(np.ones(10))
+    bearings = plot_hysteresis(problems.isolated_bridge().likelihood.model, np.ones(10))
     bearings.suptitle("isolated bridge, nominal values (assumed), synthetic motion", fontsize="medium")
     means = [problems.BRIDGE_COLUMN_MEANS[name] for name in column.parameter_names]
     bar = round(column.bar_circle_radius, 3)
@@ -100,7 +102,7 @@ def model_figures() -> dict:
     return {
         "column_sensors": sensors,
         "column_materials": materials,
-        "column_section": column.plot_section().figure,
+        "column_section": plot_section(column).figure,
         "column_hysteresis": loops,
         "bridge_hysteresis": bearings,
     }

@@ -31,13 +31,15 @@ from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
-from .noise.residuals import effective_samples, plot_residuals, residual_checks
+from .noise.residuals import effective_samples, residual_checks
 from .plots.damage import plot_damage
-from .plots.histories import plot_loop
+from .plots.fits import plot_fit
+from .plots.histories import plot_histories, plot_record, plot_residuals, plot_response, plot_spectrum
 from .plots.materials import plot_material, plot_moment_curvature
 from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
-from .plots.structures import plot_sensors
+from .plots.sensors import plot_ranking
+from .plots.structures import plot_hysteresis, plot_section, plot_sensors
 from .prediction.annual_risk import annual_risk
 from .prediction.averaging import average_predictions
 from .prediction.few_runs import propagate_few
@@ -61,7 +63,6 @@ from .signals.channels import Channel, Measurements
 from .signals.durations import growing_durations
 from .signals.error_measures import rrmse
 from .signals.events import Events
-from .signals.fits import plot_fit
 from .signals.measurement_readers import read_columns, read_imposed_test
 from .signals.readers import read_record
 from .signals.records import DisplacementHistory, Record
@@ -146,12 +147,18 @@ __all__ = [
     "plot_damage",
     "plot_fit",
     "plot_fragility",
-    "plot_loop",
+    "plot_histories",
+    "plot_hysteresis",
     "plot_material",
     "plot_moment_curvature",
+    "plot_ranking",
+    "plot_record",
     "plot_residuals",
+    "plot_response",
     "plot_scores",
+    "plot_section",
     "plot_sensors",
+    "plot_spectrum",
     "predict_new_event",
     "problems",
     "propagate",

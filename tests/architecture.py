@@ -42,6 +42,7 @@ ORDER = {
         ("reporting",),
         ("problems",),
         ("adapters",),
+        ("plots",),
         ("column_damage", "information"),
         ("prediction",),
         ("events", "models"),
@@ -51,7 +52,6 @@ ORDER = {
         ("simulation",),
         ("noise",),
         ("priors", "signals"),
-        ("plots",),
         ("kernels",),
         ("text_tables", "units"),
     ),
@@ -137,8 +137,6 @@ def _imports_of(source: str, package: tuple[str, ...]) -> tuple[Import, ...]:
     late = for_types | {node for block in functions for node in ast.walk(block)}
     found = []
     for node in ast.walk(tree):
-        if package[-1:] == ("plots",) and node in for_types:
-            continue  # figures may import the types that they draw
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

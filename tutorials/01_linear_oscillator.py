@@ -39,7 +39,10 @@ from fe_likelihoods import (
     peak,
     plot_bands,
     plot_fit,
+    plot_histories,
+    plot_record,
     plot_scores,
+    plot_spectrum,
     problems,
     propagate,
     to_si,
@@ -73,8 +76,8 @@ def save(figure, name: str) -> None:
 record = problems.bridge_column_data().record
 record = record.resample(8 * record.dt).trim(0.0, 25.0)
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4), width_ratios=(1.6, 1), layout="constrained")
-record.plot(left)
-record.plot_spectrum(axes=right)
+plot_record(record, left)
+plot_spectrum(record, axes=right)
 right.set_title("response spectrum")
 save(figure, "record")
 
@@ -105,7 +108,7 @@ rng = np.random.default_rng(args.seed)
 clean = model.simulate(truth[:2])
 noisy = clean + truth[2:, None] * rng.standard_normal(clean.shape)
 measured = Measurements(model.channels, model.dt, noisy, "SYNTHETIC: a linear oscillator plus white noise")
-save(measured.plot(), "measurements")
+save(plot_histories(measured), "measurements")
 
 # %%
 # 4. Prior, likelihood, posterior

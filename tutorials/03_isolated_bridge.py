@@ -48,6 +48,7 @@ from fe_likelihoods import (
     propagate,
 )
 from fe_likelihoods.models.isolated_bridge_parts import Bearing
+from fe_likelihoods.plots.structures import plot_bridge
 from fe_likelihoods.problems import table_motion
 from samplers import (
     SamplingWarning,
@@ -107,7 +108,7 @@ names, n_structural = posterior.parameter_names, len(model.parameter_names)
 truth = np.array([problems.ISOLATED_BRIDGE_TRUTH[args.data][name] for name in model.parameter_names])
 print(measured.description)
 print(f"{measured.n_steps} samples at {measured.dt:g} s of {', '.join(c.name for c in measured.channels)}")
-figure = model.plot_scheme().figure  # Figures 2 and 3 of the study: the bridge and its instrumentation
+figure = plot_bridge(model).figure  # Figures 2 and 3 of the study: the bridge and its instrumentation
 figure.savefig(args.out / "fig2_scheme_and_channels.png", dpi=150)
 if args.preset == "fast":
     print("REDUCED SETTING (fast): few samples and long time steps; these numbers are not results")

@@ -41,6 +41,7 @@ from fe_likelihoods import (
     Record,
     identifiability,
     peak,
+    plot_ranking,
     plot_sensors,
     problems,
     propagate,
@@ -104,7 +105,7 @@ settings = {"noise": NOISE, "effective_samples": INDEPENDENT, "draws": DRAWS, "s
 for_parameters = rank_sensors(column, prior, **settings)
 for_decision = rank_sensors(column, prior, target=target, target_model=design, **settings)
 print(f"For the parameters\n{for_parameters}\n\nFor the peak displacement under the design motion\n{for_decision}")
-figure = for_decision.plot()
+figure = plot_ranking(for_decision)
 figure.savefig(args.out / "ranks.png", dpi=150)
 
 # %%

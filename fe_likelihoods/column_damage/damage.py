@@ -22,7 +22,7 @@ Structural Engineering 111(4), 740-757, doi:10.1061/(ASCE)0733-9445(1985)111:4(7
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,9 +41,6 @@ from ..prediction.reliability import (
 from ..text_tables import number
 from ..units import DIMENSIONS, find_unit, from_si
 from .measures import SIDES, STRAIN_MEASURES, DamageMeasures
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["Damage", "LimitState", "damage", "limit_states"]
 
@@ -196,12 +193,6 @@ class Damage(NamedTuple):
         closing = [f"The probabilities contain {self.uncertainty}."]
         closing += [f"{self.failures}."] if self.failures else []
         return "\n".join([*lines, "", *closing, *(f"CAUTION: {remark}" for remark in self.remarks)])
-
-    def plot(self, events: Sequence[str] | None = None) -> Figure:
-        """Draw the column with its probabilities, see `fe_likelihoods.plots.damage.plot_damage`."""
-        from ..plots.damage import plot_damage
-
-        return plot_damage(self, events)
 
 
 def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:

@@ -9,8 +9,8 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.posterior import Posterior
 from ..reporting.rehearsal import Rehearsal, rehearse
+from ..signals.data_faults import REMARK
 from ..signals.error_measures import rrmse
-from ..signals.fit_gate import REMARK
 from ..units import from_si
 from .events import Event, read_events
 from .job import Job, read_job

@@ -22,7 +22,7 @@ from ..prediction.prediction import Prediction
 from ..reporting.advice import judge, judge_run
 from ..reporting.rehearsal import refuse_chance
 from ..reporting.run import FinishedRun, read_run
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
+from ..signals.data_faults import CARE, REMARK, WRONG, Finding
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,

@@ -20,7 +20,7 @@ noise is white, known, and independent between channels; errors of the model are
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,9 +32,6 @@ from ..priors.priors import Prior
 from ..signals.channels import Channel
 from ..simulation.model import Model, derivatives_batch, most_responses, simulate_batch
 from ..text_tables import number, text_table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["SensorRanking", "Slopes", "information_of", "rank_sensors", "slopes_at", "variance_of"]
 
@@ -148,12 +145,6 @@ class SensorRanking(NamedTuple):
             f"Standard deviations left with all of them: {left}",
         ]
         return "\n".join(lines)
-
-    def plot(self) -> "Figure":
-        """Draw the chosen sensors: information alone and added, and the share of the target's variance that is left."""
-        from ..plots.sensors import draw_ranking
-
-        return draw_ranking(self)
 
 
 def _with_error(value: float, error: float) -> str:

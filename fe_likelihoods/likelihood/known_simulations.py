@@ -14,7 +14,7 @@ from ..cache.memory import MemoryCache, ResponseMemory, thetas_of
 from ..cache.verification import StaleCache
 from ..simulation.model import SimulationBatch, misfit_of_responses, most_responses
 from .checked_model import CheckedModel
-from .failures import FailureLog
+from .failure_log import FailureLog
 
 __all__ = ["KnownSimulations", "Requested"]
 

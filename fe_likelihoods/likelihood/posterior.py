@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..noise.protocol import noise_title
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
@@ -411,29 +410,6 @@ class Posterior:
             of the simulations). For a `JointLikelihood` also ``likelihoods``, the report of each part.
         """
         return self.likelihood.report()
-
-    def _repr_html_(self) -> str:
-        """In notebooks: what is updated with what data, the parameters with their priors, simulations so far."""
-        from ..plots.html import html_object, html_table
-
-        parts, lines = self.likelihood.parts(), []
-        for part, _ in parts:
-            channels = ", ".join(channel.name for channel in part.measurements.channels)
-            samples = np.sum(~np.isnan(part.measurements.values))
-            lines.append(f"{type(part.model).__name__}, {noise_title(part.noise)}, {samples} samples of {channels}")
-        report = self.report()
-        lines.append(f"{report['simulations']} simulations so far, {report['failure_count']} failed")
-        header, rows = self.prior.table()
-        shown = [
-            (
-                parameter.label,
-                _family(row[1]),
-                *(float(parameter.shown(value)) for value in (*row[2:], parameter.nominal)),
-            )
-            for parameter, row in zip(self.parameters, rows, strict=True)
-        ]
-        table = html_table((*header[:1], "prior", *header[2:], "nominal"), shown)
-        return html_object(f"Posterior of {self.ndim} parameters", lines, table)
 
     def _evaluate(self, x: Any) -> tuple[np.ndarray | float, np.ndarray | float]:
         """Log-prior and log-likelihood of one point, or (n,) of n points; nothing is simulated outside the support."""

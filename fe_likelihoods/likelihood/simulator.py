@@ -40,7 +40,7 @@ from ..simulation.model import (
 )
 from ..simulation.opened import Observed, unpack
 from .checked_model import CheckedModel
-from .failures import FailureLog
+from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
 from .known_simulations import KnownSimulations, Requested
 from .running_simulations import RunningRequests, RunningSimulation, Simulated, take_all

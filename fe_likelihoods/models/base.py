@@ -11,18 +11,15 @@ import hashlib
 import logging
 import weakref
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..signals.channels import Channel, Measurements, plot_response
+from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import array_digest
 from .validation import check_theta, invalid
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["BuiltInModel", "History", "StructuralModel", "digest", "remark_on_range"]
 
@@ -71,7 +68,7 @@ class StructuralModel:
     dt: float
     n_steps: int
     path_dependent: bool = True
-    _time_label = "time [s]"
+    time_label = "time [s]"
 
     def simulate(self, theta: ArrayLike) -> np.ndarray:
         """Simulate the structure for one set of parameters.
@@ -94,11 +91,6 @@ class StructuralModel:
             If `theta` has another shape.
         """
         return self._respond(check_theta(theta, self.parameter_names))
-
-    def plot_response(self, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
-        """Plot the response at `theta`, together with `measurements` of its channels if they are given."""
-        response = Measurements(self.channels, self.dt, self.simulate(theta))
-        return plot_response(response, measurements, time_label=self._time_label)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         raise NotImplementedError

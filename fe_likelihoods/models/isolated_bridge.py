@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -44,10 +44,6 @@ from .validation import (
     check_theta,
     invalid,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["PARAMETERS", "BridgeHistory", "IsolatedBridge"]
 
@@ -373,18 +369,6 @@ class IsolatedBridge(ThreadedModel):
         nominal = np.array(list(self.nominal.values()))
         physical = np.asarray(thetas, dtype=float) * nominal
         return physical[..., _EXCHANGED] / nominal
-
-    def plot_scheme(self, axes: Axes | None = None) -> Axes:
-        """Plot the bridge and its channels (`fe_likelihoods.plots.structures.plot_bridge`)."""
-        from ..plots.structures import plot_bridge
-
-        return plot_bridge(self, axes)
-
-    def plot_hysteresis(self, theta: np.ndarray) -> Figure:
-        """Plot isolator force against bearing displacement of both piers at `theta`."""
-        from ..plots.structures import plot_bearing_loops
-
-        return plot_bearing_loops(replace(self, every=1).history(theta))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         return self._outputs_of(run_bridge(self, self._prepared, theta, None), theta)

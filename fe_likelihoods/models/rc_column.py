@@ -31,7 +31,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -55,10 +55,6 @@ from .validation import (
     check_theta,
     invalid,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["PARAMETERS", "RCColumn"]
 
@@ -420,18 +416,6 @@ class RCColumn(ThreadedModel):
         values = np.vstack([history.values, *sensors.values()])
         return replace(history, names=(*history.names, *sensors), values=values)
 
-    def plot_section(self, axes: Axes | None = None) -> Axes:
-        """Plot cover, core, mesh and bars of the section (`fe_likelihoods.plots.structures.plot_section`)."""
-        from ..plots.structures import plot_section
-
-        return plot_section(self, axes)
-
-    def plot_hysteresis(self, theta: np.ndarray) -> Figure:
-        """Plot base moment against curvature and force against displacement of the top at `theta`."""
-        from ..plots.structures import plot_column_loops
-
-        return plot_column_loops(self, self.history(theta))
-
     def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
         """Simulate from the state at a sample of the response, and return the state at the last sample.
 
@@ -470,7 +454,7 @@ class RCColumn(ThreadedModel):
         return prepare_column(self, self._parsed_outputs)
 
     @property
-    def _time_label(self) -> str:
+    def time_label(self) -> str:
         return "time [s]" if isinstance(self.loading, Record) else "step"
 
     @property

@@ -64,7 +64,7 @@ class SteelCoupon(BuiltInModel):
     parameters: tuple[str, ...] = tuple(PARAMETERS)
     unit: str = "MPa"
 
-    _time_label: ClassVar[str] = "step"
+    time_label: ClassVar[str] = "step"
     _nominal_units: ClassVar[dict[str, str]] = {"fy": "MPa", "fu": "MPa", "Es": "GPa", "Esh": "GPa"}
 
     def __post_init__(self) -> None:

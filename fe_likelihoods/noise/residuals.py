@@ -14,7 +14,7 @@ The equations are on the page ``docs/theory/noise.rst``.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,16 +22,12 @@ from ..signals.channels import Channel
 from ..units import find_unit
 from .sample_counts import distinct_gaps
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 __all__ = [
     "ResidualChecks",
     "autocorrelation",
     "effective_samples",
     "innovations",
     "lag_one_sums",
-    "plot_residuals",
     "residual_checks",
 ]
 
@@ -376,43 +372,6 @@ def residual_checks(
         channels=tuple(channels),
         whitened=whitened,
     )
-
-
-def plot_residuals(
-    residuals: np.ndarray, channels: Sequence[Channel], dt: float, *, whitened: bool = False
-) -> "Figure":
-    """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
-
-    For white residuals, 95 % of the autocorrelation coefficients are in the shaded band. The quantiles of normal
-    residuals follow the straight line. The text above each row is the verdict of `residual_checks`.
-
-    Parameters
-    ----------
-    residuals : ndarray, shape (n_channels, n_steps)
-        Measured minus simulated response [SI], such as the result of `FELikelihood.residuals`.
-    channels : sequence of Channel
-        The channels, one per row of `residuals`.
-    dt : float
-        Time step [s].
-    whitened : bool
-        See `residual_checks`.
-
-    Returns
-    -------
-    matplotlib Figure
-        The figure, with axes of shape (n_channels, 3).
-
-    Raises
-    ------
-    ValueError
-        If the number of channels differs from the number of rows, or the residuals have another shape, fewer than two
-        samples, non-finite values, or only zeros in a channel.
-    """
-    from ..plots.histories import plot_residual_checks
-
-    known = channels if len(channels) == len(residuals) else ()
-    checks = residual_checks(residuals, known, whitened=whitened)
-    return plot_residual_checks(residuals, channels, dt, checks, autocorrelation(residuals))
 
 
 def _checked(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> np.ndarray:

@@ -1,69 +1,103 @@
-"""The figure of a fit: measurements and the responses of a model before and after an update.
-
-The function draws what it is given, and computes no statistic.
-"""
+"""The figure of a fit: measurements and the responses of a model, such as before and after an update."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..signals.channels import Measurements
 from ..units import from_si
 from .style import BLUE, ORANGE, channel_label, marker_of, select_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..signals.channels import Measurements
-
-__all__ = ["draw_fit"]
+__all__ = ["plot_fit", "strongest_window"]
 
 _SHADES = (ORANGE, BLUE, "#5b8c5a", "#b03a48", "#7b5ea7")
 _MEASURED = "0.45"
 
 
-def draw_fit(
+def plot_fit(
     measurements: Measurements,
-    responses: Mapping[str, Measurements],
-    errors: Mapping[str, Mapping[str, float]],
-    windows: Mapping[str, tuple[float, float]],
+    responses: Mapping[str, Measurements | np.ndarray] | Measurements | np.ndarray,
     channels: Sequence[str] | None = None,
+    *,
+    window: float | None = 5.0,
     time_label: str = "time [s]",
     title: str | None = None,
 ) -> Figure:
-    """Draw one row per channel: the whole history beside each response, then all responses in a window of time.
+    """Plot measurements with the response of a model, such as before and after an update.
 
-    `fe_likelihoods.plot_fit` computes errors and windows and calls this function.
+    Each channel has a row: one axes per response with the whole history and the relative root mean square error (RRMSE)
+    in the title, then one axes with all responses in the strongest five seconds.
 
     Parameters
     ----------
     measurements : Measurements
         The measured histories.
-    responses : mapping of str to Measurements
-        Responses by their titles, in the order in which they are drawn.
-    errors : mapping of str to mapping of str to float
-        Relative root mean square error [-], by title and channel; missing where it is not known.
-    windows : mapping of str to (float, float)
-        Begin and end of each channel's window [s]; a channel without an entry has no window. Empty: no such column.
+    responses : mapping of str to (Measurements or ndarray), or one of these
+        Responses by their titles. An array has the shape, samples and channels of ``measurements.values`` [SI], such as
+        ``measurements.values - posterior.likelihood.residuals(x)`` for parameters x.
     channels : sequence of str, optional
-        Names of the channels to draw. Default: all measured channels.
+        Names of the channels to draw. Default: all.
+    window : float, optional
+        Length [s] of the strongest part, which is shown again on a longer scale. It is not shown for None or more than
+        two thirds of the history.
     time_label : str
-        Label of the horizontal axes.
+        Label of the horizontal axes, for example "step" for a test without time.
     title : str, optional
         Title of the figure. Default: the description of the measurements.
 
     Returns
     -------
     matplotlib Figure
-        With axes of shape (n_channels, n_responses + 1), or (n_channels, n_responses) without windows.
+        With axes of shape (n_channels, n_responses + 1), or (n_channels, n_responses) without strongest parts.
 
     Raises
     ------
     ValueError
-        If a channel is unknown.
+        If there is no response, an array has another shape than the measurements, a channel is unknown, or `window` is
+        not positive.
+
+    Examples
+    --------
+    >>> likelihood = posterior.likelihood
+    >>> points = {"before the update": nominal, "posterior mean": samples.mean(axis=0)}
+    >>> responses = {title: measured.values - likelihood.residuals(x) for title, x in points.items()}
+    >>> plot_fit(measured, responses).savefig("fit.png")
     """
+    if window is not None and not window > 0.0:
+        raise ValueError(f"window must be a positive number of seconds or None; got {window!r}")
+    given = responses if isinstance(responses, Mapping) else {"model": responses}
+    if not given:
+        raise ValueError("no response to draw: pass a mapping of titles to responses")
+    shown = {str(text): _as_measurements(measurements, response, text) for text, response in given.items()}
+    errors = {text: measurements.rrmse_of(response) for text, response in shown.items()}
+    windows = {}
+    for channel in measurements.channels if window is not None else ():
+        times = measurements.times(channel.name)
+        if window <= (times[-1] - times[0]) / 1.5:
+            windows[channel.name] = strongest_window(times, measurements.channel(channel.name), window)
+    if channels is not None:
+        wanted = [channels] if isinstance(channels, str) else channels
+        windows = {name: windows[name] for name in wanted if name in windows}
+    return _draw(measurements, shown, errors, windows, channels, time_label, title)
+
+
+def _draw(
+    measurements: Measurements,
+    responses: Mapping[str, Measurements],
+    errors: Mapping[str, Mapping[str, float]],
+    windows: Mapping[str, tuple[float, float]],
+    channels: Sequence[str] | None,
+    time_label: str,
+    title: str | None,
+) -> Figure:
+    """One row per channel; errors [-] by title and channel, windows (begin, end) [s] by channel."""
     import matplotlib.pyplot as plt
 
     known = {channel.name: channel for channel in measurements.channels}
@@ -132,3 +166,34 @@ def _set_limits(
     if with_window:
         row[-1].set_xlim(*(whole if window is None else window))
         row[-1].set_title("" if window is None else "the strongest part (grey on the left)", fontsize="small")
+
+
+def strongest_window(times: np.ndarray, values: np.ndarray, length: float) -> tuple[float, float]:
+    """Begin and end [s] of the part with the largest sum of squares.
+
+    Parameters
+    ----------
+    times : (n,) float
+        Times of the samples [s], with equal steps.
+    values : (n,) float
+        Any unit; NaN where a sample is missing.
+    length : float
+        Length of the part [s].
+    """
+    step = times[1] - times[0]
+    size = min(len(times), max(1, round(length / step)))
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values) ** 2)])
+    first = int(np.argmax(total[size:] - total[:-size]))
+    return float(times[first]), float(times[first] + length)
+
+
+def _as_measurements(measurements: Measurements, response: Measurements | np.ndarray, text: str) -> Measurements:
+    if isinstance(response, Measurements):
+        return response
+    values = np.asarray(response, dtype=float)
+    if values.shape != np.shape(measurements.values):
+        raise ValueError(
+            f"response {text!r}: an array must have the shape of the measured values, {np.shape(measurements.values)}; "
+            f"got {values.shape}. Pass Measurements for a response with other channels or times"
+        )
+    return replace(measurements, values=values, description="")

@@ -1,17 +1,15 @@
-"""Figures of records, response spectra, channel histories, loops and residuals, in display units.
-
-The functions draw what they are given. None of them runs a simulation or computes a statistic. Other objects with
-the attributes of the named types can be drawn as well.
-"""
+"""Figures of records, response spectra, channel histories, loops and residuals, in display units."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..noise.residuals import autocorrelation, residual_checks
+from ..signals.channels import Channel, Measurements
 from ..units import find_unit, from_si
 from .style import (
     BLUE,
@@ -30,12 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..noise.residuals import ResidualChecks
-    from ..signals.channels import Channel, Measurements
     from ..signals.records import Record
-    from ..signals.response_spectrum import ResponseSpectrum
+    from ..simulation.model import Model
 
-__all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residual_checks", "plot_spectra"]
+__all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residuals", "plot_response", "plot_spectrum"]
 
 _SHADES = (BLUE, ORANGE, "#5b8c5a", "#b03a48", GREY)
 _SPECTRUM_UNITS = {"pseudo_acceleration": "g", "pseudo_velocity": "cm/s", "displacement": "cm"}
@@ -79,27 +75,30 @@ def plot_record(record: Record, axes: Axes | None = None, unit: str = "g") -> Ax
     return axes
 
 
-def plot_spectra(
-    spectra: Sequence[ResponseSpectrum],
+def plot_spectrum(
+    record: Record,
+    periods: Sequence[float] | np.ndarray | None = None,
+    damping_ratios: Sequence[float] = (0.02, 0.05, 0.1),
     axes: Axes | None = None,
     quantity: str = "pseudo_acceleration",
     unit: str | None = None,
-    title: str = "",
 ) -> Axes:
-    """Plot response spectra against period, one line per spectrum.
+    """Plot response spectra of a record against period, one line per damping ratio.
 
     Parameters
     ----------
-    spectra : sequence of ResponseSpectrum
-        Spectra such as `ResponseSpectrum`, for instance of one record with several damping ratios.
+    record : Record
+        The ground motion.
+    periods : (n_periods,) array_like, optional
+        Undamped periods [s], see `Record.spectrum`.
+    damping_ratios : sequence of float
+        Fractions of critical damping, one line each.
     axes : matplotlib Axes, optional
         Where to draw. Default: a new figure.
     quantity : {"pseudo_acceleration", "pseudo_velocity", "displacement"}
         The quantity on the vertical axis.
     unit : str, optional
         Unit of the quantity in the figure. Default: g, cm/s and cm, respectively.
-    title : str, optional
-        Title of the axes.
 
     Returns
     -------
@@ -109,13 +108,15 @@ def plot_spectra(
     Raises
     ------
     ValueError
-        If `spectra` is empty, `quantity` is not one of the three, or the unit has another dimension.
+        If there is no damping ratio, `quantity` is not one of the three, or the unit has another dimension; as
+        `Record.spectrum`.
     """
-    if quantity not in _SPECTRUM_UNITS or not len(spectra):
+    if quantity not in _SPECTRUM_UNITS or not len(damping_ratios):
         raise ValueError(
-            f"expected one spectrum or more and one of the quantities {', '.join(_SPECTRUM_UNITS)}; got {len(spectra)} "
-            f"spectra and {quantity!r}"
+            f"expected one damping ratio or more and one of the quantities {', '.join(_SPECTRUM_UNITS)}; got "
+            f"{len(damping_ratios)} damping ratios and {quantity!r}"
         )
+    spectra = [record.spectrum(periods, ratio) for ratio in damping_ratios]
     unit = _SPECTRUM_UNITS[quantity] if unit is None else unit
     find_unit(unit, quantity.removeprefix("pseudo_"))
     axes = new_axes(axes, (6.0, 3.8))
@@ -130,7 +131,7 @@ def plot_spectra(
         axes.plot(spectrum.periods, from_si(values, unit), color=shade, linewidth=1.3, label=label)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set(xlabel="period [s]", ylabel=f"{quantity.replace('_', '-')} [{unit}]", title=title)
+    axes.set(xlabel="period [s]", ylabel=f"{quantity.replace('_', '-')} [{unit}]", title=record.name)
     axes.set_xlim(min(s.periods.min() for s in spectra), max(s.periods.max() for s in spectra))
     axes.set_ylim(bottom=0.0)
     axes.legend(frameon=False, fontsize="small", title="damping ratio", title_fontsize="small")
@@ -144,11 +145,10 @@ def plot_histories(
     channels: Sequence[str] | None = None,
     label: str = "model",
     time_label: str = "time [s]",
-    errors: Mapping[str, float] | None = None,
 ) -> Figure:
     """Plot the histories of channels above one another: measurements, the response of a model, or both.
 
-    `Measurements.plot` calls this function and computes `errors`.
+    The legend has the relative root mean square error (RRMSE) of the response in each channel.
 
     Parameters
     ----------
@@ -163,8 +163,6 @@ def plot_histories(
         Label of the response in the legend.
     time_label : str
         Label of the horizontal axis, for example "step" for a test without time.
-    errors : mapping of str to float, optional
-        Relative root mean square error of the response per channel [-], shown in the legend.
 
     Returns
     -------
@@ -174,12 +172,18 @@ def plot_histories(
     Raises
     ------
     ValueError
-        If both are missing, a channel does not exist, or a channel has different dimensions in the two.
+        If both are missing, a channel does not exist, or a channel has different dimensions in the two; as
+        `Measurements.rrmse_of`.
+
+    Examples
+    --------
+    >>> plot_histories(measured)
+    >>> plot_histories(measured, response, ["top"])
     """
     sources = [source for source in (measurements, response) if source is not None]
     if not sources:
         raise ValueError("nothing to draw: give measurements, a response, or both")
-    errors = {} if errors is None else errors
+    errors = measurements.rrmse_of(response) if len(sources) == 2 else {}
     known = {channel.name: channel for source in reversed(sources) for channel in source.channels}
     names = select_names(channels, known, [channel.name for channel in sources[0].channels])
     figure, rows = stack_axes(len(names))
@@ -239,30 +243,54 @@ def plot_loop(
     return axes
 
 
-def plot_residual_checks(
-    residuals: np.ndarray,
-    channels: Sequence[Channel],
-    dt: float,
-    checks: ResidualChecks,
-    correlation: np.ndarray,
-) -> Figure:
+def plot_response(model: Model, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
+    """Plot the response of a model at `theta`, together with measurements of its channels if they are given.
+
+    Parameters
+    ----------
+    model : Model
+        The model, of which one simulation is run.
+    theta : ndarray[n_parameters]
+        Values of ``model.parameter_names``, in this order.
+    measurements : Measurements, optional
+        The measurements. Only their channels are drawn.
+
+    Returns
+    -------
+    matplotlib Figure
+        The figure, one axes per channel.
+
+    Raises
+    ------
+    SimulationFailed
+        As ``model.simulate``.
+    ValueError
+        As `plot_histories`.
+
+    Examples
+    --------
+    >>> plot_response(column, [1.0, 1.0, 1.0, 1.0, 1.0], measured)
+    """
+    response = Measurements(model.channels, model.dt, model.simulate(np.asarray(theta, dtype=float)))
+    return plot_histories(measurements, response, time_label=getattr(model, "time_label", "time [s]"))
+
+
+def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float, *, whitened: bool = False) -> Figure:
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
 
-    The shaded band holds 95 % of the autocorrelation coefficients of white residuals. The quantiles of normal
-    residuals follow the straight line. `fe_likelihoods.plot_residuals` computes the checks and calls this function.
+    For white residuals, 95 % of the autocorrelation coefficients are in the shaded band. The quantiles of normal
+    residuals follow the straight line. The text above each row is the verdict of `residual_checks`.
 
     Parameters
     ----------
     residuals : ndarray, shape (n_channels, n_steps)
-        Measured minus simulated response [SI]; NaN where a sample is missing.
+        Measured minus simulated response [SI], such as the result of `FELikelihood.residuals`.
     channels : sequence of Channel
         The channels, one per row of `residuals`.
     dt : float
         Time step [s].
-    checks : ResidualChecks
-        Lag-one correlation, effective number of samples and verdict in words, per channel.
-    correlation : ndarray, shape (n_channels, n_steps)
-        Autocorrelation at lags 0, 1, ... samples [-].
+    whitened : bool
+        See `residual_checks`.
 
     Returns
     -------
@@ -272,11 +300,18 @@ def plot_residual_checks(
     Raises
     ------
     ValueError
-        If the number of channels differs from the number of rows.
+        If the number of channels differs from the number of rows, or the residuals have another shape, fewer than two
+        samples, non-finite values, or only zeros in a channel.
+
+    Examples
+    --------
+    >>> plot_residuals(likelihood.residuals(theta), likelihood.model.channels, likelihood.model.dt)
     """
     import matplotlib.pyplot as plt
     from scipy.special import ndtri
 
+    checks = residual_checks(residuals, channels if len(channels) == len(residuals) else (), whitened=whitened)
+    correlation = autocorrelation(residuals)
     n_channels, n = correlation.shape
     if len(channels) != n_channels:
         raise ValueError(f"expected one channel for each row of residuals; got {len(channels)} and {n_channels} rows")

@@ -37,7 +37,8 @@ def plot_bands(
     channels : sequence of str, optional
         Names of the channels to draw. Default: all channels of the prediction.
     time_shifts : mapping of str to float, optional
-        Times [s] by which mean and band of some channels are drawn later. The legend of the channel names its time.
+        Times [s] by which mean and band of some channels are drawn later, where they are compared with the
+        measurements. The legend of the channel names its time. Needed for measured channels of ``prediction.shifted``.
 
     Returns
     -------
@@ -47,7 +48,11 @@ def plot_bands(
     Raises
     ------
     ValueError
-        If the prediction has no histories, or a channel does not exist.
+        If the prediction has no histories, a channel does not exist, or a shift of ``prediction.shifted`` is missing.
+
+    Examples
+    --------
+    >>> plot_bands(prediction, measurements)
     """
     time = prediction.time
     names = [channel.name for channel in prediction.channels]
@@ -55,12 +60,13 @@ def plot_bands(
     measured = set()
     if measurements is not None:
         measured = {channel.name for channel in measurements.channels}
+    shifts = prediction.known_shifts([name for name in wanted if name in measured], time_shifts)
     low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
 
     figure, rows = stack_axes(len(wanted))
     for axes, name in zip(rows, wanted, strict=True):
         k = names.index(name)
-        channel, shift = prediction.channels[k], (time_shifts or {}).get(name, 0.0)
+        channel, shift = prediction.channels[k], shifts.get(name, 0.0)
         if low < high:
             band = [from_si(prediction.quantile(p)[k], channel.unit) for p in (low, high)]
             label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
@@ -74,7 +80,7 @@ def plot_bands(
         axes.set_ylabel(channel_label(channel))
         axes.grid(alpha=0.25)
     for axes, name in zip(rows, wanted, strict=True):
-        if axes is rows[0] or (time_shifts or {}).get(name):
+        if axes is rows[0] or shifts.get(name):
             add_legend_row(axes, 3)
     set_time_axis(rows, time[-1])
     return figure

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
     from ..information.sensors import SensorRanking
 
-__all__ = ["draw_ranking"]
+__all__ = ["plot_ranking"]
 
 
-def draw_ranking(ranking: SensorRanking) -> Figure:
-    """Draw the chosen sensors in rows, the best first, with standard errors.
+def plot_ranking(ranking: SensorRanking) -> Figure:
+    """Plot the chosen sensors in rows, the best first, with standard errors.
 
     Grey bars are the information of a sensor alone, blue ones what it adds to the sensors above it. With a target, a
     second column has the share of the target's variance that is left with the sensors down to each row.

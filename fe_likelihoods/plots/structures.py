@@ -1,17 +1,19 @@
-"""Figures of structures: the section of a column, its sensors, and hysteresis loops.
+"""Figures of structures: the section of a column, the scheme of the bridge, sensors, and hysteresis loops.
 
-The functions draw what a model or the history of one simulation holds. The models have methods that call them. Values
-are drawn in the display units of the model. Moments have units of force times length, curvatures one over length.
+Values are drawn in the display units of the model. Moments have units of force times length, curvatures one over
+length.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..models.isolated_bridge import IsolatedBridge
 from ..units import from_si
 from .histories import plot_loop
 from .style import BLUE, GREY, ORANGE, new_axes
@@ -21,12 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..models.base import History
-    from ..models.isolated_bridge import IsolatedBridge
     from ..models.linear_structure import LinearStructure
     from ..models.rc_column import RCColumn
     from ..models.rc_column_parts import Patches
 
-__all__ = ["plot_bearing_loops", "plot_bridge", "plot_column_loops", "plot_section", "plot_sensors"]
+__all__ = ["plot_bridge", "plot_hysteresis", "plot_section", "plot_sensors"]
 
 _CORE = "#b9cfe4"
 
@@ -214,22 +215,38 @@ def _rank(place: tuple[float, float, str]) -> tuple[float, float]:
     return z, x
 
 
-def plot_column_loops(column: RCColumn, history: History) -> Figure:
-    """Plot base moment against curvature, and restoring force against displacement of the top.
+def plot_hysteresis(model: RCColumn | IsolatedBridge, theta: np.ndarray) -> Figure:
+    """Plot the hysteresis loops of a built-in model at `theta`, of which one simulation is run.
 
     Parameters
     ----------
-    column : RCColumn
-        The column, for its display units and the name of its loading.
-    history : History
-        Histories by name [SI], the result of ``column.history(theta)``: "base curvature", "base moment", "force", and
-        "displacement" (imposed) or "relative displacement" (base acceleration).
+    model : RCColumn or IsolatedBridge
+        For a column, base moment against curvature, and restoring force against displacement of the top. For the
+        bridge, isolator force (friction, rubber and dampers) against bearing displacement of both piers.
+    theta : ndarray[n_parameters]
+        Values of ``model.parameter_names``, in this order.
 
     Returns
     -------
     matplotlib Figure
         The figure, with two axes.
+
+    Raises
+    ------
+    SimulationFailed, ValueError
+        As ``model.history``.
+
+    Examples
+    --------
+    >>> plot_hysteresis(column, [1.0, 1.0, 1.0, 1.0, 1.0])
     """
+    if isinstance(model, IsolatedBridge):
+        return _bearing_loops(replace(model, every=1).history(theta))
+    return _column_loops(model, model.history(theta))
+
+
+def _column_loops(column: RCColumn, history: History) -> Figure:
+    """Base moment against curvature, and force against displacement of the top, from the histories [SI]."""
     import matplotlib.pyplot as plt
 
     length, force = _length_unit(column), dict(column.units).get("force", "kN")
@@ -317,19 +334,8 @@ def plot_bridge(bridge: IsolatedBridge, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def plot_bearing_loops(history: History) -> Figure:
-    """Plot the isolator force (friction, rubber and dampers) against the bearing displacement of both piers.
-
-    Parameters
-    ----------
-    history : History
-        Histories by name [SI], the result of ``bridge.history(theta)``: "Ub_1", "Ub_2" and "Fb_1", "Fb_2".
-
-    Returns
-    -------
-    matplotlib Figure
-        The figure, with two axes of the same scale.
-    """
+def _bearing_loops(history: History) -> Figure:
+    """Isolator force against bearing displacement of both piers, from "Ub_1", "Ub_2", "Fb_1" and "Fb_2" [SI]."""
     import matplotlib.pyplot as plt
 
     figure, pair = plt.subplots(1, 2, figsize=(9.6, 4.2), sharex=True, sharey=True, layout="constrained")

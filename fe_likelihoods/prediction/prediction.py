@@ -20,7 +20,6 @@ from .score_tables import HistoryScores, QuantityScores, envelope, score_histori
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from matplotlib.figure import Figure
 
 __all__ = ["Prediction"]
 
@@ -284,35 +283,6 @@ class Prediction:
         _check_number(self.n_quantile, 2, level)
         return score_histories(self.channels, values, (mean, sd), (lower, upper), around, level)
 
-    def plot(
-        self,
-        measurements: Measurements | None = None,
-        channels: "Sequence[str] | None" = None,
-        time_shifts: "Mapping[str, float] | None" = None,
-    ) -> "Figure":
-        """Plot mean, band and measurements, see `fe_likelihoods.plots.predictions.plot_bands`.
-
-        Parameters
-        ----------
-        measurements : Measurements, optional
-            Measurements, drawn at their own times.
-        channels : sequence of str, optional
-            Names of the channels to draw. Default: all.
-        time_shifts : mapping of str to float, optional
-            As for `rrmse`: mean and band of these channels are drawn later by these times [s], where they are compared
-            with the measurements. Needed for measured channels of `shifted`.
-
-        Returns
-        -------
-        matplotlib Figure
-        """
-        from ..plots.predictions import plot_bands
-
-        measured = [] if measurements is None else [channel.name for channel in measurements.channels]
-        drawn = [channel.name for channel in self.channels] if channels is None else channels
-        shifts = self._shifts([name for name in measured if name in drawn], time_shifts)
-        return plot_bands(self, measurements, channels, shifts)
-
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
         if self.values is None:
@@ -348,13 +318,6 @@ class Prediction:
         cells = [[each if isinstance(each, str) else number(each) for each in row] for row in rows]
         table = [text_table([header, *cells])] if rows else []
         return "\n".join([f"{title}: {lines[0]}", *lines[1:], *table])
-
-    def _repr_html_(self) -> str:
-        """In notebooks: the largest values of histories, or the moments of a few numbers, in the units of channels."""
-        from ..plots.html import html_object, html_table
-
-        title, lines, header, rows = self._table()
-        return html_object(title, lines, *([html_table(header, rows)] if rows else []))
 
     def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
         """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
@@ -398,7 +361,7 @@ class Prediction:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
 
-    def _shifts(self, measured: "Sequence[str]", time_shifts: "Mapping[str, float] | None") -> dict[str, float]:
+    def known_shifts(self, measured: "Sequence[str]", time_shifts: "Mapping[str, float] | None") -> dict[str, float]:
         """Return the given time shifts; raise ValueError if one of a measured channel is missing, or is unknown."""
         shifts, names = dict(time_shifts or {}), [channel.name for channel in self.channels]
         if missing := [name for name in names if name in self.shifted and name in measured and name not in shifts]:
@@ -422,7 +385,7 @@ class Prediction:
                     f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
                     "the measurements"
                 )
-        shifts = self._shifts([channel.name for channel in self.channels], time_shifts)
+        shifts = self.known_shifts([channel.name for channel in self.channels], time_shifts)
         compared = compare_with(chosen, self.dt, self.mean.shape[1])
         return compare_shifted(chosen, compared, self.dt, self.mean.shape[1], shifts) if shifts else compared
 

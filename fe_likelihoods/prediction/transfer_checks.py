@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..cache.verification import StaleCache
-from ..likelihood.failures import TooManyFailures
+from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.joint import JointLikelihood
 from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.gaussian import GaussianNoise

@@ -92,12 +92,6 @@ class Prior:
     def __repr__(self) -> str:
         return f"Prior({self.distributions!r})"
 
-    def _repr_html_(self) -> str:
-        """In notebooks: one row per parameter, in the units of the samples."""
-        from ..plots.html import html_object, html_table
-
-        return html_object(f"Prior of {self.dim} parameters", [], html_table(*self.table()))
-
     def table(self) -> tuple[tuple[str, ...], list[tuple]]:
         """What a reader asks of the prior, for tables: a header, and one row per parameter.
 

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
+from ..signals.data_faults import CARE, REMARK, WRONG, Finding, by_weight
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..text_tables import listed
-from .failures import Failures, failures
+from .failed_simulations import Failures, failures
 from .fit_gate import fit_gate
-from .fits import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
+from .fit_results import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
 from .model_checks import find_discretisation_error, find_unread_motion, simulations_of_the_test
 from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
 from .table import ParameterRow, parameter_rows

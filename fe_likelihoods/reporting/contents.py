@@ -12,7 +12,7 @@ from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
 from .advice import Judgement, residual_sentence
 from .fit_gate import SAME_AS_PRIOR
-from .fits import Fits
+from .fit_results import Fits
 from .run import FinishedRun
 from .table import ParameterRow
 

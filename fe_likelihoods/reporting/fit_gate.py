@@ -13,13 +13,13 @@ import numpy as np
 
 from ..cache.memory import distinct_keys
 from ..cache.verification import StaleCache
-from ..likelihood.failures import TooManyFailures
+from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..priors.points import as_points
 from ..signals.channels import Measurements
+from ..signals.data_faults import CARE, LARGE_ERROR, REMARK, WRONG, Fault, Finding, describe_unit, find_faults
 from ..signals.events import find_events
-from ..signals.fit_gate import CARE, LARGE_ERROR, REMARK, WRONG, Fault, Finding, describe_unit, find_faults
 from ..simulation.faults import ChangedModel
 from ..simulation.model import simulate_batch
 from ..text_tables import listed

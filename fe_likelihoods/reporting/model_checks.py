@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from ..likelihood.posterior import Posterior
+from ..signals.data_faults import CARE, REMARK, WRONG, Finding
 from ..signals.events import motions_of
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from samplers import plot_corner, plot_marginals, plot_run
 
+from ..plots.fits import plot_fit
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
-from ..signals.fits import plot_fit
-from .fits import Fit
+from .fit_results import Fit
 from .other_events import OtherEvent
 from .run import FinishedRun
 
@@ -129,7 +129,7 @@ def draw_fit(fit: Fit) -> list[Picture]:
 
 def draw_residuals(fit: Fit) -> list[Picture]:
     """Residuals against time, their autocorrelation and quantiles."""
-    from ..noise.residuals import plot_residuals
+    from ..plots.histories import plot_residuals
 
     if fit.residuals is None or not fit.measurements.simultaneous:
         return []
@@ -164,19 +164,23 @@ def draw_run(run: FinishedRun) -> list[Picture]:
 
 def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
     """Predicted histories with their band."""
+    from ..plots.predictions import plot_bands
+
     return [
         _picture(
             "Predicted histories",
             "The band holds the predicted response with the stated probability. It contains the uncertainty of the "
             "parameters, and the noise only if the legend says so.",
             f"Predicted histories of {', '.join(channel.name for channel in prediction.channels)} with their band.",
-            lambda: prediction.plot(measurements),
+            lambda: plot_bands(prediction, measurements),
         )
     ]
 
 
 def draw_event(event: OtherEvent) -> list[Picture]:
     """Predicted histories of another event with their band and its measurements."""
+    from ..plots.predictions import plot_bands
+
     pictures = []
     for each in event.predictions.values():
         if each.dt is None:
@@ -191,7 +195,7 @@ def draw_event(event: OtherEvent) -> list[Picture]:
                 "Mean and band of the prediction, and the measurements where there are any. The band contains the "
                 "uncertainty of the parameters, and the noise only if the legend says so.",
                 f"Predicted histories of {', '.join(names)} in the event {event.name}.",
-                lambda each=each, measured=measured: each.plot(measured),
+                lambda each=each, measured=measured: plot_bands(each, measured),
             )
         )
     return pictures

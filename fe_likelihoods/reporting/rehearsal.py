@@ -21,8 +21,8 @@ from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import HalfNormal
 from ..signals.channels import Measurements
+from ..signals.data_faults import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.events import Events
-from ..signals.fit_gate import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..units import from_si

@@ -13,7 +13,7 @@ from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
-from ..signals.fit_gate import Finding
+from ..signals.data_faults import Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
 from .advice import JudgedRun, judge_run
@@ -28,8 +28,8 @@ from .contents import (
     summary_sentences,
     verdict_sentences,
 )
-from .failures import Failures
-from .fits import Fits
+from .failed_simulations import Failures
+from .fit_results import Fits
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (

@@ -8,19 +8,16 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import DIMENSIONS, find_unit, from_si
+from ..units import DIMENSIONS, find_unit
 from .error_measures import rrmse
 from .sampling import check_step, same_sampling, sample_window
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["Channel", "Measurements", "plot_response"]
+__all__ = ["Channel", "Measurements"]
 
 
 @dataclass(frozen=True)
@@ -314,62 +311,6 @@ class Measurements:
         dt = self.dt * factor if self.simultaneous else tuple(dt * factor for dt in self.steps)
         return replace(self, dt=dt, values=self.values[:, ::factor])
 
-    def plot(
-        self, response: "Measurements | None" = None, channels: Sequence[str] | None = None, **options
-    ) -> "Figure":
-        """Plot the histories of the channels and, if given, the response of a model with its errors.
-
-        Parameters
-        ----------
-        response : Measurements, optional
-            The response of a model.
-        channels : sequence of str, optional
-            Names of the channels to draw. Default: all.
-        **options
-            Further arguments of `fe_likelihoods.plots.histories.plot_histories`.
-
-        Returns
-        -------
-        matplotlib Figure
-            The figure, one axes per channel.
-
-        Raises
-        ------
-        ValueError
-            As `fe_likelihoods.plots.histories.plot_histories`.
-        """
-        from ..plots.histories import plot_histories
-
-        errors = {} if response is None else self.rrmse_of(response)
-        return plot_histories(self, response, channels, errors=errors, **options)
-
-    def _repr_html_(self) -> str:
-        """In notebooks: one row per channel, in the display unit of the channel."""
-        from ..plots.html import html_history, html_object, html_table
-
-        header = (
-            "channel",
-            "quantity",
-            "unit",
-            "samples",
-            "missing",
-            "first [s]",
-            "step [s]",
-            "peak",
-            "RMS",
-            "history",
-        )
-        rows = []
-        for channel, values, step, start in zip(self.channels, self.values, self.steps, self.starts, strict=True):
-            there = np.flatnonzero(~np.isnan(values))
-            inside = values[there[0] : there[-1] + 1]
-            shown = from_si(values[there], channel.unit, channel.dimension)
-            begun = start + step * float(there[0])
-            sizes = float(np.abs(shown).max()), float(np.sqrt(np.mean(shown**2)))
-            counts = len(there), len(inside) - len(there), begun, step
-            rows.append((channel.name, channel.quantity, channel.unit, *counts, *sizes, html_history(inside)))
-        return html_object(f"Measurements of {self.n_channels} channels", [self.description], html_table(header, rows))
-
     def rrmse_of(self, response: "Measurements") -> dict[str, float]:
         """Return the RRMSE of each common channel [-], except channels that are zero or whose times differ."""
         simulated = {channel.name for channel in response.channels}
@@ -459,32 +400,3 @@ def _check_start(start: Any) -> float:
     if not math.isfinite(seconds):
         raise ValueError(f"start of the measurements must be a finite number of seconds, got {start!r}")
     return seconds
-
-
-def plot_response(response: Measurements, measurements: Measurements | None = None, **options) -> "Figure":
-    """Plot the response of a model, with measurements if there are any.
-
-    Parameters
-    ----------
-    response : Measurements
-        The response, with the channels and the step of the model.
-    measurements : Measurements, optional
-        The measurements. Only their channels are drawn.
-    **options
-        Further arguments of `fe_likelihoods.plots.histories.plot_histories`.
-
-    Returns
-    -------
-    matplotlib Figure
-        The figure, one axes per channel.
-
-    Raises
-    ------
-    ValueError
-        As `fe_likelihoods.plots.histories.plot_histories`.
-    """
-    if measurements is not None:
-        return measurements.plot(response, **options)
-    from ..plots.histories import plot_histories
-
-    return plot_histories(response=response, **options)

@@ -11,17 +11,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import from_si
 from .response_spectrum import ResponseSpectrum, response_spectrum
 from .sampling import array_digest, check_samples, check_step, rest_samples, same_step, sample_window
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["DisplacementHistory", "Record", "SubdividedHistory"]
 
@@ -224,59 +220,6 @@ class Record:
     ) -> ResponseSpectrum:
         """Compute the elastic response spectrum, see `fe_likelihoods.signals.response_spectrum.response_spectrum`."""
         return response_spectrum(self.acceleration, self.dt, periods, damping_ratio)
-
-    def plot(self, axes: "Axes | None" = None, unit: str = "g") -> "Axes":
-        """Plot acceleration against time, see `fe_likelihoods.plots.histories.plot_record`."""
-        from ..plots.histories import plot_record
-
-        return plot_record(self, axes, unit)
-
-    def plot_spectrum(
-        self,
-        periods: Sequence[float] | NDArray[np.float64] | None = None,
-        damping_ratios: Sequence[float] = (0.02, 0.05, 0.1),
-        axes: "Axes | None" = None,
-        quantity: str = "pseudo_acceleration",
-        unit: str | None = None,
-    ) -> "Axes":
-        """Plot response spectra for one damping ratio or several.
-
-        Parameters
-        ----------
-        periods : (n_periods,) array_like, optional
-            Undamped periods [s], see `fe_likelihoods.signals.response_spectrum.response_spectrum`.
-        damping_ratios : sequence of float
-            Fractions of critical damping, one line each.
-        axes : matplotlib Axes, optional
-            Where to draw. Default: a new figure.
-        quantity : {"pseudo_acceleration", "pseudo_velocity", "displacement"}
-            The quantity on the vertical axis.
-        unit : str, optional
-            Unit of the quantity in the figure. Default: g, cm/s and cm, respectively.
-
-        Returns
-        -------
-        matplotlib Axes
-            The axes with the figure.
-
-        Raises
-        ------
-        ValueError
-            As `spectrum` and `fe_likelihoods.plots.histories.plot_spectra`.
-        """
-        from ..plots.histories import plot_spectra
-
-        spectra = [self.spectrum(periods, ratio) for ratio in damping_ratios]
-        return plot_spectra(spectra, axes, quantity, unit, self.name)
-
-    def _repr_html_(self) -> str:
-        """In notebooks: step, duration and peak, and the motion."""
-        from ..plots.html import html_history, html_object, html_table
-
-        peak = float(np.abs(self.acceleration).max())
-        header = ("samples", "step [s]", "duration [s]", "peak [g]", "peak [m/s²]", "ground acceleration")
-        row = (self.n_steps, self.dt, self.duration, float(from_si(peak, "g")), peak, html_history(self.acceleration))
-        return html_object(f"Record {self.name}", [self.source], html_table(header, [row]))
 
     def _source(self, note: str) -> str:
         return f"{self.source}; {note}" if self.source else note

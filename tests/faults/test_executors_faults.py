@@ -13,7 +13,7 @@ import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods.likelihood.failures import TooManyFailures
+from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation import dask_executor, executors
 from fe_likelihoods.simulation.executors import LocalPool

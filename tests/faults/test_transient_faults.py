@@ -24,7 +24,7 @@ from fe_likelihoods import (
     SimulationCache,
     SimulationFailed,
 )
-from fe_likelihoods.likelihood.failures import FailureLog
+from fe_likelihoods.likelihood.failure_log import FailureLog
 from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import misfit_batch, misfit_of_responses, simulate_batch

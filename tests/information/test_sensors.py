@@ -18,6 +18,7 @@ from fe_likelihoods import (
     SimulationFailed,
     TruncatedNormal,
     peak,
+    plot_ranking,
     problems,
     propagate,
     rank_sensors,
@@ -213,7 +214,7 @@ def test_the_figure_has_the_chosen_sensors():
     import matplotlib.pyplot as plt
 
     ranking = rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, target=lambda response: response[1].mean())
-    figure = ranking.plot()
+    figure = plot_ranking(ranking)
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == list(ranking.chosen)
     assert figure.axes[1].get_xlabel() == "variance of the target that is left [%]"
     plt.close(figure)

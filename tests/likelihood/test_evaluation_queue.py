@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
-from fe_likelihoods.likelihood.failures import TooManyFailures
+from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.likelihood.joint import JointLikelihood
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior

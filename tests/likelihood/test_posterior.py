@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from fe_likelihoods.likelihood.failures import FailureLog, reason_without_numbers
+from fe_likelihoods.likelihood.failure_log import FailureLog, reason_without_numbers
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator

@@ -14,6 +14,7 @@ from fe_likelihoods import (
     Steel,
     SteelCoupon,
     TruncatedNormal,
+    plot_response,
     propagate,
 )
 from fe_likelihoods.kernels import reinforcing_steel
@@ -70,7 +71,7 @@ def test_fingerprint_depends_on_the_strains(coupon):
 
 def test_the_response_is_plotted_per_step(coupon):
     pytest.importorskip("matplotlib").use("agg")
-    (axes,) = coupon.plot_response(np.ones(6)).axes
+    (axes,) = plot_response(coupon, np.ones(6)).axes
     assert axes.get_xlabel() == "step" and "MPa" in axes.get_ylabel()
 
 

@@ -20,6 +20,8 @@ from fe_likelihoods import (
     TruncatedNormal,
     Uniform,
     effective_samples,
+    plot_bands,
+    plot_histories,
     plot_residuals,
     propagate,
     residual_checks,
@@ -396,7 +398,7 @@ def test_errors_and_coverage_are_over_the_samples_that_are_there(rng):
     np.testing.assert_allclose(prediction.coverage(data), inside)
     with pytest.raises(ValueError, match="channels top have no sample in this part"):
         prediction.coverage(data, part=slice(0, 4))
-    assert len(prediction.plot(data).axes) == len(data.plot().axes) == 2
+    assert len(plot_bands(prediction, data).axes) == len(plot_histories(data).axes) == 2
     scales = GaussianNoise(data.channels, groups="all").with_measurements(data).scales
     assert scales[0] == pytest.approx(math.sqrt(np.square(data.values[0][there[0]]).mean()))
 

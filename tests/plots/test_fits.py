@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, Measurements, plot_fit
-from fe_likelihoods.signals.fits import strongest_window
+from fe_likelihoods.plots.fits import strongest_window
 from fe_likelihoods.units import G0
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "mm"))

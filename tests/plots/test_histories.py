@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fe_likelihoods import plot_histories, plot_record, plot_residuals, plot_response, plot_spectrum
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.noise.residuals import autocorrelation, plot_residuals, residual_checks
-from fe_likelihoods.plots.histories import plot_histories, plot_loop, plot_record, plot_spectra
+from fe_likelihoods.noise.residuals import autocorrelation, residual_checks
+from fe_likelihoods.plots.histories import plot_loop
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0
@@ -29,7 +30,7 @@ class Motion:
 
 
 def test_record(record):
-    axes = record.plot()
+    axes = plot_record(record)
     history, peak = axes.lines
     np.testing.assert_allclose(history.get_ydata(), record.acceleration / G0)
     np.testing.assert_allclose(history.get_xdata(), record.time)
@@ -37,12 +38,12 @@ def test_record(record):
     assert peak.get_xdata()[0] == record.time[where]
     assert texts(axes) == [f"peak {abs(record.acceleration[where]) / G0:.3g} g at {record.time[where]:.4g} s"]
     assert axes.get_ylabel() == "ground acceleration [g]" and axes.get_title() == "noise"
-    assert record.plot(axes, unit="m/s2") is axes
+    assert plot_record(record, axes, unit="m/s2") is axes
     np.testing.assert_allclose(axes.lines[2].get_ydata(), record.acceleration)
     with pytest.raises(ValueError, match="expected a unit of acceleration, got 'mm'"):
-        record.plot(unit="mm")
+        plot_record(record, unit="mm")
     assert shows(axes, axes.lines) and axes.get_xlim() == (0.0, record.duration)
-    assert Record("rest", 0.1, np.zeros(5)).plot().get_ylim()[1] > 0.0
+    assert plot_record(Record("rest", 0.1, np.zeros(5))).get_ylim()[1] > 0.0
 
 
 def test_any_object_with_the_attributes_of_a_record_is_drawn():
@@ -53,59 +54,58 @@ def test_any_object_with_the_attributes_of_a_record_is_drawn():
 
 def test_spectrum(record):
     periods = [0.1, 0.5, 2.0]
-    axes = record.plot_spectrum(periods, (0.02, 0.1))
+    axes = plot_spectrum(record, periods, (0.02, 0.1))
     assert texts(axes) == ["2 %", "10 %"] and axes.get_ylabel() == "pseudo-acceleration [g]"
     np.testing.assert_allclose(axes.lines[1].get_ydata(), record.spectrum(periods, 0.1).pseudo_acceleration / G0)
     assert shows(axes, axes.lines) and axes.get_xlim() == (0.1, 2.0) and axes.get_ylim()[0] == 0.0
     assert axes.get_xlabel() == "period [s]" and axes.get_title() == "noise"
-    axes = record.plot_spectrum(periods, quantity="displacement", unit="in")
+    axes = plot_spectrum(record, periods, quantity="displacement", unit="in")
     np.testing.assert_allclose(axes.lines[1].get_ydata(), record.spectrum(periods, 0.05).displacement / 0.0254)
     assert axes.get_ylabel() == "displacement [in]"
     with pytest.raises(ValueError, match="expected a unit of displacement"):
-        record.plot_spectrum(periods, quantity="displacement", unit="g")
+        plot_spectrum(record, periods, quantity="displacement", unit="g")
     with pytest.raises(ValueError, match="one of the quantities pseudo_acceleration"):
-        plot_spectra([record.spectrum(periods)], quantity="acceleration")
-    with pytest.raises(ValueError, match="one spectrum or more"):
-        plot_spectra([])
+        plot_spectrum(record, periods, quantity="acceleration")
+    with pytest.raises(ValueError, match="one damping ratio or more"):
+        plot_spectrum(record, damping_ratios=())
 
 
 def test_measurements(measured):
-    figure = measured.plot()
+    figure = plot_histories(measured)
     assert [axes.get_ylabel() for axes in figure.axes] == ["top [g]", "drift [mm]"]
     np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), measured.values[0] / G0)
     np.testing.assert_allclose(figure.axes[1].lines[0].get_ydata(), 1e3 * measured.values[1])
     assert figure.axes[1].get_xlabel() == "time [s]" and figure.get_suptitle() == "SYNTHETIC: white noise"
     assert all(shows(axes, axes.lines) and axes.get_xlim() == (0.0, measured.time[-1]) for axes in figure.axes)
-    (only,) = measured.plot(channels=["drift"]).axes
+    (only,) = plot_histories(measured, channels=["drift"]).axes
     assert only.get_ylabel() == "drift [mm]"
     with pytest.raises(ValueError, match="channels must be some of top, drift; got \\['Top'\\]"):
-        measured.plot(channels="Top")
+        plot_histories(measured, channels="Top")
     with pytest.raises(ValueError, match="nothing to draw"):
         plot_histories()
 
 
 def test_measurements_beside_a_response(measured):
     response = replace(measured, values=1.1 * measured.values)
-    axes = measured.plot(response, label="at the mean").axes[1]
+    axes = plot_histories(measured, response, label="at the mean").axes[1]
     assert [line.get_label() for line in axes.lines] == ["measured", "at the mean, RRMSE 10 %"]
     np.testing.assert_allclose(axes.lines[1].get_ydata(), 1.1e3 * measured.values[1])
-    axes = measured.plot(response.decimate(2)).axes[0]
+    axes = plot_histories(measured, response.decimate(2)).axes[0]
     assert texts(axes) == ["measured", "model"], "no error for different instants"
     assert shows(axes, axes.lines)
     silent = replace(measured, values=measured.values * [[1.0], [0.0]])
-    assert texts(silent.plot(response).axes[1]) == ["measured", "model"], "no error relative to zero"
-    assert texts(plot_histories(measured, response, errors={"drift": 0.5}).axes[1])[1] == "model, RRMSE 50 %"
+    assert texts(plot_histories(silent, response).axes[1]) == ["measured", "model"], "no error relative to zero"
     other = replace(response, channels=(Channel("top", "velocity", "m/s"), CHANNELS[1]))
     with pytest.raises(ValueError, match="'top' is 'absolute acceleration' in the measurements, 'velocity' in"):
-        measured.plot(other)
+        plot_histories(measured, other)
 
 
 def test_response_of_any_model(record, measured):
     oscillator = LinearOscillator(record)
-    figure = oscillator.plot_response([1.2, 0.8])
+    figure = plot_response(oscillator, [1.2, 0.8])
     np.testing.assert_allclose(figure.axes[1].lines[0].get_ydata(), 100.0 * oscillator.simulate([1.2, 0.8])[1])
     function = FunctionModel(lambda theta: theta[0] * measured.values, ("gain",), CHANNELS, 0.1, 50)
-    axes = function.plot_response([2.0], measured.select(["drift"])).axes
+    axes = plot_response(function, [2.0], measured.select(["drift"])).axes
     assert len(axes) == 1 and texts(axes[0]) == ["measured", "model, RRMSE 100 %"]
 
 

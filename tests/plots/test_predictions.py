@@ -37,7 +37,7 @@ def samples(rng):
 
 def test_bands(posterior, samples):
     prediction = propagate(posterior, samples, noise=True, progress=False)
-    figure = prediction.plot(posterior.likelihood.measurements)
+    figure = plot_bands(prediction, posterior.likelihood.measurements)
     acceleration, displacement = figure.axes
     assert acceleration.get_ylabel() == "acceleration [g]" and displacement.get_ylabel() == "displacement [cm]"
     assert displacement.get_xlabel() == "time [s]" and displacement.get_xlim() == (0.0, prediction.time[-1])

@@ -5,10 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fe_likelihoods import Bars, LinearStructure, ModalModel, ShearFlexuralBeam, ShearFrame, plot_sensors
+from fe_likelihoods import (
+    Bars,
+    LinearStructure,
+    ModalModel,
+    ShearFlexuralBeam,
+    ShearFrame,
+    plot_hysteresis,
+    plot_response,
+    plot_section,
+    plot_sensors,
+)
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.models.isolated_bridge_channels import CHANNELS
 from fe_likelihoods.models.rc_column import Patches, RCColumn
+from fe_likelihoods.plots.structures import plot_bridge
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.records import DisplacementHistory
 from tests.plots.reading import shows, texts
@@ -17,10 +28,10 @@ from tests.plots.reading import shows, texts
 def test_response_of_the_bridge():
     data = isolated_bridge_data()
     bridge = IsolatedBridge(data.record.trim(0.0, 2.0), outputs=10, every=2, step=1e-3)
-    figure = bridge.plot_response(np.ones(10), data.measurements.trim(0.0, 2.0))
+    figure = plot_response(bridge, np.ones(10), data.measurements.trim(0.0, 2.0))
     assert [axes.get_ylabel() for axes in figure.axes][:2] == ["Ub_1 [mm]", "Fb_1 [kN]"] and len(figure.axes) == 10
     assert all("RRMSE" in texts(axes)[1] for axes in figure.axes)
-    first, second = bridge.plot_hysteresis(np.ones(10)).axes
+    first, second = plot_hysteresis(bridge, np.ones(10)).axes
     history = replace(bridge, every=1).history(np.ones(10))
     x, y = second.lines[2].get_data()  # after the two lines through the origin
     np.testing.assert_allclose(x, 1e3 * history["Ub_2"])
@@ -33,7 +44,7 @@ def test_hysteresis_of_a_shaken_column():
     motion = bridge_column_data().record.resample(8 / 256).trim(5.0, 8.0)
     column = RCColumn.lhpost(motion, parameters=("Ec",))
     history = column.history([0.6])
-    section, top = column.plot_hysteresis([0.6]).axes
+    section, top = plot_hysteresis(column, [0.6]).axes
     assert section.get_xlabel() == "curvature [1/in]" and section.get_ylabel() == "moment [kip in]"
     kip = 4448.2216152605
     x, y = section.lines[2].get_data()
@@ -49,9 +60,9 @@ def test_hysteresis_of_a_shaken_column():
 def test_the_response_to_an_imposed_displacement_is_drawn_over_steps():
     history = DisplacementHistory("push", np.linspace(0.0, 0.1, 12))
     column = RCColumn.lhpost(history, parameters=("Ec",), units=(("force", "MN"),))
-    (axes,) = column.plot_response([1.0]).axes
+    (axes,) = plot_response(column, [1.0]).axes
     assert axes.get_xlabel() == "step" and axes.get_ylabel() == "force [MN]"
-    section, top = column.plot_hysteresis([1.0]).axes
+    section, top = plot_hysteresis(column, [1.0]).axes
     assert section.get_ylabel() == "moment [MN m]" and top.get_xlabel() == "displacement [m]"
     np.testing.assert_allclose(top.lines[2].get_xdata(), history.displacement, atol=1e-12)
 
@@ -59,7 +70,7 @@ def test_the_response_to_an_imposed_displacement_is_drawn_over_steps():
 @pytest.mark.parametrize("mesh", [40, Patches(20, 10, 2)])
 def test_section(record, mesh):
     column = RCColumn.lhpost(record, mesh=mesh)
-    axes = column.plot_section()
+    axes = plot_section(column)
     cover, core = axes.patches
     assert 2 * cover.radius == pytest.approx(48.0) and 2 * core.radius == pytest.approx(48.0 - 4.0 - 0.625)
     lines, bars = axes.collections
@@ -84,7 +95,7 @@ def test_the_first_bar_is_drawn_where_it_acts():
     """Of three bars the first is on the side that positive displacements put in tension, as its strain shows."""
     push = DisplacementHistory("push", np.linspace(0.0, 0.1, 12))
     column = RCColumn.lhpost(push, parameters=("Ec",), bars=Bars(3, 0.05, area=0.006))
-    bars = column.plot_section().collections[1]
+    bars = plot_section(column).collections[1]
     centers = [path.get_extents().get_points().mean(axis=0)[0] * 0.0254 for path in bars.get_paths()]
     assert min(centers) == pytest.approx(-column.bar_circle_radius) and max(centers) < 0.3
     turned = replace(column, bars=replace(column.bars, first_angle=np.pi))
@@ -153,11 +164,11 @@ def test_labels_are_beside_their_sensors():
 
 def test_the_scheme_of_the_bridge_names_every_channel_at_its_pier():
     names, record = tuple(CHANNELS), isolated_bridge_data().record
-    axes = IsolatedBridge(record, outputs=names).plot_scheme()
+    axes = plot_bridge(IsolatedBridge(record, outputs=names))
     places = {text.get_text().split(" [")[0]: text.get_position() for text in axes.texts}
     assert set(names) <= set(places)
     assert places["Ub_1"][0] < 0.0 < places["Ub_2"][0]
     assert places["shear_1"][1] < places["drift_1"][1] < places["Ub_1"][1] < places["acc_d"][1]
     assert places["mean_Ub"][0] == 0.0
-    few = IsolatedBridge(record, outputs=5).plot_scheme()
+    few = plot_bridge(IsolatedBridge(record, outputs=5))
     assert "Ub_2" not in " ".join(text.get_text() for text in few.texts)

@@ -24,6 +24,7 @@ from fe_likelihoods import (
     damage_outputs,
     limit_states,
     park_ang_constants,
+    plot_damage,
     problems,
     propagate,
 )
@@ -209,7 +210,7 @@ def test_a_bridge_on_bearings_has_the_measures_of_its_channels():
     np.testing.assert_allclose(found.extent["dissipated energy"][1], np.trapezoid(history[1], history[0]))
     assert found.limits == () and found.location == {}
     with pytest.raises(ValueError, match="needs probabilities at sections"):
-        found.plot()
+        plot_damage(found)
 
 
 def test_constants_of_the_index_are_those_of_the_pushed_column(column):
@@ -274,7 +275,7 @@ def test_default_limits_have_sources(prediction):
 
 def test_figure_has_the_probabilities_of_each_section(prediction):
     found = damage(prediction)
-    figure = found.plot(["EQ1", "EQ2"])
+    figure = plot_damage(found, ["EQ1", "EQ2"])
     panels = figure.axes[:10]  # two rows of four limit states and the text
     titles = [axes.get_title() for axes in panels]
     assert titles[5].startswith("bar yield\n100 %") and titles[3].startswith("bar fracture\n0 %")
@@ -284,9 +285,9 @@ def test_figure_has_the_probabilities_of_each_section(prediction):
     assert any("Park-Ang index" in text.get_text() for text in panels[9].texts)
     assert "not the error of the model" in figure.axes[-1].get_xlabel()
     with pytest.raises(ValueError, match="EQ9"):
-        found.plot(["EQ9"])
+        plot_damage(found, ["EQ9"])
     assert "failed" not in found.table()
-    figure = found._replace(n_failed=3).plot(["EQ1"])
+    figure = plot_damage(found._replace(n_failed=3), ["EQ1"])
     assert "3 of 15 samples failed" in figure.axes[-1].get_xlabel()
 
 

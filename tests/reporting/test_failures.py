@@ -15,8 +15,8 @@ from fe_likelihoods import (
     report,
 )
 from fe_likelihoods.reporting.contents import summary_sentences
-from fe_likelihoods.reporting.failures import failures
-from fe_likelihoods.reporting.fits import fit_data_sets
+from fe_likelihoods.reporting.failed_simulations import failures
+from fe_likelihoods.reporting.fit_results import fit_data_sets
 from fe_likelihoods.reporting.report import gather
 from fe_likelihoods.reporting.run import read_run
 from fe_likelihoods.reporting.table import parameter_rows

@@ -17,7 +17,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.noise.draws import sample_noise
 from fe_likelihoods.reporting.contents import residual_sentences
-from fe_likelihoods.reporting.fits import fit_data_sets
+from fe_likelihoods.reporting.fit_results import fit_data_sets
 from fe_likelihoods.reporting.run import read_run
 from samplers import SMCSampler, compare_models, to_arviz
 

@@ -35,12 +35,12 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.reporting.advice import advise, check_result, judge
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
-from fe_likelihoods.reporting.failures import Failures
-from fe_likelihoods.reporting.fits import fit_data_sets
+from fe_likelihoods.reporting.failed_simulations import Failures
+from fe_likelihoods.reporting.fit_results import fit_data_sets
 from fe_likelihoods.reporting.report import _like
 from fe_likelihoods.reporting.run import _errors, read_run
 from fe_likelihoods.reporting.table import moments_of, parameter_rows
-from fe_likelihoods.signals.fit_gate import Finding
+from fe_likelihoods.signals.data_faults import Finding
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian

@@ -19,6 +19,7 @@ from fe_likelihoods import (
     Uniform,
     align,
     fit_measures,
+    plot_bands,
     propagate,
 )
 
@@ -314,16 +315,16 @@ def test_residuals_and_errors_are_at_the_shift(rng):
         lambda: fit_measures(likelihood, [point[:2]]),
         lambda: found.rrmse(data),
         lambda: found.coverage(data),
-        lambda: found.plot(data),
+        lambda: plot_bands(found, data),
     ):
         with pytest.raises(ValueError, match="time shifts"):
             call()
     with pytest.raises(ValueError, match="time_shifts has base"):
         found.rrmse(data, time_shifts={"top": 0.0, "base": 0.0})
     assert found.coverage(data, time_shifts={"top": 0.0234}).shape == (2,)
-    top, drift = found.plot(data, time_shifts={"top": 0.0234}).axes
+    top, drift = plot_bands(found, data, time_shifts={"top": 0.0234}).axes
     for axes, shift, label in ((top, 0.0234, "mean, shifted by 0.0234 s"), (drift, 0.0, "mean")):
         mean = next(line for line in axes.lines if line.get_label().startswith("mean"))
         assert (mean.get_label(), mean.get_xdata()[0]) == (label, shift)
         assert axes.collections[0].get_paths()[0].vertices[:, 0].min() == pytest.approx(shift)
-    assert len(found.plot(data, ["drift"]).axes) == len(found.plot(channels=["top"]).axes) == 1
+    assert len(plot_bands(found, data, ["drift"]).axes) == len(plot_bands(found, channels=["top"]).axes) == 1

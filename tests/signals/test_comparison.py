@@ -12,6 +12,7 @@ from fe_likelihoods import (
     LinearOscillator,
     Measurements,
     Record,
+    plot_histories,
 )
 from fe_likelihoods.signals.comparison import Comparison, compare_with
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
@@ -92,7 +93,7 @@ def test_steps_starts_and_ends_of_channels(tmp_path):
     write_dataset(tmp_path / "data.h5", record, measurements)
     back = read_dataset(tmp_path / "data.h5").measurements
     assert back.fingerprint == measurements.fingerprint and back.starts == measurements.starts
-    assert len(measurements.plot().axes) == 2
+    assert len(plot_histories(measurements).axes) == 2
 
 
 def test_wrong_steps_and_starts_are_refused():

@@ -12,7 +12,7 @@ from scipy.stats import ks_2samp
 
 from samplers.judgement.failures import NearFailures, failures_near
 
-from ..likelihood.failures import reason_without_numbers
+from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.likelihood import FELikelihood
 from .run import FinishedRun
 
