@@ -13,6 +13,7 @@ import pytest
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from tests.contract.targets import WithBlobs
+from tests.covering import covering
 
 N, NDIM = 40, 3
 KINDS = {
@@ -168,10 +169,10 @@ def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_pat
 # ---------------------------------------------------------------- limits and interrupts
 
 
-@pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
-@pytest.mark.parametrize("place", ["start", "annealing", "at beta = 1"])
-@pytest.mark.parametrize("kind", OURS)
-@pytest.mark.parametrize("what", ["interrupt_at", "spoilt_at"])
+@pytest.mark.parametrize(
+    ("what", "kind", "place", "reopened"),
+    covering(["interrupt_at", "spoilt_at"], OURS, ["start", "annealing", "at beta = 1"], [False, True]),
+)
 def test_an_interrupt_or_an_error_and_then_the_same_call(what, kind, place, reopened, tmp_path, whole_run):
     """An interrupt loses no evaluated point; the batch that contains an error is evaluated again, nothing before it."""
     annealing = whole_run(kind, 0).evaluations

@@ -140,7 +140,14 @@ needs_loky = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("loky", marks=needs_loky)])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "threads",
+        pytest.param("processes", marks=pytest.mark.slow),
+        pytest.param("loky", marks=[needs_loky, pytest.mark.slow]),
+    ],
+)
 def test_pools_that_take_single_points(kind):
     """Each point goes to the pool by itself; the result is that of the posterior."""
     opened = {"threads": lambda: ThreadPoolExecutor(2)}
@@ -200,9 +207,7 @@ def killed_run(folder, pool, asynchronous=True):
     return sampler
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param("executor", marks=pytest.mark.slow), pytest.param("loky", marks=needs_loky)]
-)
+@pytest.mark.parametrize("kind", ["executor", pytest.param("loky", marks=[needs_loky, pytest.mark.slow])])
 def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path):
     """The pool gives up; the run goes on afterwards with a new one."""
     (tmp_path / "points").mkdir()

@@ -20,6 +20,7 @@ from samplers import SMCSampler
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
+from tests.covering import covering
 from tests.faults.kills import end, evaluated_again, fork
 from tests.faults.resumable_run import NDIM, STEPS, N, go_on, make, outcome, points_of
 
@@ -70,8 +71,9 @@ def flipped(data, share):
     return bytes(changed)
 
 
-@pytest.mark.parametrize("chain", [name for name in CHAINS if name != "a bit"])
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize(
+    ("chain", "share"), covering([name for name in CHAINS if name != "a bit"], [0.02, 0.2, 0.5, 0.9, 1.0], strength=1)
+)
 def test_a_record_that_is_cut_anywhere(whole, chain, share, tmp_path):
     kind, path, expected = whole
     path = copied(path, tmp_path)
