@@ -1,6 +1,6 @@
 """Every tutorial runs from top to bottom with ``FAST=1``, saves its figures, and finds known numbers.
 
-Those that take seconds run with the quick tests: 01, 05 and 13.
+Two of them run with the quick tests: 01 and 13.
 """
 
 import ast
@@ -213,7 +213,8 @@ def test_comparison_run_twice_simulates_once(tmp_path):
 # 05
 
 
-@pytest.mark.parametrize("pool", ["local", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("pool", ["local", "dask"])
 def test_own_models_agree(pool, tmp_path):
     """Workers of dask are tested in `tests/faults/test_executors_faults.py` as well."""
     if pool == "dask":
