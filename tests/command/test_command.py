@@ -1,5 +1,6 @@
 """The commands as a user calls them: their files, their messages, their exit codes."""
 
+import contextlib
 import dataclasses
 import itertools
 import re
@@ -83,6 +84,22 @@ def folder(tmp_path, monkeypatch):
     write_oscillator(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def run_once(tmp_path_factory):
+    """A folder with the files of a finished run, and what the run said."""
+    path = tmp_path_factory.mktemp("run")
+    write_oscillator(path)
+    with contextlib.chdir(path):
+        return path, call("run", "oscillator.toml", "--quiet")
+
+
+@pytest.fixture
+def finished(run_once, folder):
+    """A copy of these files in the current folder."""
+    shutil.copytree(run_once[0], folder, dirs_exist_ok=True)
+    return folder
 
 
 def call(*arguments: str, code: int = 0) -> str:
@@ -232,8 +249,8 @@ def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkey
     assert "for example with a fixed seed" in call("run", "chance.toml", "--quiet", code=1)
 
 
-def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
-    output = call("run", "oscillator.toml", "--quiet")
+def test_run_writes_its_files_and_is_not_repeated(finished, run_once, caplog):
+    folder, output = finished, run_once[1]
     assert "log-evidence" in output and "Written to results-oscillator/" in output
     results = folder / "results-oscillator"
     for name in (
@@ -272,9 +289,9 @@ def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
     assert (results / "summary.csv").read_text() != first
 
 
-def test_another_file_of_the_same_name_is_refused(folder):
+def test_another_file_of_the_same_name_is_refused(finished):
     """Its settings are the same, its data are not."""
-    call("run", "oscillator.toml", "--quiet")
+    folder = finished
     (folder / "other").mkdir()
     for name in ("oscillator.toml", "top.csv"):
         (folder / "other" / name).write_text((folder / name).read_text())
@@ -286,8 +303,7 @@ def test_another_file_of_the_same_name_is_refused(folder):
     assert (folder / "results-oscillator" / "origin.json").read_text() == before
 
 
-def test_caches(folder):
-    call("run", "oscillator.toml", "--quiet")
+def test_caches(finished):
     file = "results-oscillator/simulations.sqlite"
     assert "simulations " in call("cache", "info", file)
     assert "0 of which do not match" in call("cache", "verify", file)
@@ -388,6 +404,7 @@ def test_a_damaged_table_and_a_missing_file_are_named(folder):
     assert "No such option" in call("run", "oscillator.toml", "--ressume", code=1)
 
 
+@pytest.mark.slow
 def test_measurements_that_hardly_cover_the_record_are_told(folder):
     """Times in milliseconds under a header in seconds, and a record that is much shorter than the measurements."""
     lines = (folder / "top.csv").read_text().splitlines()
@@ -505,6 +522,7 @@ def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     assert "returns SI units" in output
 
 
+@pytest.mark.slow
 def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     """And the units, which are right, are not suspected."""
     monkeypatch.chdir(tmp_path)

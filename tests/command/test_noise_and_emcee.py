@@ -183,7 +183,9 @@ def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps, two_steps)
     assert "nan" not in said and (folder / "r" / "report.html").is_file()
 
 
-@pytest.mark.parametrize("name", ["run.h5", "origin.json", "settings.toml"])
+@pytest.mark.parametrize(
+    "name", ["run.h5", *(pytest.param(name, marks=pytest.mark.slow) for name in ("origin.json", "settings.toml"))]
+)
 def test_a_damaged_file_of_a_run_is_named(folder, name, two_steps):  # noqa: F811
     shutil.copytree(two_steps[0], folder, dirs_exist_ok=True)
     path = folder / "r" / name

@@ -81,6 +81,7 @@ def check(left_out, posterior, name, measured) -> None:
     assert name not in left_out.hierarchy.posterior.tests
 
 
+@pytest.mark.slow
 def test_weights_leave_tests_out_as_exactly_as_a_new_run(alike):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -82,6 +82,7 @@ def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path
     assert state_of(again) == state_of(resumed) and nothing.simulations == 0.0
 
 
+@pytest.mark.slow
 def test_a_run_that_limits_have_ended_goes_on(tmp_path):
     """The search, then the rounds; what was simulated is not simulated again."""
     with suppress(NothingToReport):  # a draw or none
