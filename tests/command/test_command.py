@@ -230,11 +230,16 @@ def test_check_says_what_was_read_and_what_a_run_costs(folder):
     stored = SimulationCache(folder / "results-oscillator" / "simulations.sqlite").info().simulations
     assert 20 < stored <= made
     assert all(path.name.startswith("simulations.sqlite") for path in (folder / "results-oscillator").iterdir())
-    call("run", "oscillator.toml", "--quiet")  # uses the folder and what it has
-    assert (folder / "results-oscillator" / "report.html").exists()
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("no run")
     assert "is not the folder of a run" in call("run", "oscillator.toml", "--out", "other", code=1)
+
+
+@pytest.mark.slow
+def test_a_run_uses_the_folder_of_a_check_and_what_it_has(folder):
+    call("check", "oscillator.toml")
+    call("run", "oscillator.toml", "--quiet")
+    assert (folder / "results-oscillator" / "report.html").exists()
 
 
 def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkeypatch):

@@ -101,6 +101,7 @@ def test_a_limit_counts_what_is_running(tmp_path):
     assert 74.0 < sampler.simulations <= 75.0 and pool.simulations == pytest.approx(sampler.simulations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", *(pytest.param(k, marks=pytest.mark.slow) for k in ("map only", "none"))])
 def test_pools(kind):
     """Real threads; pools that take batches only, or no pool, are used without overlap."""

@@ -172,9 +172,8 @@ def test_a_killed_writer_does_not_block_others(path):
     assert cache.look_up(FINGERPRINT, thetas, 2, 8).known.all()
 
 
-@pytest.mark.parametrize(
-    "share", [pytest.param(0.1, marks=pytest.mark.slow), 0.5, pytest.param(0.9, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     whole, reference = cached_run.make(tmp_path / "whole.sqlite")
     whole.run_mcmc(None, cached_run.STEPS)
