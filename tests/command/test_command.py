@@ -254,8 +254,8 @@ def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkey
     assert "for example with a fixed seed" in call("run", "chance.toml", "--quiet", code=1)
 
 
-def test_run_writes_its_files_and_is_not_repeated(finished, run_once, caplog):
-    folder, output = finished, run_once[1]
+def test_run_writes_its_files(run_once):
+    folder, output = run_once
     assert "log-evidence" in output and "Written to results-oscillator/" in output
     results = folder / "results-oscillator"
     for name in (
@@ -269,13 +269,27 @@ def test_run_writes_its_files_and_is_not_repeated(finished, run_once, caplog):
         "settings.toml",
     ):
         assert (results / name).stat().st_size > 0, name
-    first = (results / "summary.csv").read_text()
     told = (results / "summary.txt").read_text()
     stored, counted = (int(re.search(words, told)[1]) for words in (r"(\d+) runs of the model", r"as (\d+) full simul"))
     assert stored == SimulationCache(results / "simulations.sqlite").info().simulations > counted
     assert f" from {counted} simulations." in told
-    assert "sigma_displacement [cm]" in first
+    assert "sigma_displacement [cm]" in (results / "summary.csv").read_text()
     assert "prior of sigma" not in output
+
+
+def test_a_run_with_other_settings_is_refused(finished):
+    first = (finished / "results-oscillator" / "summary.csv").read_text()
+    (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
+    message = call("run", "oscillator.toml", "--quiet", code=1)
+    assert "[sampler] walkers differ" in message and "--overwrite" in message
+    assert (finished / "results-oscillator" / "summary.csv").read_text() == first
+    assert "contains no run to resume" in call("run", "oscillator.toml", "--resume", "--out", "other", code=1)
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_not_repeated_unless_it_is_overwritten(finished, caplog):
+    results = finished / "results-oscillator"
+    first = (results / "summary.csv").read_text()
     assert "Written to" in call("run", "oscillator.toml", "--quiet")
     caplog.clear()
     assert (results / "summary.csv").read_text() == first
@@ -283,13 +297,7 @@ def test_run_writes_its_files_and_is_not_repeated(finished, run_once, caplog):
     call("report", "results-oscillator/run.h5")
     assert "nothing is added" not in caplog.text and "Continuing" not in caplog.text
     assert (results / "summary.csv").read_text() == first
-
-    text = OSCILLATOR.replace("walkers = 20", "walkers = 24")
-    (folder / "oscillator.toml").write_text(text)
-    message = call("run", "oscillator.toml", "--quiet", code=1)
-    assert "[sampler] walkers differ" in message and "--overwrite" in message
-    assert (results / "summary.csv").read_text() == first
-    assert "contains no run to resume" in call("run", "oscillator.toml", "--resume", "--out", "other", code=1)
+    (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
     call("run", "oscillator.toml", "--quiet", "--overwrite")
     assert (results / "summary.csv").read_text() != first
 
