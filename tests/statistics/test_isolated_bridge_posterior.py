@@ -10,6 +10,7 @@ import time
 import warnings
 from typing import NamedTuple
 
+import arviz
 import emcee
 import numpy as np
 import pytest
@@ -73,8 +74,6 @@ def ensemble(data: str, seed: int, initial: np.ndarray, n_steps: int, discard: i
     start = time.perf_counter()
     sampler.run_mcmc(initial, n_steps)
     chain = sampler.get_chain(discard=discard)
-    import arviz
-
     effective = arviz.ess(arviz.convert_to_dataset(chain.transpose(1, 0, 2)), method="mean")["x"].values.min()
     print(
         f"\nemcee on {data!r}: {posterior.report()['simulations']} simulations in {time.perf_counter() - start:.0f} s, "
