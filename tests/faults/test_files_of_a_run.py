@@ -110,7 +110,7 @@ def points_in(data):
     return points
 
 
-@pytest.mark.parametrize("chain", ["kept", "deleted"])
+@pytest.mark.parametrize("chain", ["kept", pytest.param("deleted", marks=pytest.mark.slow)])
 def test_a_record_with_a_changed_byte(whole, chain, tmp_path, caplog):
     """In the name of the format: refused. Elsewhere: what is behind the byte is evaluated again."""
     kind, source, expected = whole
