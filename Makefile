@@ -4,8 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 NEWER_PYTHON ?= python3.13
 READY := $(VENV)/.ready
-WITH_ARVIZ := tests/test_imports.py tests/reporting/test_arviz_data.py tests/reporting/test_noise_of_response.py \
-	tests/contract/test_emcee_contract.py tests/contract/test_ladder_and_storage.py
 
 # tests start hundreds of interpreters, and pytest rewrites 200 files: bytecode is kept whatever the machine's setting
 unexport PYTHONDONTWRITEBYTECODE
@@ -25,15 +23,16 @@ update: $(READY) ## update the bridge column on bundled data; writes report.html
 	$(BIN)/fe-likelihoods run data/templates/column.toml --out results
 
 test: $(READY)   ## run the quick tests on all cores
+	$(BIN)/python -m tests.compile_kernels
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
 .venv-newer/.ready: pyproject.toml
 	$(NEWER_PYTHON) -m venv .venv-newer
-	.venv-newer/bin/python -m pip install --quiet --disable-pip-version-check --editable . pytest pytest-timeout pytest-xdist
+	.venv-newer/bin/python -m pip install --quiet --disable-pip-version-check --editable . pytest pytest-timeout
 	@touch $@
 
 test-newer: .venv-newer/.ready ## tests that use arviz, with arviz 1 and NEWER_PYTHON (from 3.12 on)
-	.venv-newer/bin/python -m pytest -n auto --dist worksteal $(WITH_ARVIZ)
+	.venv-newer/bin/python -m pytest tests/reporting/test_arviz_data.py
 
 test-slow: $(READY) ## run the slow tests
 	$(BIN)/python -m pytest -m slow --timeout 7200

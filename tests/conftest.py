@@ -9,6 +9,7 @@ The longest tests come first, and `make test` distributes tests by stealing: no 
 import os
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -42,6 +43,21 @@ def seed() -> int:
 def rng(seed) -> np.random.Generator:
     """Generator seeded with `seed`."""
     return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def shared_pool():
+    """A function: a context with a pool of some processes that the tests of a file use one after another.
+
+    A process of a pool takes a CPU second to start. Tests that leave a process busy or look at the processes make
+    pools of their own.
+    """
+    from fe_likelihoods.simulation.local_pool import LocalPool
+
+    pools = {}
+    yield lambda workers: nullcontext(pools.get(workers) or pools.setdefault(workers, LocalPool(workers)))
+    for pool in pools.values():
+        pool.close()
 
 
 @pytest.fixture(autouse=True)

@@ -5,21 +5,21 @@ with Gauss-Lobatto points, corotational transformation, Newmark's average accele
 `peer_of` translates an `RCColumn` and its parameters into kip and inch (it uses the fibers and the confinement of the
 model, none of its kernels); `shake` and `push` run it.
 
-OpenSees has one model per process and may end that process. Each run therefore starts a process
-``python -m tests.opensees_column JOB RESULT`` and reads its result file.
+OpenSees has one model per process and may end that process. Therefore all runs are made in a second process.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib.util
-import pickle
+import multiprocessing
+import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -174,15 +174,27 @@ def _record(ops, recorders: Recorders) -> list[float]:
 
 
 def _in_process(function: str, *arguments) -> Shake | Push:
-    with tempfile.TemporaryDirectory() as folder:
-        job, result = Path(folder) / "job", Path(folder) / "result"
-        job.write_bytes(pickle.dumps((function, arguments)))
-        command = [sys.executable, "-m", "tests.opensees_column", str(job), str(result)]
-        run = subprocess.run(command, cwd=Path(__file__).resolve().parents[1], capture_output=True, text=True)
-        if not result.exists():
-            raise RuntimeError(f"OpenSees ended with code {run.returncode}: {run.stderr[-2000:]}")
-        kind, values = pickle.loads(result.read_bytes())
-        return {"Shake": Shake, "Push": Push}[kind](*values)
+    try:
+        return _process().submit(_run, function, arguments).result()
+    except BrokenProcessPool as error:
+        _process.cache_clear()
+        raise RuntimeError("OpenSees ended its process") from error
+
+
+@functools.cache
+def _process() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_print_nothing)
+
+
+def _print_nothing() -> None:
+    for descriptor in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+
+
+def _run(function: str, arguments: tuple) -> Shake | Push:
+    import openseespy.opensees as ops
+
+    return {"_shake": _shake, "_push": _push}[function](ops, *arguments)
 
 
 def _build(ops, column: PeerColumn, tolerance: float) -> None:
@@ -284,18 +296,3 @@ def _push(ops, column: PeerColumn, targets: np.ndarray, tolerance: float, record
         recorded[done] = _record(ops, recorders)
         done += 1
     return Push(response[:, :done], time.process_time() - start, recorded[:done])
-
-
-def main() -> None:
-    """Run one job; the arguments are the file of the job and the file for the result."""
-    import openseespy.opensees as ops
-
-    function, arguments = pickle.loads(Path(sys.argv[1]).read_bytes())
-    result = {"_shake": _shake, "_push": _push}[function](ops, *arguments)
-    # the classes of this module have another qualified name while it runs as a program
-    plain = (type(result).__name__, tuple(result))
-    Path(sys.argv[2]).write_bytes(pickle.dumps(plain))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,20 +1,19 @@
 """Every Python block of the README and of the documentation runs as printed, and every link leads to a file.
 
-The blocks of a page run one after another in one process, as in a notebook, in an empty working folder. A block with
+The blocks of a page run one after another as one script, as in a notebook, in an empty working folder. A block with
 the comment ``slow`` on the line before it runs only with the slow tests, and a page of which that is the first line
 runs only there.
 """
 
-import os
 import re
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
 import pytest
 
+from fe_likelihoods import problems
 from tests.opensees_column import require_opensees
+from tests.scripts import run_script
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = {"api", "tutorials", "_build"}
@@ -32,8 +31,10 @@ RESTRUCTURED = re.compile(
 def blocks(page: Path, language: str, slow: bool = True) -> list[str]:
     """Blocks of code in a language on a page; without the slow ones unless `slow`."""
     pattern = MARKDOWN if page.suffix == ".md" else RESTRUCTURED
-    found = [match for match in pattern.finditer(page.read_text()) if match["language"] == language]
-    return [textwrap.dedent(match["code"]) for match in found if slow or not match["slow"]]
+    text = page.read_text()
+    found = [match for match in pattern.finditer(text) if match["language"] == language]
+    whole = text.startswith(".. slow\n")
+    return [textwrap.dedent(match["code"]) for match in found if slow or not (whole or match["slow"])]
 
 
 def name_of(page: Path) -> str:
@@ -45,15 +46,7 @@ def run(page: Path, folder: Path, slow: bool) -> None:
     """Run the Python blocks of a page as one script in `folder`."""
     script = folder / "page.py"
     script.write_text("\n\n".join(blocks(page, "python", slow)))
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=folder,
-        env=os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=1800 if slow else 500,
-    )
-    assert done.returncode == 0, f"{name_of(page)}:\n{done.stderr[-3000:]}"
+    run_script(script)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python", slow=False)], ids=name_of)
@@ -70,6 +63,21 @@ def test_python_blocks_run_as_printed(page, tmp_path):
 )
 def test_slow_python_blocks_run_as_printed(page, tmp_path):
     run(page, tmp_path, slow=True)
+
+
+def test_first_lines_of_the_readme_run_with_another_posterior(tmp_path, monkeypatch, capsys):
+    """With the bridge column, which takes half a minute, they run among the slow tests."""
+    first, own_model, *_ = blocks(ROOT / "README.md", "python")
+    assert 'problems.bridge_column(data="short")' in first
+    script = tmp_path / "own_model.py"
+    script.write_text(own_model.split("sampler =")[0])
+    posterior = run_script(script)["posterior"]
+    monkeypatch.setattr(problems, "bridge_column", lambda data: posterior)
+    (tmp_path / "first.py").write_text(first)
+    variables = run_script(tmp_path / "first.py")
+    assert abs(variables["sampler"].get_chain(flat=True).mean(axis=0)[0] - 1.1) < 0.01  # the true stiffness
+    assert f"log-evidence {variables['sampler'].log_evidence:.1f}" in capsys.readouterr().out
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_every_python_block_is_found():

@@ -252,7 +252,7 @@ def test_how_many_rows():
             rows_to_compare(wrong)
 
 
-@pytest.mark.parametrize("ndim", [1, 3, 6])
+@pytest.mark.parametrize("ndim", [1, pytest.param(3, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.slow)])
 def test_changes_of_5_percent_are_found(ndim, rng):
     thetas = rng.normal(size=(2000, ndim))
     rows = [StoredSimulation(theta, np.array([1.0]), "") for theta in thetas]

@@ -2,10 +2,12 @@
 
 from typing import NamedTuple
 
-import arviz
+import lazy_loader
 import numpy as np
 
 from .problem import Exact
+
+arviz = lazy_loader.load("arviz")  # its import takes seconds
 
 __all__ = ["Found", "Score", "chains", "check", "replicates", "score", "weighted"]
 

@@ -10,6 +10,7 @@ import pytest
 from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements, Posterior, Uniform
 from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.simulation.faults import ChangedModel
+from tests.covering import covering
 
 CHANNELS = (Channel("u", "displacement", "m"),)
 TIME = np.linspace(0.0, 1.0, 20)
@@ -27,8 +28,10 @@ def posterior_of_a_function():
 
 
 @pytest.mark.skipif(importlib.util.find_spec("joblib") is None, reason="NO JOBLIB: `pip install joblib` to test it")
-@pytest.mark.parametrize("backend", ["loky", "multiprocessing", "threading"])
-@pytest.mark.parametrize("make", [bridge_column, posterior_of_a_function])
+@pytest.mark.parametrize(
+    ("backend", "make"),
+    covering(["loky", "multiprocessing", "threading"], [posterior_of_a_function, bridge_column], strength=1),
+)
 def test_parallel_gives_the_values_of_this_process(make, backend):
     from joblib import Parallel, delayed
 

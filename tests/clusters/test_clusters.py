@@ -1,4 +1,4 @@
-"""The scripts of docs/clusters on SLURM, MPI and one machine; workers, parents and schedulers end in the middle."""
+"""The scripts of docs/clusters with MPI and on one machine; jobs, workers and parents end in the middle."""
 
 import contextlib
 import importlib.util
@@ -20,14 +20,12 @@ from fe_likelihoods import DaskExecutor
 from fe_likelihoods.simulation import dask_executor
 from samplers import SMCSampler
 from samplers.record import Record
-from tests.clusters import noted, slurm_machine
-from tests.clusters.slurm_machine import SlurmMachine
+from tests.clusters import noted
 from tests.faults.treacherous import Treacherous, posterior_of
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "docs" / "clusters"
 LARGEST_GROUP = 10  # short simulations that are one task of dask, and are repeated if its worker ends
-JOB = ["--partition", "compute", "--memory", "1GB"]
 WALKERS = 250  # of slow_model.py
 LOG_EVIDENCE = 2427.63  # +- 0.01, of problem.py with 2000 walkers in one process
 PRINTED = re.compile(r"log-evidence ([\d.]+) \+- ([\d.]+)")
@@ -36,17 +34,6 @@ PRINTED = re.compile(r"log-evidence ([\d.]+) \+- ([\d.]+)")
 def needs(module):
     missing = importlib.util.find_spec(module) is None
     return pytest.mark.skipif(missing, reason=f"NO {module.upper()}: install it to test the scripts for clusters")
-
-
-needs_slurm = pytest.mark.skipif(
-    not slurm_machine.is_installed(), reason="NO SLURM: `apt-get install slurm-wlm munge` to test its scripts"
-)
-
-
-@pytest.fixture
-def slurm():
-    with SlurmMachine() as machine:
-        yield machine
 
 
 @pytest.fixture
@@ -62,9 +49,9 @@ def place(tmp_path):
 
 
 @contextlib.contextmanager
-def started(place, machine, *command):
+def started(place, *command):
     """A process of a script, which is killed at the end."""
-    environment = (machine.environment if machine else dict(os.environ)) | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with (
         open(place / "output.txt", "ab") as output,
         subprocess.Popen(
@@ -91,11 +78,11 @@ def progressed(place, process, number):
         time.sleep(0.1)
 
 
-def check_result(place, interruptions, unwritten=0):
+def check_result(place, interruptions):
     """Every simulation that ended is kept, and the evidence is that of one machine without interruptions.
 
     No evaluation has failed, so that none was given up because of the ends of its workers. Every simulation that ended
-    is in the record. `unwritten` of them may not be in the cache: they ended in a worker when the parent died.
+    is in the record and in the cache.
     Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
     """
     text = (place / "output.txt").read_text()
@@ -114,127 +101,24 @@ def check_result(place, interruptions, unwritten=0):
     # the measurements are a simulation of the function that is not one of the likelihood
     known = {tuple(row[:2]) for row in evaluated.coords}
     assert len({tuple(map(float, re.findall(r"[-+.e\d]{3,}(?=\))", line))) for line in ends} - known) == 1
-    assert 0 <= len(ends) - 1 - rows <= unwritten
+    assert rows == len(ends) - 1
     return repeated
 
 
-def ended_workers(place):
-    """Number of worker processes that have begun, by the logs of the jobs."""
-    return sum(path.read_text().count("Start worker at") for path in place.glob("slurm-*.out"))
-
-
-@needs_slurm
 @needs("dask_jobqueue")
 @pytest.mark.slow
-def test_slurm_accepts_the_directives(slurm, place):
-    for command in (["python", "dask_jobs.py"], ["--cpus-per-task=8", "slurm.sh", "python", "one_machine.py"]):
-        command = command if "slurm.sh" in command else ["slurm.sh", *command]
-        assert "to start at" in slurm.run("sbatch", "--test-only", *command, folder=place)
+def test_scripts_of_jobs_limit_threads_and_leave_before_their_walltime(place):
     code = "import dask_jobs; print(dask_jobs.make_cluster(dask_jobs.parse_arguments()).job_script())"
-    environment = slurm.environment | {"PYTHONPATH": str(ROOT)}
-    options = [*JOB, "--cores", "8", "--threads", "4"]
-    script = subprocess.run(
-        [sys.executable, "-c", code, *options], cwd=place, env=environment, capture_output=True, text=True, check=True
-    ).stdout
-    (place / "worker.sh").write_text(script)
-    assert "to start at" in slurm.run("sbatch", "--test-only", "worker.sh", folder=place)
-    assert "OMP_NUM_THREADS=4" in script
-    assert re.search(r"--nworkers 2.*--nthreads 1 --lifetime 7h", script), script
-    command = [sys.executable, "-c", code, *options, "--system", "pbs"]  # no PBS is there to accept it
-    script = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True).stdout
-    assert "#PBS -l select=1:ncpus=8:mem=" in script and "#PBS -l walltime=08:00:00" in script
-    refused = slurm.run("sbatch", "--test-only", "--partition=none", "slurm.sh", "true", folder=place, check=False)
-    assert "invalid partition" in refused.lower()  # the negative control
-
-
-@needs_slurm
-@needs("dask_jobqueue")
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("lifetime", ["1h", "25s"])
-def test_workers_that_end_with_their_walltime_are_replaced(lifetime, slurm, place):
-    """Jobs of one minute: SLURM kills them (a lifetime of 1 h), or their workers leave before."""
-    slurm.environment["SECONDS_PER_SIMULATION"] = "0.2" if lifetime == "1h" else "0.1"
-    options = ["--cores", "3", "--jobs", "2", "--walltime", "00:01:00", "--lifetime", lifetime, "--stagger", "3s"]
-    with started(place, slurm, "dask_jobs.py", *JOB, *options) as parent:
-        assert parent.wait(600) == 0, (place / "output.txt").read_text()
-    states = Counter(slurm.jobs().values())
-    assert states.total() > 2, states
-    if lifetime == "1h":
-        assert states["TIMEOUT"] >= 1, states
-    check_result(place, ended_workers(place))
-
-
-BATCH = """
-import dask_jobs, problem
-from dask.distributed import Client
-from fe_likelihoods.simulation.executors import DaskExecutor
-
-with dask_jobs.make_cluster(dask_jobs.parse_arguments()) as cluster, Client(cluster) as client:
-    cluster.scale(jobs=2)
-    posterior = problem.make_posterior(DaskExecutor(client))
-    posterior(posterior.sample_prior(150, 1))
-    report = posterior.report()
-    print(report["simulations"], report["failure_count"])
-"""
-
-
-@needs_slurm
-@needs("dask_jobqueue")
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_a_worker_that_leaves_repeats_the_one_simulation_that_it_ran(slurm, place):
-    """Simulations of more than a second are tasks of their own; without adaptive scaling, jobs are replaced as well."""
-    slurm.environment["SECONDS_PER_SIMULATION"] = "1.2"
-    (place / "batch.py").write_text(BATCH)
-    options = ["--cores", "3", "--walltime", "00:02:00", "--lifetime", "20s", "--stagger", "5s"]
-    with started(place, slurm, "batch.py", *JOB, *options) as parent:
-        assert parent.wait(1100) == 0, (place / "output.txt").read_text()
-    assert "150 0" in lines(place, "output.txt")  # dask may write more when it closes
-    starts, ends = Counter(lines(place, "starts.txt")), Counter(lines(place, "ends.txt"))
-    assert set(starts) == set(ends) and len(ends) == 150 + 1  # the measurements are one of them
-    workers = ended_workers(place)
-    assert workers > 6 and starts.total() - len(starts) <= workers, (starts.total(), workers)
-
-
-@needs_slurm
-@needs("dask_jobqueue")
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_parent_and_a_controller_that_are_killed(slurm, place):
-    """slurmctld is killed by -9 and comes back; then the parent with the scheduler of dask is, and its jobs end."""
-    command = ["dask_jobs.py", *JOB, "--cores", "2", "--jobs", "2"]
-    with started(place, slurm, *command) as parent:
-        progressed(place, parent, 300)
-        slurm.kill_controller()
-        progressed(place, parent, 500)
-        slurm.start_controller()
-        progressed(place, parent, 800)
-        parent.kill()
-    done = len(lines(place, "ends.txt"))
-    with started(place, slurm, *command) as parent:
-        assert parent.wait(400) == 0, (place / "output.txt").read_text()
-    slurm.wait_until(lambda: not slurm.jobs("RUNNING,PENDING"), 120.0)  # workers whose scheduler has died end
-    again = int(re.search(r"(\d+) simulations by this process", (place / "output.txt").read_text())[1])
-    assert done >= 800 and again < len(lines(place, "ends.txt")) - 700
-    check_result(place, ended_workers(place), unwritten=4 * LARGEST_GROUP)  # groups of four workers
-
-
-@needs_slurm
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_job_submits_itself_again_before_its_walltime_ends(slurm, place):
-    """``slurm.sh`` with a walltime of two minutes; SLURM sends its signal up to a minute early."""
-    slurm.environment |= {"SECONDS_PER_SIMULATION": "0.08", "PYTHONPATH": str(ROOT)}
-    options = ["--time=2", "--signal=B:USR1@30", "--cpus-per-task=2", "--output=output.txt"]
-    command = ["slurm.sh", sys.executable, "one_machine.py", "--cores", "2"]
-    number = int(slurm.run("sbatch", "--parsable", *options, *command, folder=place))
-    slurm.wait_until(lambda: slurm.jobs().get(number) in ("COMPLETED", "FAILED", "TIMEOUT"), 600.0)
-    text = (place / "output.txt").read_text()
-    assert slurm.jobs()[number] == "COMPLETED", text
-    restarts = int(re.search(r"Restarts=(\d+)", slurm.run("scontrol", "show", "job", str(number)))[1])
-    assert restarts >= 1 and text.count("KeyboardInterrupt: ") == restarts
-    check_result(place, 2 * restarts)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    options = ["--partition", "compute", "--memory", "1GB", "--cores", "8", "--threads", "4"]
+    scripts = {}
+    for system in ("slurm", "pbs"):
+        command = [sys.executable, "-c", code, *options, "--system", system]
+        done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True)
+        scripts[system] = done.stdout
+    assert "OMP_NUM_THREADS=4" in scripts["slurm"]
+    assert re.search(r"--nworkers 2.*--nthreads 1 --lifetime 7h", scripts["slurm"]), scripts["slurm"]
+    assert "#PBS -l select=1:ncpus=8:mem=" in scripts["pbs"] and "#PBS -l walltime=08:00:00" in scripts["pbs"]
 
 
 @needs("mpi4py")
@@ -253,16 +137,16 @@ def test_mpi(place):
 @pytest.mark.slow
 def test_one_machine_stopped_by_a_signal_goes_on(place, monkeypatch):
     monkeypatch.setenv("SECONDS_PER_SIMULATION", "0.01")
-    with started(place, None, "one_machine.py", "--cores", "2") as parent:
+    with started(place, "one_machine.py", "--cores", "2") as parent:
         progressed(place, parent, 1000)
         parent.send_signal(signal.SIGTERM)
         assert parent.wait(60) != 0
-    with started(place, None, "one_machine.py", "--cores", "2") as parent:
+    with started(place, "one_machine.py", "--cores", "2") as parent:
         assert parent.wait(300) == 0
     check_result(place, 2)
 
 
-# quick ones -----------------------------------------------------------------------------------------------------------
+# jobs on one machine -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -299,6 +183,7 @@ def jobs(tmp_path, monkeypatch):
         yield client, names
 
 
+@pytest.mark.slow
 @needs("dask_jobqueue")
 def test_a_job_with_several_workers_that_has_ended_is_submitted_again(jobs, tmp_path):
     client, names = jobs
@@ -310,8 +195,9 @@ def test_a_job_with_several_workers_that_has_ended_is_submitted_again(jobs, tmp_
     assert posterior.report()["failure_count"] == 0
 
 
+@pytest.mark.slow
 @needs("dask_jobqueue")
-@pytest.mark.parametrize("asynchronous", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("asynchronous", [True, False])
 def test_an_executor_as_pool_of_a_sampler_replaces_jobs_as_well(asynchronous, jobs, tmp_path, caplog):
     """A log-density that is no posterior of this library; a bare client has an advice instead."""
     client, names = jobs

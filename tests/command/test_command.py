@@ -1,5 +1,6 @@
 """The commands as a user calls them: their files, their messages, their exit codes."""
 
+import contextlib
 import dataclasses
 import itertools
 import re
@@ -83,6 +84,22 @@ def folder(tmp_path, monkeypatch):
     write_oscillator(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def run_once(tmp_path_factory):
+    """A folder with the files of a finished run, and what the run said."""
+    path = tmp_path_factory.mktemp("run")
+    write_oscillator(path)
+    with contextlib.chdir(path):
+        return path, call("run", "oscillator.toml", "--quiet")
+
+
+@pytest.fixture
+def finished(run_once, folder):
+    """A copy of these files in the current folder."""
+    shutil.copytree(run_once[0], folder, dirs_exist_ok=True)
+    return folder
 
 
 def call(*arguments: str, code: int = 0) -> str:
@@ -213,11 +230,16 @@ def test_check_says_what_was_read_and_what_a_run_costs(folder):
     stored = SimulationCache(folder / "results-oscillator" / "simulations.sqlite").info().simulations
     assert 20 < stored <= made
     assert all(path.name.startswith("simulations.sqlite") for path in (folder / "results-oscillator").iterdir())
-    call("run", "oscillator.toml", "--quiet")  # uses the folder and what it has
-    assert (folder / "results-oscillator" / "report.html").exists()
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("no run")
     assert "is not the folder of a run" in call("run", "oscillator.toml", "--out", "other", code=1)
+
+
+@pytest.mark.slow
+def test_a_run_uses_the_folder_of_a_check_and_what_it_has(folder):
+    call("check", "oscillator.toml")
+    call("run", "oscillator.toml", "--quiet")
+    assert (folder / "results-oscillator" / "report.html").exists()
 
 
 def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkeypatch):
@@ -232,8 +254,8 @@ def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkey
     assert "for example with a fixed seed" in call("run", "chance.toml", "--quiet", code=1)
 
 
-def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
-    output = call("run", "oscillator.toml", "--quiet")
+def test_run_writes_its_files(run_once):
+    folder, output = run_once
     assert "log-evidence" in output and "Written to results-oscillator/" in output
     results = folder / "results-oscillator"
     for name in (
@@ -247,13 +269,27 @@ def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
         "settings.toml",
     ):
         assert (results / name).stat().st_size > 0, name
-    first = (results / "summary.csv").read_text()
     told = (results / "summary.txt").read_text()
     stored, counted = (int(re.search(words, told)[1]) for words in (r"(\d+) runs of the model", r"as (\d+) full simul"))
     assert stored == SimulationCache(results / "simulations.sqlite").info().simulations > counted
     assert f" from {counted} simulations." in told
-    assert "sigma_displacement [cm]" in first
+    assert "sigma_displacement [cm]" in (results / "summary.csv").read_text()
     assert "prior of sigma" not in output
+
+
+def test_a_run_with_other_settings_is_refused(finished):
+    first = (finished / "results-oscillator" / "summary.csv").read_text()
+    (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
+    message = call("run", "oscillator.toml", "--quiet", code=1)
+    assert "[sampler] walkers differ" in message and "--overwrite" in message
+    assert (finished / "results-oscillator" / "summary.csv").read_text() == first
+    assert "contains no run to resume" in call("run", "oscillator.toml", "--resume", "--out", "other", code=1)
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_not_repeated_unless_it_is_overwritten(finished, caplog):
+    results = finished / "results-oscillator"
+    first = (results / "summary.csv").read_text()
     assert "Written to" in call("run", "oscillator.toml", "--quiet")
     caplog.clear()
     assert (results / "summary.csv").read_text() == first
@@ -261,20 +297,14 @@ def test_run_writes_its_files_and_is_not_repeated(folder, caplog):
     call("report", "results-oscillator/run.h5")
     assert "nothing is added" not in caplog.text and "Continuing" not in caplog.text
     assert (results / "summary.csv").read_text() == first
-
-    text = OSCILLATOR.replace("walkers = 20", "walkers = 24")
-    (folder / "oscillator.toml").write_text(text)
-    message = call("run", "oscillator.toml", "--quiet", code=1)
-    assert "[sampler] walkers differ" in message and "--overwrite" in message
-    assert (results / "summary.csv").read_text() == first
-    assert "contains no run to resume" in call("run", "oscillator.toml", "--resume", "--out", "other", code=1)
+    (finished / "oscillator.toml").write_text(OSCILLATOR.replace("walkers = 20", "walkers = 24"))
     call("run", "oscillator.toml", "--quiet", "--overwrite")
     assert (results / "summary.csv").read_text() != first
 
 
-def test_another_file_of_the_same_name_is_refused(folder):
+def test_another_file_of_the_same_name_is_refused(finished):
     """Its settings are the same, its data are not."""
-    call("run", "oscillator.toml", "--quiet")
+    folder = finished
     (folder / "other").mkdir()
     for name in ("oscillator.toml", "top.csv"):
         (folder / "other" / name).write_text((folder / name).read_text())
@@ -286,8 +316,7 @@ def test_another_file_of_the_same_name_is_refused(folder):
     assert (folder / "results-oscillator" / "origin.json").read_text() == before
 
 
-def test_caches(folder):
-    call("run", "oscillator.toml", "--quiet")
+def test_caches(finished):
     file = "results-oscillator/simulations.sqlite"
     assert "simulations " in call("cache", "info", file)
     assert "0 of which do not match" in call("cache", "verify", file)
@@ -388,6 +417,7 @@ def test_a_damaged_table_and_a_missing_file_are_named(folder):
     assert "No such option" in call("run", "oscillator.toml", "--ressume", code=1)
 
 
+@pytest.mark.slow
 def test_measurements_that_hardly_cover_the_record_are_told(folder):
     """Times in milliseconds under a header in seconds, and a record that is much shorter than the measurements."""
     lines = (folder / "top.csv").read_text().splitlines()
@@ -505,6 +535,7 @@ def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     assert "returns SI units" in output
 
 
+@pytest.mark.slow
 def test_a_sensor_with_the_opposite_sign_is_told(tmp_path, monkeypatch):
     """And the units, which are right, are not suspected."""
     monkeypatch.chdir(tmp_path)

@@ -147,6 +147,7 @@ def test_warnings_of_the_model_are_given_and_remarks_are_not(events):
     assert {str(each.message) for each in caught} == {"the oscillator is very soft", *found.remarks}
 
 
+@pytest.mark.slow
 def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monkeypatch):
     weak, one = 0.7 * np.abs(read_csv("base.csv").acceleration).max(), LinearOscillator.simulate
 
@@ -261,6 +262,7 @@ def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, st
     assert "Event after: other" in call("check", "oscillator.toml")
 
 
+@pytest.mark.slow
 def test_measurements_that_end_between_two_steps_of_the_model_are_scored(events):
     """With `every`, the motion may end one sample before the measurements."""
     for name in ("base.csv", "top.csv", "weaker.csv"):

@@ -95,6 +95,7 @@ def test_a_noise_without_a_guide_is_told_before_the_run(folder):  # noqa: F811
     assert "[sampler]" in output and "guide" in output and not (folder / "results-oscillator").exists()
 
 
+@pytest.mark.slow
 def test_emcee_runs_and_goes_on_with_more_steps(folder):  # noqa: F811
     (folder / "oscillator.toml").write_text(EMCEE)
     assert "emcee makes 976 simulations" in call("check", "oscillator.toml")
@@ -172,7 +173,7 @@ def two_steps(tmp_path_factory):
         return path, call("run", "oscillator.toml", "--quiet", "--out", "r", code=3)
 
 
-@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps, two_steps):  # noqa: F811
     """The autocorrelation time of so few steps is not a number."""
     folder, said = two_steps if steps == 2 else (folder, "")
@@ -183,7 +184,9 @@ def test_a_chain_of_few_steps_is_told_after_its_tables(folder, steps, two_steps)
     assert "nan" not in said and (folder / "r" / "report.html").is_file()
 
 
-@pytest.mark.parametrize("name", ["run.h5", "origin.json", "settings.toml"])
+@pytest.mark.parametrize(
+    "name", ["run.h5", *(pytest.param(name, marks=pytest.mark.slow) for name in ("origin.json", "settings.toml"))]
+)
 def test_a_damaged_file_of_a_run_is_named(folder, name, two_steps):  # noqa: F811
     shutil.copytree(two_steps[0], folder, dirs_exist_ok=True)
     path = folder / "r" / name

@@ -13,6 +13,7 @@ import pytest
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from tests.contract.targets import WithBlobs
+from tests.covering import covering
 
 N, NDIM = 40, 3
 KINDS = {
@@ -22,6 +23,8 @@ KINDS = {
     "TMCMCSampler": (TMCMCSampler, {}),
 }
 OURS = [kind for kind in KINDS if kind != "EnsembleSampler"]
+SLOW = ("SMCSampler by moves",)  # TMCMCSampler moves as well, among the quick tests
+MARKED = [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS]
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")  # 40 walkers are few
 
 
@@ -100,7 +103,7 @@ def record_of(path):
 # ---------------------------------------------------------------- emcee's idiom
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MARKED)
 def test_steps_are_added_after_the_last_stored_one(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 3)
     posterior = Counted()
@@ -111,7 +114,7 @@ def test_steps_are_added_after_the_last_stored_one(kind, tmp_path, whole_run):
     assert len(posterior.evaluated) <= 4 * N  # those of the added steps only
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MARKED)
 def test_equal_calls_add_steps_too(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     for _ in range(2):
@@ -120,7 +123,7 @@ def test_equal_calls_add_steps_too(kind, tmp_path, whole_run):
     assert same(reopened, whole_run(kind, 2, 2, 2))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MARKED)
 def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     reopened = make(kind, tmp_path / "run.h5", Counted())
@@ -133,7 +136,7 @@ def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
     assert np.array_equal(reopened.get_chain(), whole_run(kind, 2, 3).get_chain())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MARKED)
 def test_reset_begins_anew(kind, tmp_path):
     """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
     begin(make(kind, tmp_path / "run.h5", Counted()), 3)
@@ -149,7 +152,7 @@ def test_reset_begins_anew(kind, tmp_path):
 
 
 @pytest.mark.parametrize("fingerprint", ["counted", None])
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path, whole_run):
     whole = whole_run(kind, 3)
     path = tmp_path / "run.h5"
@@ -168,10 +171,10 @@ def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_pat
 # ---------------------------------------------------------------- limits and interrupts
 
 
-@pytest.mark.parametrize("reopened", [False, True], ids=["same object", "reopened"])
-@pytest.mark.parametrize("place", ["start", "annealing", "at beta = 1"])
-@pytest.mark.parametrize("kind", OURS)
-@pytest.mark.parametrize("what", ["interrupt_at", "spoilt_at"])
+@pytest.mark.parametrize(
+    ("what", "kind", "place", "reopened"),
+    covering(["interrupt_at", "spoilt_at"], OURS, ["start", "annealing", "at beta = 1"], [False, True]),
+)
 def test_an_interrupt_or_an_error_and_then_the_same_call(what, kind, place, reopened, tmp_path, whole_run):
     """An interrupt loses no evaluated point; the batch that contains an error is evaluated again, nothing before it."""
     annealing = whole_run(kind, 0).evaluations
@@ -194,7 +197,7 @@ def test_an_interrupt_or_an_error_and_then_the_same_call(what, kind, place, reop
 # ---------------------------------------------------------------- what is refused, and errors
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run):
     path = tmp_path / "run.h5"
     annealing = whole_run(kind, 0).evaluations
@@ -208,7 +211,7 @@ def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run)
     assert same(again, whole_run(kind, 2))
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_second_annealing_of_a_reopened_run(kind, tmp_path):
     """Other draws begin a new annealing after the steps of the first one; a third sampler goes on with the second."""
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -251,7 +254,7 @@ def test_a_log_prior_of_another_convention_is_named(tmp_path):
         sampler.run_mcmc(np.random.default_rng(1).standard_normal((N, NDIM)), 1)
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_file_that_is_only_read(kind, tmp_path):
     whole = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     before = sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir())
@@ -265,7 +268,7 @@ def test_a_file_that_is_only_read(kind, tmp_path):
 # ---------------------------------------------------------------- idioms of emcee's users
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
     """``np.random.seed``, a sampler, a start from the global generator: the same start after a restart."""
 
@@ -280,7 +283,7 @@ def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
     assert again.iteration == 5 and again.log_prob_fn.f.evaluated
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
     annealing = whole_run(kind, 0).evaluations
     posterior = Counted(interrupt_at=annealing + int(2.5 * N))
@@ -291,7 +294,7 @@ def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
     assert same(sampler, whole_run(kind, 4))
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
     whole = whole_run(kind, 2, 2)
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -301,7 +304,7 @@ def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
     assert np.array_equal(again.get_chain(), whole.get_chain()[2:])
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
     sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 3)
     for each in (sampler, make(kind, tmp_path / "run.h5", Counted())):

@@ -43,6 +43,7 @@ def _linear(theta):
     return theta
 
 
+@pytest.mark.slow
 def test_a_run_does_not_hold_its_responses_in_memory():
     """All responses have 310 MiB; all copies of them had 840."""
     n_channels, n_steps = 40, 5000

@@ -95,7 +95,7 @@ def test_a_budget_includes_derivatives(budget):
     assert posterior.report()["simulations"] + counted.calls == search.simulations <= budget
 
 
-@pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.parametrize("asynchronous", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_run_in_a_pool_is_that_of_one_process(asynchronous):
     runs = []
     for pool in (None, 2):
@@ -300,7 +300,7 @@ def test_right_derivatives_are_accepted_for_any_width_of_the_prior(prior):
         (fails, "got ZeroDivisionError: no tangent, at stiffness = .*: correct it, or leave it out"),
     ],
 )
-@pytest.mark.parametrize("pool", [None, 2])
+@pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_derivatives_that_cannot_be_used(jacobian, message, pool):
     posterior = posterior_of(jacobian, pool=pool)
     with pytest.raises(ValueError, match=message):

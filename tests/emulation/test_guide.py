@@ -39,7 +39,7 @@ def quadrature(posterior):
     return top + np.log(density.sum() * cell), centre
 
 
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+@pytest.mark.parametrize("Sampler", [SMCSampler, pytest.param(TMCMCSampler, marks=pytest.mark.slow)])
 def test_evidence_and_means_against_quadrature(Sampler):
     posterior = vibration()
     log_evidence, means = quadrature(vibration())
@@ -51,6 +51,7 @@ def test_evidence_and_means_against_quadrature(Sampler):
     assert posterior.report()["simulations"] == sampler.verdict.simulations <= 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["autoregressive", "effective"])
 def test_every_noise_is_sampled_together_with_its_parameters(noise):
     posterior = vibration(noise)
@@ -133,6 +134,7 @@ def test_a_second_sampler_repeats_no_simulation(tmp_path):
     assert results[:2] == results[2:]
 
 
+@pytest.mark.slow
 def test_a_second_sampler_in_memory(tmp_path):
     posterior = guided_run.make(None, tmp_path / "log")[1]
     counts = []
@@ -167,6 +169,7 @@ def test_a_channel_with_an_offset_of_a_million_times_its_noise():
     assert abs(results[0][0] - results[1][0]) < 1e-4
 
 
+@pytest.mark.slow
 def test_springs_in_series_are_emulated_in_flexibilities():
     """The displacements are linear in the reciprocals of the stiffnesses, so few runs give the whole posterior."""
     n = 6

@@ -103,7 +103,9 @@ def _equal_modes(n):
     return Posterior(FELikelihood(model, measured), prior)
 
 
-@pytest.mark.parametrize(("n", "most"), [(1, 12), (2, 24), (6, 32)])
+@pytest.mark.parametrize(
+    ("n", "most"), [(2, 24), *(pytest.param(n, most, marks=pytest.mark.slow) for n, most in ((1, 12), (6, 32)))]
+)
 def test_starts_are_added_until_few_unseen_modes_are_expected(n, most):
     """And while few ascents have reached a mode: with one mode, four of eight are given up in some of the searches."""
     found = [find_modes(_equal_modes(n), seed=seed) for seed in range(1, 6)]
@@ -116,7 +118,7 @@ def test_starts_are_added_until_few_unseen_modes_are_expected(n, most):
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
 
 
-@pytest.mark.parametrize("difference", [0.4, 0.7])
+@pytest.mark.parametrize("difference", [0.4, pytest.param(0.7, marks=pytest.mark.slow)])
 def test_two_straight_ridges_are_two_modes(difference):
     """Only (a - b)^2 is identified. With wrong derivatives at first, steps cost hundreds, which is no roughness; and
     from the saddle a = b, lines lead up to both modes."""
@@ -167,7 +169,8 @@ def test_a_result_with_many_modes_of_one_start_is_refused():
     assert unseen_share(sampler.guide.search) > 0.3
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_curved_ridge_is_sampled_whole_or_doubted(seed):
     """Only a^2 + b^2 is identified: the posterior is a ring, and the Laplace approximation at one point is short."""
     time, channels = 0.02 * np.arange(200), [Channel("top", "displacement", "m")]
@@ -221,6 +224,7 @@ def test_a_budget_is_kept(budget):
     assert posterior.report()["simulations"] == search.simulations <= budget
 
 
+@pytest.mark.slow
 def test_parts_of_the_record_count_as_fractions():
     posterior = problems.isolated_bridge(noise="marginal")
     search = find_modes(posterior, starts=4, seed=1)
@@ -229,7 +233,7 @@ def test_parts_of_the_record_count_as_fractions():
     assert whole < search.simulations < 300
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_starts_that_differ_only_in_what_the_end_of_the_record_determines_stay_apart(seed):
     search = find_modes(acts_late(seed), seed=seed)
     assert sorted(round(float(mode.parameters[2])) for mode in search.modes) == [-1, 1]
@@ -238,7 +242,7 @@ def test_starts_that_differ_only_in_what_the_end_of_the_record_determines_stay_a
 
 
 @pytest.mark.parametrize("first", [True, False])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_a_search_leaves_the_axis_of_symmetry(seed, first):
     """The prior's median lies on it: a point without a gradient, lower than the modes on both sides."""
     search = find_modes(symmetric(first=first), seed=seed)

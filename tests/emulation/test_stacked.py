@@ -154,6 +154,7 @@ def guided(posterior, limit=700, seed=1, **options):
     return sampler
 
 
+@pytest.mark.slow
 def test_two_events_take_hundreds_of_simulations():
     """The result is that of quadrature; every simulation is one run of each model."""
     log_evidence, mean, sd = exact(joint())
@@ -172,6 +173,7 @@ def test_two_events_take_hundreds_of_simulations():
     assert samples.std(axis=0) == pytest.approx(sd, rel=4.0 * np.sqrt(variance / 2.0))
 
 
+@pytest.mark.slow
 def test_a_joint_likelihood_of_one_event_is_guided_as_the_event_itself():
     """Both are the same density, up to the name of a parameter."""
     of_one = joint_of_one()
@@ -198,6 +200,7 @@ def test_control_one_event_alone_has_another_posterior():
     assert np.all(alone > 1.05 * sd)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_is_the_long_run(tmp_path):
     whole = guided(joint())
     path = str(tmp_path / "run.h5")
@@ -210,6 +213,7 @@ def test_a_run_that_goes_on_is_the_long_run(tmp_path):
     assert again.likelihood.simulations < 2 * whole.simulations - 1.4 * limit
 
 
+@pytest.mark.slow
 def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     """The draws that fill the limit are of a guide that has not ended its search; they stay in the count."""
     calls, call = [], Vibration.__call__

@@ -54,6 +54,7 @@ def test_tests_that_say_nothing_do_not_move_a_common_parameter(n_flat, rng):
         assert wrong[0] - mean > 0.4 * sd
 
 
+@pytest.mark.slow
 def test_correlation_with_the_varying_parameter_is_kept(rng):
     """A test that knows k - c only, to within 0.1; the exact marginal likelihood is an integral over k.
 
@@ -126,7 +127,11 @@ def shares(n_flat: int, prior: str, rng: np.random.Generator) -> dict[str, Store
 
 @pytest.mark.parametrize(
     ("prior", "scale", "is_right"),
-    [("uniform", "linear", False), ("uniform", "logit", False), ("logit-normal", "logit", True)],
+    [
+        pytest.param("uniform", "linear", False, marks=pytest.mark.slow),
+        ("uniform", "logit", False),
+        ("logit-normal", "logit", True),
+    ],
 )
 def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right):
     """Such tests should add a constant. Where the mixture makes something else of them, an alarm says so."""
@@ -165,7 +170,10 @@ def test_flat_shares_are_told_with_bounds_of_the_scale_within_those_of_the_prior
     assert "johnsonsb(0.0, 0.6, low, high - low) for scale='logit'" in said
 
 
-@pytest.mark.parametrize(("counts", "is_right"), [((0,) * 10, False), ((4, 7, 6, 5, 8, 6, 9, 6, 5, 7), True)])
+@pytest.mark.parametrize(
+    ("counts", "is_right"),
+    [((0,) * 10, False), pytest.param((4, 7, 6, 5, 8, 6, 9, 6, 5, 7), True, marks=pytest.mark.slow)],
+)
 def test_tests_that_pile_up_at_one_bound(counts, is_right, rng):
     """Shares of 20 trials with a flat prior, whose posteriors are beta densities; the population is integrated exactly.
 

@@ -229,6 +229,7 @@ def test_draws_of_a_new_test_beyond_the_bounds_are_a_warning(rng):
 # ------------------------------------------------------------------ checks
 
 
+@pytest.mark.slow
 def test_stated_errors_are_those_of_other_samples():
     """Standard errors from resampling against the scatter over independent stored samples."""
     points = np.random.default_rng(1).normal([1.1, 0.3], [0.1, 0.05], (60, 2))

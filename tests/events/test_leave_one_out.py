@@ -81,6 +81,7 @@ def check(left_out, posterior, name, measured) -> None:
     assert name not in left_out.hierarchy.posterior.tests
 
 
+@pytest.mark.slow
 def test_weights_leave_tests_out_as_exactly_as_a_new_run(alike):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -223,6 +224,7 @@ def check_without_c(left_out, posterior) -> None:
     assert left_out.log_density_error < 0.5
 
 
+@pytest.mark.slow
 def test_a_prior_of_a_common_parameter_that_is_narrower_than_the_others():
     """No hyper-sample is where only this test forbids the parameter, and the weights of the others are even."""
     hierarchy = hierarchy_with_common(1.0, 5.0)
@@ -288,6 +290,7 @@ def test_bridge_between_a_density_and_its_part(rng):
     assert np.isnan(module._bridge(upper, np.full(10, -np.inf))).all()
 
 
+@pytest.mark.slow
 def test_a_test_that_the_others_exclude_has_no_predictive_density():
     hierarchy = hierarchy_with_common(1.0, 5.0)
 

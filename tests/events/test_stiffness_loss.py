@@ -136,6 +136,7 @@ def test_other_parameters_may_differ_between_the_states():
 # ---------------------------------------------------------------------- what must not be found
 
 
+@pytest.mark.slow
 def test_without_a_loss_there_are_no_alarms():
     """Negative control, and its counterpart with a loss: 15 pairs of calibrations, with errors as stated or not."""
     rng = np.random.default_rng(4)
@@ -154,6 +155,7 @@ def test_without_a_loss_there_are_no_alarms():
         assert np.mean(presence[0.3] > 0.5) > (0.95 if factor == 1.0 else 0.7)
 
 
+@pytest.mark.slow
 def test_stated_probabilities_are_calibrated():
     """Truths drawn from the prior of the states: probabilities of losses have a mean of zero error, bin by bin."""
     rng = np.random.default_rng(11)

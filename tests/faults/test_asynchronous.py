@@ -68,12 +68,13 @@ def test_a_run_depends_on_the_order_of_arrival_and_on_nothing_else(tmp_path):
     assert np.array_equal(chains[0], chains[1]) and not np.array_equal(chains[0], chains[2])
 
 
-def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(tmp_path):
-    """Cut after every thirteenth block, and continued with other lengths: nothing known is evaluated again."""
+@pytest.mark.parametrize("every", [65, pytest.param(13, marks=pytest.mark.slow)])
+def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(every, tmp_path):
+    """Cut after some of the blocks, and continued with other lengths: nothing known is evaluated again."""
     whole, cluster = finished(tmp_path / "whole.h5", order=1)
     assert whole.failures and cluster.evaluations == whole.evaluations
-    places = [place for _, place in blocks(tmp_path / "whole.h5")][::13]
-    assert len(places) > 5
+    places = [place for _, place in blocks(tmp_path / "whole.h5")][::every]
+    assert len(places) > 65 // every
     for number, place in enumerate(places):
         path = tmp_path / "killed.h5"
         cut(tmp_path / "whole.h5", place, path)
@@ -111,6 +112,7 @@ def run_with_threads(path):
     return sampler
 
 
+@pytest.mark.slow
 def test_killed_by_signal_9(tmp_path, rng):
     """A real process with threads; whatever the place, the run goes on and every stored evaluation is used."""
     path = tmp_path / "killed.h5"
@@ -140,7 +142,14 @@ needs_loky = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("loky", marks=needs_loky)])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "threads",
+        pytest.param("processes", marks=pytest.mark.slow),
+        pytest.param("loky", marks=[needs_loky, pytest.mark.slow]),
+    ],
+)
 def test_pools_that_take_single_points(kind):
     """Each point goes to the pool by itself; the result is that of the posterior."""
     opened = {"threads": lambda: ThreadPoolExecutor(2)}
@@ -200,9 +209,8 @@ def killed_run(folder, pool, asynchronous=True):
     return sampler
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param("executor", marks=pytest.mark.slow), pytest.param("loky", marks=needs_loky)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["executor", pytest.param("loky", marks=needs_loky)])
 def test_a_process_of_a_pool_that_is_killed_ends_the_run_with_advice(kind, tmp_path):
     """The pool gives up; the run goes on afterwards with a new one."""
     (tmp_path / "points").mkdir()

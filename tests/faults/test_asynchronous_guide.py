@@ -69,7 +69,7 @@ def test_the_record_repeats_a_run_without_a_simulation(whole, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "share", [0.1, 0.5, 0.9, *(pytest.param(s, marks=pytest.mark.slow) for s in np.arange(0.04, 1.0, 0.07).round(2))]
+    "share", [0.5, *(pytest.param(s, marks=pytest.mark.slow) for s in np.arange(0.04, 1.0, 0.07).round(2))]
 )
 def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path, share):
     """In the search and in the rounds; continued with other lengths, of which a later replay takes no account."""
@@ -82,6 +82,7 @@ def test_killed_anywhere_a_run_goes_on_and_its_record_repeats_it(whole, tmp_path
     assert state_of(again) == state_of(resumed) and nothing.simulations == 0.0
 
 
+@pytest.mark.slow
 def test_a_run_that_limits_have_ended_goes_on(tmp_path):
     """The search, then the rounds; what was simulated is not simulated again."""
     with suppress(NothingToReport):  # a draw or none
@@ -100,7 +101,8 @@ def test_a_limit_counts_what_is_running(tmp_path):
     assert 74.0 < sampler.simulations <= 75.0 and pool.simulations == pytest.approx(sampler.simulations)
 
 
-@pytest.mark.parametrize("kind", ["threads", "map only", "none"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["threads", *(pytest.param(k, marks=pytest.mark.slow) for k in ("map only", "none"))])
 def test_pools(kind):
     """Real threads; pools that take batches only, or no pool, are used without overlap."""
     posterior = symmetric()

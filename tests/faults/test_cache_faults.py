@@ -108,7 +108,9 @@ def write_until_killed(path, kill, max_rows, pipe):
         pipe.send_bytes(number.to_bytes(4, "little"))
 
 
-@pytest.mark.parametrize(("kills", "max_rows"), [(30, 1_000_000), (10, 1_000)])
+@pytest.mark.parametrize(
+    ("kills", "max_rows"), [(5, 1_000_000), (5, 1_000), pytest.param(40, 10_000, marks=pytest.mark.slow)]
+)
 def test_killed_while_writing(path, rng, kills, max_rows):
     """SIGKILL at random moments: acknowledged batches are stored, others are complete or absent."""
     acknowledged = []
@@ -170,9 +172,8 @@ def test_a_killed_writer_does_not_block_others(path):
     assert cache.look_up(FINGERPRINT, thetas, 2, 8).known.all()
 
 
-@pytest.mark.parametrize(
-    "share", [pytest.param(0.1, marks=pytest.mark.slow), 0.5, pytest.param(0.9, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_killed_run_is_repeated_without_a_simulation(path, tmp_path, share):
     whole, reference = cached_run.make(tmp_path / "whole.sqlite")
     whole.run_mcmc(None, cached_run.STEPS)
@@ -371,7 +372,7 @@ def test_another_file_that_takes_the_place_of_the_cache_during_the_run(filled, t
     assert warnings_of(caplog, "is not a cache of simulations, and is not changed") > 0
 
 
-@pytest.mark.parametrize("attempts", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("attempts", [4, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", ["bytes", "page", "cut"])
 def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, how, attempts):
     """Damage at random places, also while the file is open."""

@@ -11,6 +11,7 @@ import emcee
 import pytest
 
 import samplers
+from tests.covering import covering
 from tests.faults.kills import evaluated_again
 from tests.faults.resumable_run import STEPS, go_on, make, outcome, points_of
 
@@ -68,8 +69,10 @@ def whole_run(kind):
     return outcome(whole), points, counted.count
 
 
-@pytest.mark.parametrize("stored", [False, True], ids=["memory", "file"])
-@pytest.mark.parametrize("kind", ["smc", "moves", "guided", "map", "asynchronous", "thin"])
+@pytest.mark.parametrize(
+    ("kind", "stored"),
+    covering(["smc", "moves", "guided", "map", "asynchronous", "thin"], [True, False], strength=1),
+)
 def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored, tmp_path):
     whole, evaluated, lines_traced = whole_run(kind)
     choose, interrupts = random.Random(kind), 0

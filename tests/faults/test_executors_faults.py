@@ -75,7 +75,7 @@ def theta(what, n=1):
 # workers that die ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_an_item_that_kills_its_worker_fails_alone(workers):
     thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
     with LocalPool(workers) as pool:
@@ -334,7 +334,11 @@ def test_mpi_gives_the_same_bits():
 
 # parents that die ---------------------------------------------------------------------------------------------------
 
-PARENTS = ["local", "deaf", "nested", "isolated", "program", pytest.param("dask", marks=needs("distributed"))]
+PARENTS = [
+    "nested",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("local", "deaf", "isolated", "program")),
+    pytest.param("dask", marks=[needs("distributed"), pytest.mark.slow]),
+]
 
 
 @needs_proc
@@ -370,7 +374,7 @@ def third(**options):
     return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
 
 
-@pytest.mark.parametrize("pool", [None, 2])
+@pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
     posterior = third(pool=pool)
     sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)

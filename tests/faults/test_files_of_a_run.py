@@ -20,6 +20,7 @@ from samplers import SMCSampler
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
+from tests.covering import covering
 from tests.faults.kills import end, evaluated_again, fork
 from tests.faults.resumable_run import NDIM, STEPS, N, go_on, make, outcome, points_of
 
@@ -70,8 +71,9 @@ def flipped(data, share):
     return bytes(changed)
 
 
-@pytest.mark.parametrize("chain", [name for name in CHAINS if name != "a bit"])
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize(
+    ("chain", "share"), covering([name for name in CHAINS if name != "a bit"], [0.02, 0.2, 0.5, 0.9, 1.0], strength=1)
+)
 def test_a_record_that_is_cut_anywhere(whole, chain, share, tmp_path):
     kind, path, expected = whole
     path = copied(path, tmp_path)
@@ -108,7 +110,7 @@ def points_in(data):
     return points
 
 
-@pytest.mark.parametrize("chain", ["kept", "deleted"])
+@pytest.mark.parametrize("chain", ["kept", pytest.param("deleted", marks=pytest.mark.slow)])
 def test_a_record_with_a_changed_byte(whole, chain, tmp_path, caplog):
     """In the name of the format: refused. Elsewhere: what is behind the byte is evaluated again."""
     kind, source, expected = whole

@@ -91,10 +91,10 @@ def kernel(pytestconfig):
 @pytest.mark.parametrize(
     ("name", "place", "in_file"),
     [
-        ("SMCSampler", "annealing", False),
         ("SMCSampler", "at beta = 1", True),
-        ("TMCMCSampler", "annealing", True),
-        ("TMCMCSampler", "at beta = 1", False),
+        pytest.param("SMCSampler", "annealing", False, marks=pytest.mark.slow),
+        pytest.param("TMCMCSampler", "annealing", True, marks=pytest.mark.slow),
+        pytest.param("TMCMCSampler", "at beta = 1", False, marks=pytest.mark.slow),
     ],
 )
 def test_a_cell_that_was_interrupted_is_run_again(name, place, in_file, kernel, tmp_path):
@@ -149,6 +149,7 @@ print([np.array_equal(here, other) for other in (*found, alone)], here.sum())
 """
 
 
+@pytest.mark.slow
 def test_functions_of_cells_run_in_workers_with_the_values_of_the_notebook(kernel):
     """Also after a cell has changed a value; the workers are other processes."""
     assert kernel.reply(kernel.start(MODEL))["status"] == "ok"

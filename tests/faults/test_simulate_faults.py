@@ -36,7 +36,7 @@ def requested():
     return np.column_stack([random.uniform(0.5, 1.5, 300), random.uniform(-0.1, 1.0, 300)])
 
 
-@pytest.mark.parametrize("responses", [False, True])
+@pytest.mark.parametrize("responses", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
     path = tmp_path / "killed.sqlite"
     command = [sys.executable, "-c", PROGRAM, str(path), str(int(responses))]

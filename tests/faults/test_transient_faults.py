@@ -208,8 +208,15 @@ def test_a_function_that_is_stopped_is_run_again_with_a_longer_limit(tmp_path):
 # real faults ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pool", [None, 1], ids=["isolated", "pool"])
-@pytest.mark.parametrize("what", ["CRASHES", "LEAVES"])
+@pytest.mark.parametrize(
+    ("what", "pool"),
+    [
+        pytest.param("CRASHES", None, id="isolated, crashes"),
+        pytest.param("LEAVES", 1, id="pool, leaves"),
+        pytest.param("LEAVES", None, id="isolated, leaves", marks=pytest.mark.slow),
+        pytest.param("CRASHES", 1, id="pool, crashes", marks=pytest.mark.slow),
+    ],
+)
 def test_a_worker_that_dies_is_not_an_answer(what, pool, tmp_path):
     model = (
         FunctionModel(bad.treacherous, NAMES, CHANNELS, DT, N_STEPS, isolated=True) if pool is None else Treacherous()

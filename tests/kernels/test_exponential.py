@@ -48,6 +48,7 @@ def test_entries_that_are_not_finite_give_nan(bad):
     assert np.isnan(exponential(a)).all()
 
 
+@pytest.mark.slow
 def test_response_of_the_bridge_has_the_same_bits_on_any_number_of_blas_threads():
     """Executors limit the threads of their workers. With scipy's expm the state matrices differed by 1e-15 here."""
     code = (

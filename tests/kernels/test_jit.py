@@ -41,6 +41,7 @@ def python(code, *arguments, cwd=SOURCES.parents[1], **environment):
 # --- the cache ---
 
 
+@pytest.mark.slow
 def test_hash_names_the_folder_of_the_machine_code(tmp_path):
     code = "from fe_likelihoods.kernels import jit; print(jit.KERNEL_HASH)"
     found = python(code, FE_LIKELIHOODS_CACHE=str(tmp_path)).strip()
@@ -105,12 +106,14 @@ def messages(copied, code, cache, **environment):
     return done.stderr.splitlines()
 
 
+@pytest.mark.slow
 def test_a_compilation_announces_itself_once_and_only_if_it_is_made(copied, tmp_path):
     (line,) = messages(copied, CALL_TWICE, tmp_path / "cache")
     assert line.startswith("Compiling the kernels, once: ") and str(tmp_path / "cache") in line
     assert messages(copied, CALL_TWICE, tmp_path / "cache") == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork")
 @pytest.mark.parametrize(("code", "mark"), [(IN_A_WORKER, {}), (CALL_TWICE, {"FE_LIKELIHOODS_RUN_1": "1"})])
 def test_workers_announce_no_compilation(copied, tmp_path, code, mark):
@@ -130,6 +133,7 @@ def start(copied, code, cache):
     return subprocess.Popen([sys.executable, "-c", code], env=os.environ | settings, text=True, **pipes)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jit.flock is None, reason="NO flock")
 def test_processes_that_start_together_compile_once(copied, tmp_path):
     both = [start(copied, CALL_AT_A_SIGN, tmp_path / "cache") for _ in range(2)]
@@ -151,6 +155,7 @@ def test_processes_that_start_together_compile_once(copied, tmp_path):
     assert sorted(results) == [("0\n", ""), ("1\n", "")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["content", "name", "new file"])
 def test_any_change_of_the_sources_changes_the_hash(copied, change):
     before = result_of_hash(copied)
@@ -168,6 +173,7 @@ def result_of_hash(copied):
     return python("from kernels.jit import KERNEL_HASH; print(KERNEL_HASH)", cwd=copied.parent).strip()
 
 
+@pytest.mark.slow
 def test_a_cache_folder_that_cannot_be_written_is_skipped(tmp_path):
     """Where a file is in the place of a folder, the next candidate is used."""
     blocked = tmp_path / "blocked"
@@ -183,6 +189,7 @@ def folder_of(**environment):
     return python(code, **{name: str(value) for name, value in environment.items()}).strip()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="NO getuid: files have no modes")
 def test_the_folder_is_private(tmp_path):
     """Others could put a pickle into another one, which numba would load."""
@@ -306,6 +313,7 @@ def short_subset() -> dict[str, np.ndarray]:
     return out
 
 
+@pytest.mark.slow
 def test_pure_python_gives_the_same_results(tmp_path):
     code = (
         "import sys, numba, numpy; assert numba.config.DISABLE_JIT; "

@@ -120,12 +120,12 @@ def test_values_are_those_of_single_points_on_every_pool(make, tmp_path):
 
 
 @pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
-def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path):
+def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path, shared_pool):
     """Two workers, of which one runs the first point for as long as the test wants."""
     path = tmp_path / "cache.sqlite"
     x = np.concatenate([LONG[:1], SHORT])
     expected = posterior_of(Treacherous())(x)
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
         thetas, key = x[:, :2], posterior.likelihood.simulator.simulation_key
         stored = SimulationCache(path)
@@ -152,9 +152,9 @@ def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path):
         assert stored.are_stored([key], thetas).all()
 
 
-def test_items_that_kill_their_process(tmp_path):
+def test_items_that_kill_their_process(tmp_path, shared_pool):
     x = np.column_stack([[bad.KILLED + 0.5, 0.5, bad.CRASHES + 0.5], [0.1] * 3, [0.5] * 3])
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         posterior = posterior_of(Treacherous(), top=20.0, pool=pool)
         with posterior.evaluation_queue() as queue:
             values = collect(queue, queue.submit(x))
@@ -165,9 +165,9 @@ def test_items_that_kill_their_process(tmp_path):
             assert np.isfinite(collect(queue, queue.submit(x[:1]))).all()
 
 
-def test_points_come_back_while_others_are_submitted(tmp_path):
+def test_points_come_back_while_others_are_submitted(tmp_path, shared_pool):
     """New points go to the free worker, and duplicates of a running point are simulated once."""
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         posterior = posterior_of(Gated(tmp_path), pool=pool)
         with posterior.evaluation_queue() as queue:
             (long,) = queue.submit(LONG[:1])
@@ -291,9 +291,9 @@ def test_a_model_that_has_changed_ends_the_run(monkeypatch):
                     queue.collect()
 
 
-def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path):
+def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared_pool):
     path = tmp_path / "cache.sqlite"
-    with LocalPool(1) as pool:
+    with shared_pool(1) as pool:
         posterior = posterior_of(Gated(tmp_path), pool=pool, cache=path)
         queue = posterior.evaluation_queue()
         queue.submit(np.concatenate([LONG[:1], SHORT]))
@@ -371,7 +371,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("kind", ["queue", "call"])
+@pytest.mark.parametrize("kind", ["queue", pytest.param("call", marks=pytest.mark.slow)])
 def test_a_killed_process_loses_what_runs_and_the_last_second(kind, tmp_path):
     """SIGKILL after the short runs are stored: the next process simulates the long one only."""
     script = tmp_path / "script.py"

@@ -362,17 +362,15 @@ def test_known_failures_are_compared_with_all_known_simulations(source, path, th
     assert second.simulator.statistics(new).shape == (40, 2)
 
 
-def test_a_pool_changes_nothing(thetas):
+def test_a_pool_changes_nothing(thetas, shared_pool):
     expected = likelihood_of(Line()).simulate(thetas)
-    likelihood = likelihood_of(Line(), pool=2)
-    try:
+    with shared_pool(2) as pool:
+        likelihood = likelihood_of(Line(), pool=pool)
         batch = likelihood.simulate(thetas)
         np.testing.assert_array_equal(batch.response, expected.response)
         assert batch.reasons == expected.reasons
         assert likelihood.model.runs == 0  # all in the workers
         assert_same_log_likelihood(likelihood, thetas, 40)
-    finally:
-        likelihood.simulator.pool.close()
 
 
 def test_known_statistics_are_recalled_without_a_simulation(thetas):
@@ -402,9 +400,11 @@ def test_a_simulator_stands_on_its_own(thetas):
     assert simulator.report()["simulations"] == model.runs == len(thetas)
 
 
-@pytest.mark.parametrize("pool", [None, 2, "map"])
-def test_start_and_wait_are_one_way_with_and_without_a_pool(pool, thetas, path):
-    simulator = likelihood_of(Line(), pool=MapOnly() if pool == "map" else pool, cache=path).simulator
+@pytest.mark.parametrize("kind", ["no pool", "pool", "map only"])
+def test_start_and_wait_are_one_way_with_and_without_a_pool(kind, thetas, path, shared_pool):
+    with shared_pool(2) as pool:
+        chosen = {"no pool": None, "pool": pool, "map only": MapOnly()}[kind]
+        simulator = likelihood_of(Line(), pool=chosen, cache=path).simulator
     arrived = SimpleQueue()
     waiting = simulator.start([theta.tobytes() for theta in thetas], True, arrived)
     results = {}

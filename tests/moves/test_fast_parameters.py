@@ -89,7 +89,9 @@ MODES = {
 # ---------------------------------------------------------------- the right posterior
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode", [pytest.param(m, marks=() if m in ("recycling", "moves", "tmcmc") else pytest.mark.slow) for m in MODES]
+)
 def test_conjugate_sample(mode, seed):
     posterior = NormalInverseGamma()
     samplers = runs(posterior, seed, **MODES[mode])
@@ -236,7 +238,7 @@ def oscillator(kind=Posterior, memory=100_000):
     return kind(FELikelihood(model, Measurements(model.channels, model.dt, values), memory_rows=memory), prior)
 
 
-@pytest.mark.parametrize("mode", ["recycling", "moves", "tmcmc"])
+@pytest.mark.parametrize("mode", ["recycling", *(pytest.param(m, marks=pytest.mark.slow) for m in ("moves", "tmcmc"))])
 def test_only_new_structural_parameters_are_simulated(mode, seed):
     posterior = oscillator(Recorded)
     kwargs = dict(MODES[mode])

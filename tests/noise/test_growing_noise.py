@@ -149,6 +149,7 @@ def test_the_density_integrates_to_one_over_the_measurements():
     assert area * np.sum(density) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_calibrated_parameters_have_uniform_ranks(rng):
     """Simulation-based calibration on a grid, with exact posteriors; without the growth the share is too small."""
     specimen, repeats = Specimen(cycles(0.04)), 100
@@ -172,6 +173,7 @@ def test_calibrated_parameters_have_uniform_ranks(rng):
     assert stats.kstest(ranks[0.0][:, 1], "uniform").pvalue < 1e-6
 
 
+@pytest.mark.slow
 def test_predictions_of_a_larger_test_cover_errors_that_grow(rng):
     """Twins whose errors grow, calibrated up to a drift of 1 %, of a specimen twice as high up to 4 %."""
     calibrated = Specimen(cycles(0.01))

@@ -82,7 +82,7 @@ def modulated(local):
 SHARE, SIGMA = {"share_acceleration": HalfNormal(0.5)}, {"sigma_acceleration": HalfNormal(3.0)}
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_response_that_is_too_large_under_shares_of_itself_is_said(seed):
     rng = np.random.default_rng([3, seed])
     ground = earthquake(rng)
@@ -102,6 +102,7 @@ def test_a_response_that_is_too_large_under_shares_of_itself_is_said(seed):
         assert fitted < 0.8 * rrmse and smaller < 0.9 * rrmse
 
 
+@pytest.mark.slow
 def test_right_runs_of_an_oscillator_give_no_alarm():
     alarms = []
     for seed in range(20):
@@ -163,6 +164,7 @@ def band_shares(residuals, response):
     return [np.sqrt(np.mean(errors[band] ** 2) / np.mean(coefficients[band] ** 2)) for band in (low, ~low)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ("modulated", "bands"))
 def test_alarms_of_whitened_residuals_in_100_runs(kind):
     """None of 100 runs that are right; most of 100 whose errors have another correlation."""
@@ -232,6 +234,7 @@ def test_noise_in_si_units_is_compared_with_the_peak_of_the_response_without_it(
     assert np.median(predicted.values) > 0.5 * largest, "the predicted peak is that of the noise"
 
 
+@pytest.mark.slow
 def test_a_response_below_the_noise_of_its_sensor_is_not_said_to_be_too_large():
     """The best multiple of such a response is anything by chance, but fits hardly better."""
     channels = (Channel("weak", "displacement", "mm"), TOP)

@@ -48,6 +48,7 @@ def test_a_linear_quantity_is_known_from_thirty_simulations(sample):
     assert "30 samples" in str(found) and not found.remarks
 
 
+@pytest.mark.slow
 def test_stated_errors_hold_for_a_curved_quantity(sample):
     model = model_of(lambda theta: np.exp(theta[0] + theta[1]) + theta[2] ** 2)
     exact = np.exp(3.0 + 0.5 * (SD[:2] ** 2).sum()) + MEAN[2] ** 2 + SD[2] ** 2
@@ -63,6 +64,7 @@ def test_stated_errors_hold_for_a_curved_quantity(sample):
     assert np.mean(np.abs(scores) < 2.0) > 0.9
 
 
+@pytest.mark.slow
 def test_a_quantity_without_structure_gains_nothing_and_says_so(sample):
     model = model_of(lambda theta: hash_uniform(theta[None])[0])
     found = [propagate_few(model, sample, quantity=first, seed=seed, progress=False) for seed in range(20)]

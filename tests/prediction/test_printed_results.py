@@ -142,6 +142,7 @@ def test_ratios():
     assert float(cells(text, 2)[2]) == pytest.approx(line.quantile(0.5, 0.1), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_events_that_were_left_out():
     found = leave_one_out(hierarchy_of(ALIKE, n=500))
     text = str(found)

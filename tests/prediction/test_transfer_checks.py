@@ -209,6 +209,7 @@ def test_the_check_is_one_simulation_that_is_counted_and_taken_from_the_cache(rn
     assert third.report()["simulations"] == 0
 
 
+@pytest.mark.slow
 def test_false_alarms_of_100_runs_that_are_right():
     """Records of the strength of the calibration, white errors: no alarm of the residuals, 1 % have other peaks."""
     of_residuals, of_peaks = 0, 0
@@ -224,6 +225,7 @@ def test_false_alarms_of_100_runs_that_are_right():
     assert of_residuals == 0 and of_peaks <= 3
 
 
+@pytest.mark.slow
 def test_missed_alarms_of_100_runs_that_are_wrong():
     """Three times the strength, and errors with a correlation of 0.8."""
     missed = np.zeros(2)

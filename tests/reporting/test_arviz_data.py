@@ -2,9 +2,10 @@
 
 import json
 import warnings
+from importlib.metadata import version
 
 import emcee
-import matplotlib
+import lazy_loader
 import numpy as np
 import pytest
 from scipy import stats
@@ -14,9 +15,9 @@ from samplers import SMCSampler, TMCMCSampler, to_arviz
 from tests.contract.targets import Gaussian
 from tests.likelihood.linear_gaussian import likelihood_of
 
-arviz = pytest.importorskip("arviz")
+arviz = lazy_loader.load("arviz")  # its import takes seconds
 SIGMA, MEAN, SD = 0.5, 0.8, 1.5
-GENERATION = int(arviz.__version__.split(".")[0])
+GENERATION = int(version("arviz").split(".")[0])
 
 
 @pytest.fixture(scope="module")
@@ -218,8 +219,9 @@ def oscillator():
 
 
 def test_labels_and_figures(oscillator, tmp_path):
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+
+    plt.switch_backend("Agg")
 
     data = to_arviz([run(oscillator, seed, 60, 2) for seed in (1, 2)], oscillator, draws=80)
     assert data["posterior"]["sigma_top"].attrs["long_name"] == "sigma_top [mm]"

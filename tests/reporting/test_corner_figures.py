@@ -246,6 +246,7 @@ def test_points_or_contours_are_chosen_per_sampler(rng):
     assert "fewer than 150 distinct" in figure.legends[0].get_title().get_text()
 
 
+@pytest.mark.slow
 def test_long_names_do_not_cover_each_other(rng):
     names = [f"a_parameter_with_a_long_name_{i}" for i in range(13)]
     figure = plot_corner(rng.normal(size=(300, 13)), labels=names)

@@ -47,7 +47,8 @@ class SlowAtFirst:
         return 0.01 * np.array([theta[0], theta[1], theta[0] * theta[1]])[None]
 
 
-@pytest.mark.parametrize("slow", [4, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("slow", [4, 5])
 def test_the_start_of_the_workers_is_not_timed(slow, tmp_path):
     channels = (Channel("top", "displacement", "mm"),)
     function = SlowAtFirst(tmp_path, slow, 1.5)

@@ -149,6 +149,7 @@ def _prior():
     return known | {name: HalfNormal(1.0) for name in ("sigma_acceleration", "sigma_displacement")}
 
 
+@pytest.mark.slow
 def test_the_lag_of_a_recorder_is_found_as_a_parameter():
     """The ends are 0.1 s late; with their lags as parameters the fit is right, and nothing speaks against it."""
     model, measured = deck(late=5)

@@ -75,7 +75,7 @@ def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise,
         assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
 
 
-@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("joint", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_coarse_step_limits_the_result_of_a_run(joint):
     """Also where only one of two data sets is computed with the coarse step."""
 

@@ -313,6 +313,7 @@ def browse(address, folder, *options) -> subprocess.CompletedProcess:
     return subprocess.run([BROWSER, *common, *options, address], capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
 def test_a_browser_shows_the_report_on_a_telephone_a_desk_and_paper(page, tmp_path):
     path = page.path
@@ -334,6 +335,7 @@ def test_a_browser_shows_the_report_on_a_telephone_a_desk_and_paper(page, tmp_pa
     assert paper.read_bytes().startswith(b"%PDF") and len(re.findall(rb"/Type\s*/Page\b", paper.read_bytes())) >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="NO BROWSER: install chromium to look at the report as a reader does")
 def test_control_the_browser_tells_of_errors(tmp_path):
     bad = tmp_path / "bad.html"

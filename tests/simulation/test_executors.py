@@ -72,7 +72,13 @@ def pools():
     yield "another object", Recorder
 
 
-@pytest.mark.parametrize("make", [pytest.param(make, id=name) for name, make in pools()])
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(make, id=name, marks=pytest.mark.slow if name in ("one process", "executor") else ())
+        for name, make in pools()
+    ],
+)
 def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
     measured = rng.normal(size=(2, 300))
     expected = misfit_batch(oscillator, thetas, measured)
@@ -168,8 +174,8 @@ def test_invalid_pools_are_refused(pool):
         posterior_of(Treacherous(), pool=pool)
 
 
-def test_model_is_sent_once_to_each_process():
-    with LocalPool(2) as pool:
+def test_model_is_sent_once_to_each_process(shared_pool):
+    with shared_pool(2) as pool:
         for _ in range(3):
             batch = simulate_batch(Large(), np.tile([0.2, 0.3], (20, 1)), pool)
             assert set(batch.response[:, 0, 0]) == {1.0}
@@ -263,8 +269,8 @@ def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
     assert posterior.report()["simulations"] == 0
 
 
-def test_local_pool_maps_any_function_and_raises_its_exceptions():
-    with LocalPool(2) as pool:
+def test_local_pool_maps_any_function_and_raises_its_exceptions(shared_pool):
+    with shared_pool(2) as pool:
         assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
         assert pool.map(abs, []) == []
         with pytest.raises(TypeError, match="bad operand"):
@@ -297,12 +303,12 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
     posterior.likelihood.simulator.pool.close()
 
 
-def test_as_the_pool_of_a_sampler(seed):
+def test_as_the_pool_of_a_sampler(seed, shared_pool):
     """The chain equals that of a run without a pool."""
     posterior = posterior_of(Treacherous())
     start = posterior.sample_prior(10, seed)
     chains = []
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         for workers in (None, pool):
             sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, pool=workers)
             sampler.random_state = np.random.RandomState(seed).get_state()
@@ -329,7 +335,11 @@ def main():
 
 
 @pytest.mark.parametrize(
-    "end", ['if __name__ == "__main__":\n    main()\n', "main()\n"], ids=["guarded", "not guarded"]
+    "end",
+    [
+        pytest.param('if __name__ == "__main__":\n    main()\n', id="guarded", marks=pytest.mark.slow),
+        pytest.param("main()\n", id="not guarded"),
+    ],
 )
 def test_models_defined_in_a_script(end, tmp_path):
     """Workers do not run the script, so it needs no guard."""
@@ -340,6 +350,7 @@ def test_models_defined_in_a_script(end, tmp_path):
     assert " ".join(run.stdout.split()) == "run True True", run.stderr
 
 
+@pytest.mark.slow
 def test_models_of_a_prompt():
     code = "import numpy as np\n" + SCRIPT + "main()\n"
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -348,7 +359,7 @@ def test_models_of_a_prompt():
 
 
 @pytest.mark.parametrize("system", ["column", "bridge"])
-def test_compiled_models_go_through_a_pool_to_the_same_bits(system):
+def test_compiled_models_go_through_a_pool_to_the_same_bits(system, shared_pool):
     """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
     if system == "column":
         posterior = problems.bridge_column(duration=2.0)
@@ -358,7 +369,7 @@ def test_compiled_models_go_through_a_pool_to_the_same_bits(system):
         posterior = problems.isolated_bridge(record=record, step=1e-3)
         thetas = posterior.sample_prior(6, 1)[:, :10]
     likelihood = posterior.likelihood
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)
         np.testing.assert_array_equal(pooled.misfit(thetas), likelihood.misfit(thetas))
         assert pooled.simulations == 6

@@ -40,9 +40,13 @@ def wait_until(condition):
     raise AssertionError("it does not happen")
 
 
-@pytest.mark.parametrize("make", [lambda: LocalPool(2), lambda: ThreadPoolExecutor(2)], ids=["local", "threads"])
-def test_whichever_ends_first_comes_first(make, function, tmp_path):
-    executor = as_executor(pool := make())
+@pytest.mark.parametrize("kind", ["local", "threads"])
+def test_whichever_ends_first_comes_first(kind, function, tmp_path, shared_pool):
+    with shared_pool(2) if kind == "local" else ThreadPoolExecutor(2) as pool:
+        check_order_of_arrival(as_executor(pool), function, tmp_path)
+
+
+def check_order_of_arrival(executor, function, tmp_path):
     futures = executor.submit_all(function, [LONG, *SHORT])
     arrivals = as_completed(futures, timeout=SECONDS)
     assert {next(arrivals) for _ in SHORT} == set(futures[1:])
@@ -53,12 +57,11 @@ def test_whichever_ends_first_comes_first(make, function, tmp_path):
         response, reason = future.result()
         np.testing.assert_array_equal(response, line(theta))
         assert reason == ""
-    getattr(pool, "shutdown", pool.__exit__)()
 
 
-def test_items_that_kill_their_process_end_as_with_map(tmp_path):
+def test_items_that_kill_their_process_end_as_with_map(tmp_path, shared_pool):
     thetas = [np.array([what + 0.5, 0.1]) for what in (bad.FINE, bad.CRASHES, bad.FINE, bad.LEAVES, bad.RAISES)]
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         expected = simulate_batch(Treacherous(), np.array(thetas), pool)
         outcomes = [future.result() for future in pool.submit_all(sent_simulation(Treacherous()), thetas)]
         assert [reason for _, reason in outcomes] == expected.reasons
@@ -68,8 +71,8 @@ def test_items_that_kill_their_process_end_as_with_map(tmp_path):
         assert pool.submit(again, np.array([bad.KILLED + 0.5, 0.1])).result()[1] == ""
 
 
-def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(tmp_path):
-    with LocalPool(2) as pool:
+def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(tmp_path, shared_pool):
+    with shared_pool(2) as pool:
         absent = pool.submit_all(sent_simulation(Absent()), SHORT)
         fine = pool.submit_all(sent_simulation(Treacherous()), SHORT)
         for future in absent:
@@ -84,24 +87,24 @@ def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(tmp_pat
         assert unpicklable[1].result() == 1
 
 
-def test_the_function_is_sent_once_to_each_process():
+def test_the_function_is_sent_once_to_each_process(shared_pool):
     function = sent_simulation(Large())
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         futures = [pool.submit(function, theta) for theta in SHORT * 5]
         assert {future.result()[0][0, 0] for future in futures} == {1.0}
 
 
-def test_a_free_process_does_not_wait_for_one_that_loads(tmp_path):
+def test_a_free_process_does_not_wait_for_one_that_loads(tmp_path, shared_pool):
     function = LoadsOnce(tmp_path)
-    with LocalPool(2) as pool:
+    with shared_pool(2) as pool:
         assert [future.result(SECONDS) for future in pool.submit_all(function, [1, 2])] == [1, 2]
         assert pool.submit(function, 3).result(SECONDS) == 3
         (tmp_path / "go").touch()
 
 
-def test_map_goes_before_items_that_wait(function, tmp_path):
+def test_map_goes_before_items_that_wait(function, tmp_path, shared_pool):
     """A verification does not wait for a batch of long runs."""
-    with LocalPool(1) as pool:
+    with shared_pool(1) as pool:
         first = pool.submit_all(function, [SHORT[0], LONG])
         first[0].result()
         waiting = pool.submit_all(function, [LONG + 0.01])
@@ -128,8 +131,8 @@ def test_items_are_given_up(function, tmp_path):
     assert not (tmp_path / f"started {SHORT[0][0]!r}").exists()
 
 
-def test_cancelled_items_are_not_run(function, tmp_path):
-    with LocalPool(1) as pool:
+def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
+    with shared_pool(1) as pool:
         futures = pool.submit_all(function, [LONG, *SHORT])
         wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists())
         assert [future.cancel() for future in futures] == [False, True, True, True, True]
@@ -147,8 +150,8 @@ def test_cancelled_items_are_not_run(function, tmp_path):
         assert isinstance(first, Future)
 
 
-def test_several_threads_share_a_pool():
-    with LocalPool(2) as pool, ThreadPoolExecutor(3) as threads:
+def test_several_threads_share_a_pool(shared_pool):
+    with shared_pool(2) as pool, ThreadPoolExecutor(3) as threads:
         results = list(threads.map(lambda k: pool.map(abs, range(-5 * k, 0)), range(1, 4)))
     assert results == [list(range(5 * k, 0, -1)) for k in range(1, 4)]
 

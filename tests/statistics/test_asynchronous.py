@@ -66,6 +66,7 @@ def test_a_run_of_failures_is_stopped():
         sampler.run_mcmc(None, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["one pool", "two pools"])
 def test_a_joint_likelihood_has_its_evidence(kind, rng, tmp_path):
     """Two tests that share a parameter; the parts have one pool of processes, or one of threads beside it."""
@@ -113,6 +114,7 @@ def deviations_with_a_guide(seeds=30):
     return numbers.mean(axis=0) / (numbers.std(axis=0, ddof=1) / np.sqrt(seeds))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 @pytest.mark.parametrize("parts", [False, True], ids=["complete rounds", "parts of rounds"])
 def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
@@ -121,6 +123,7 @@ def test_rounds_of_a_guide_do_not_prefer_short_runs(monkeypatch, parts):
     assert np.all(np.abs(deviations_with_a_guide()) < 3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_control_rounds_of_early_arrivals_prefer_short_runs(monkeypatch):
     """Negative control: rounds are judged when 60 % of their draws have arrived, and consist of these."""

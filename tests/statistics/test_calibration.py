@@ -71,6 +71,7 @@ def p_values(name, seed, repeats, nwalkers, noise=NOISE):
     return np.array([stats.chisquare(count).pvalue for count in counts])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SMC", "TMCMC"])
 def test_ranks_are_uniform(name, seed):
     assert np.min(p_values(name, seed, repeats=60, nwalkers=80)) > 1e-4
@@ -82,6 +83,7 @@ def test_ranks_are_uniform_over_many_runs(name, seed):
     assert np.min(p_values(name, seed, repeats=1000, nwalkers=100)) > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_wrong_noise_is_caught(factor, seed):
     """Negative control: a likelihood that believes the data too much, or too little."""

@@ -66,6 +66,7 @@ def outcomes(posterior, guide, limit, runs=RUNS):
     return np.array(deviations), np.array(statuses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limit", [200, pytest.param(500, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.slow)]
 )
@@ -84,6 +85,7 @@ def test_two_standard_errors_cover(case, limit):
     assert np.all(np.abs(deviations[statuses == "converged"]) < 4.5)
 
 
+@pytest.mark.slow
 def test_control_a_guide_that_misses_a_mode_is_wrong():
     """Negative control: the criterion of the test above fails. The guide claims that it has no concerns."""
     deviations, statuses = outcomes(*two_modes(1, FixedGuide), 500, runs=5)
@@ -100,6 +102,7 @@ def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
     assert np.all(statuses == "usable")
 
 
+@pytest.mark.slow
 def test_a_share_of_the_prior_finds_a_missing_mode_or_shows_that_something_is_missing():
     """With 30 % of the draws from the prior and a mode that holds 13 % of it, some draws reach the mode."""
     posterior, guide = two_modes(1, LearningGuide, width=0.08, prior_share=0.3)

@@ -11,6 +11,7 @@ from tests.statistics.test_mean_error import TwoModes, scores
 from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nwalkers", [pytest.param(100, marks=pytest.mark.slow), 400])
 def test_two_modes(nwalkers, seed):
     posterior = TwoModes()
@@ -30,6 +31,7 @@ def test_truncated_prior_edges(seed):
     assert within(evidence_deviation(samplers, log_evidence), samplers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("settings", "biased"), [({}, False), ({"burn_in": 0, "moves": RandomWalkMove(0.7)}, True)])
 def test_burn_in_removes_the_bias_of_chains_from_leaders(settings, biased, seed):
     """Negative control: without burn-in, a random walk has a bias that many points do not remove."""
@@ -50,6 +52,7 @@ def test_stated_errors_of_two_modes_cover(seed):
     assert np.all((0.5 < ratio) & (ratio < 1.6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("burn_in", "right"), [(4, True), (0, False)])
 def test_few_walkers_for_many_parameters(burn_in, right, seed):
     """Chains alone leave copies, of which the next fit sees too few distinct points; the control makes no sweeps."""

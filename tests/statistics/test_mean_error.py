@@ -93,6 +93,7 @@ def scores_of_forty_runs(mode, target, nwalkers, seed):
     return of_means, *np.array([[s.log_evidence, s.log_evidence_error] for s in samplers]).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode, target, nwalkers, low",
     [
@@ -111,6 +112,7 @@ def test_mean_error_covers(mode, target, nwalkers, low, seed):
     assert np.all((low < ratio) & (ratio < 1.6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
 def test_evidence_error_covers(mode, seed):
     """Two standard errors cover the truth in nearly 95 % of the same runs, and are not idly wide."""
@@ -121,6 +123,7 @@ def test_evidence_error_covers(mode, seed):
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 def test_control_walkers_counted_as_independent_give_too_small_an_error(seed):
     """Negative control: moves too short to separate copies. The error accounts for it only with the founders."""

@@ -78,6 +78,7 @@ def test_without_components_for_basins_it_is_lost(monkeypatch):
     assert share < 0.05 and sampler.log_evidence == pytest.approx(np.log(0.5), abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
 def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost, monkeypatch):
     """Recycling finds both modes, is not trusted, and the stretch moves after it find one."""
@@ -89,6 +90,7 @@ def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, los
     assert not lost or sampler.verdict.status == "not usable"
 
 
+@pytest.mark.slow
 def test_moves_keep_the_narrow_mode():
     posterior = TwoModes(2)
     sampler, share = finish(TMCMCSampler(500, NDIM, posterior, vectorize=True, seed=2), posterior)

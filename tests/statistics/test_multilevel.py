@@ -42,6 +42,7 @@ def test_a_close_model_saves_evaluations(seed):
     assert np.mean([sampler.evaluations for sampler in samplers]) < alone.evaluations
 
 
+@pytest.mark.slow
 def test_a_model_far_away_changes_no_result(seed):
     assert is_right(two_runs(FINE, FAR, seed, count=3))
 

@@ -24,7 +24,9 @@ MODES = {
 EXACT = [mode for mode in MODES if mode != "published tmcmc"]  # that one collapses
 
 
-both_ways_of_annealing = pytest.mark.parametrize("recycle", [True, False], ids=["recycling", "moves"])
+recycling, moves = pytest.param(True, id="recycling"), pytest.param(False, id="moves")
+slow_recycling = pytest.param(True, id="recycling", marks=pytest.mark.slow)
+slow_moves = pytest.param(False, id="moves", marks=pytest.mark.slow)
 
 
 def runs(posterior, seed, count=8, nwalkers=200, nsteps=4, Sampler=SMCSampler, **kwargs):
@@ -100,7 +102,7 @@ def test_a_wrong_kernel_is_caught(seed):
     assert not within(spread, samplers)
 
 
-@both_ways_of_annealing
+@pytest.mark.parametrize("recycle", [recycling, slow_moves])
 def test_two_modes(recycle, seed):
     """Weights 1:2, ten standard deviations apart."""
     centres, sd, weights = np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.5]]), 0.1, np.array([1.0, 2.0]) / 3
@@ -116,7 +118,7 @@ def test_two_modes(recycle, seed):
     assert within(evidence_deviation(samplers, -3 * np.log(3)), samplers)
 
 
-@both_ways_of_annealing
+@pytest.mark.parametrize("recycle", [slow_recycling, moves])
 def test_edges_of_a_truncated_prior(recycle, seed):
     """The posterior is a half-normal with its mode on the edge, times an exponential that piles up at another."""
 
@@ -154,7 +156,7 @@ def test_flat_likelihood(seed):
     assert within(deviations(samplers, [0.5, 1.5]), samplers)
 
 
-@both_ways_of_annealing
+@pytest.mark.parametrize("recycle", [recycling, moves])
 def test_very_informative_likelihood(recycle, seed):
     """The posterior is a hundred thousand times narrower than the prior."""
     posterior = Gaussian(2, sd=1e-5)
@@ -163,7 +165,7 @@ def test_very_informative_likelihood(recycle, seed):
     assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
 
 
-@both_ways_of_annealing
+@pytest.mark.parametrize("recycle", [slow_recycling, moves])
 def test_dead_regions(recycle, seed):
     """Where the model fails the likelihood is zero: 70 % of the box."""
     posterior = Box([0, 0], [1, 1], lambda x: np.where(x[..., 0] > 0.3, -np.inf, -10.0 * x[..., 1]))
@@ -217,7 +219,9 @@ def test_one_parameter_in_another_unit(seed):
         assert np.allclose(plain.get_chain() * np.array([1, unit, 1]), scaled.get_chain(), rtol=1e-8)
 
 
-@pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
+@pytest.mark.parametrize(
+    "mode", ["default", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("moves", "literal", "tmcmc"))]
+)
 def test_order_of_parameters_changes_no_answer(mode, seed):
     """Another order gives other draws; mean and evidence agree within the errors over runs."""
 

@@ -43,6 +43,7 @@ healthy = pytest.mark.filterwarnings(
 )
 
 
+@pytest.mark.slow
 @healthy
 @pytest.mark.parametrize(
     "preset, stages, evaluations",
@@ -63,6 +64,7 @@ def test_readings_of_table_1(column, preset, stages, evaluations, seed):
     assert np.max(np.abs(z)) < 4 * np.sqrt(4 / 1000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["T1", "T2", "T3", "T4"])
 def test_published_tmcmc_fails_with_a_warning(targets, name, seed):
     target = targets[name]
@@ -87,6 +89,7 @@ DEFAULTS = {
 }
 
 
+@pytest.mark.slow
 @healthy
 @pytest.mark.parametrize("case", DEFAULTS, ids=" ".join)
 def test_defaults_on_the_targets(targets, case, seed):

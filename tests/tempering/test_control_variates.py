@@ -30,6 +30,7 @@ def rounds_of(rng, n, number, shift=0.1, scale=1.1, posterior=POSTERIOR):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, number, shift, scale", [(30, 1, 0.1, 1.1), (30, 2, 0.3, 0.8)])
 def test_errors_cover(n, number, shift, scale, rng):
     scores = {name: [] for name in ("mean", "sd", "low", "median", "high", "log Z")}

@@ -350,7 +350,7 @@ def test_a_model_that_always_fails_is_noticed_soon(shift):
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("share", [0.2, 0.9])
+@pytest.mark.parametrize("share", [0.2, pytest.param(0.9, marks=pytest.mark.slow)])
 def test_a_model_that_often_fails_is_sampled(share):
     """Control: 20 % or 90 % of all points are impossible; the run ends with an answer, in each of ten cases."""
     for seed in range(10):

@@ -20,6 +20,7 @@ from fe_likelihoods import (
 )
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, Verdict
 from tests.contract.targets import Gaussian
+from tests.covering import covering
 from tests.tempering.guides import LearningGuide, SearchingGuide
 from tests.tempering.test_guided import N, laplace
 
@@ -74,8 +75,7 @@ def same(sampler, whole):
     return True
 
 
-@pytest.mark.parametrize("where", ["memory", "file", "new process"])
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(("path", "where"), covering(PATHS, ["new process", "memory", "file"], strength=1))
 def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
     """Several limits, one after the other; the last one is never reached."""
     whole = make(path, None)

@@ -22,7 +22,9 @@ def check(runs, exact):
     return scatter
 
 
-@pytest.mark.parametrize(("ndim", "probability"), [(2, 1e-3), (10, 1e-4), (100, 1e-6)])
+@pytest.mark.parametrize(
+    ("ndim", "probability"), [(2, 1e-3), (10, 1e-4), pytest.param(100, 1e-6, marks=pytest.mark.slow)]
+)
 def test_a_linear_limit_state_has_the_closed_form(ndim, probability):
     threshold = stats.norm.isf(probability)
     runs = [subset_simulation(linear, threshold, ndim, seed=seed) for seed in range(SEEDS)]
