@@ -248,23 +248,28 @@ def collects(ops, theta):
 
 
 def pushed_after_gravity(ops, theta):
-    """A static stage, tested and not handled if it has one iteration, before another that converges."""
+    """A static stage that is tested, and does not converge with one iteration, before one that converges."""
     prepare(ops, int(theta[0]))
-    ops.wipeAnalysis()
+    ops.remove("loadPattern", 1)
     ops.timeSeries("Linear", 2)
     ops.pattern("Plain", 2, 2)
     ops.load(2, 0.5)
+    ops.wipeAnalysis()
     ops.constraints("Plain")
     ops.numberer("Plain")
     ops.system("BandGeneral")
-    ops.algorithm("Newton")
     ops.test("NormDispIncr", 1e-8, int(theta[0]))
+    ops.algorithm("Newton")
     ops.integrator("LoadControl", 0.25)
     ops.analysis("Static")
     if ops.analyze(4) != 0:
         print("gravity failed")
     ops.loadConst("-time", 0.0)
     ops.test("NormDispIncr", 1e-8, 50)
+    ops.timeSeries("Linear", 3)
+    ops.pattern("Plain", 3, 3)
+    ops.load(2, 1.0)
+    ops.integrator("DisplacementControl", 2, 1, 0.001)
     response = np.zeros((1, HARD_N))
     for sample in range(HARD_N):
         if ops.analyze(1) != 0:
