@@ -19,6 +19,7 @@ from fe_likelihoods.simulation.local_pool import LocalPool
 from samplers import SMCSampler, TMCMCSampler
 from samplers.interrupts import deferred_interrupts
 from tests.contract.targets import Gaussian
+from tests.faults import guided_run
 
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
@@ -289,3 +290,32 @@ def test_a_posterior_in_the_processes_of_another_sampler_counts_sys_exit():
     with Pool(1) as pool:
         values = pool.map(likelihood_of(leave).misfit, [THETAS])[0]
     assert np.isnan(values).ravel().tolist() == [0, 0, 1, 0, 0, 0]
+
+
+@pytest.fixture(scope="module")
+def guided_evidence(tmp_path_factory):
+    """Log-evidence of a guided run without interrupt."""
+    whole, _ = guided_run.make(tmp_path_factory.mktemp("whole") / "cache.db")
+    whole.run_mcmc(None, 0)
+    return whole.log_evidence
+
+
+@pytest.mark.parametrize("act", [press_ctrl_c, leave])
+def test_a_guided_run_goes_on_after_an_interrupt_in_the_search(act, guided_evidence, tmp_path, monkeypatch):
+    signal.signal(signal.SIGINT, leaves)
+    simulate, calls = guided_run.Vibration.simulate, []
+
+    def interrupted(model, theta):
+        calls.append(theta)
+        if len(calls) == 8:
+            act()
+        return simulate(model, theta)
+
+    monkeypatch.setattr(guided_run.Vibration, "simulate", interrupted)
+    with pytest.raises(SystemExit if act is leave else KeyboardInterrupt):
+        guided_run.make(tmp_path / "cache.db")[0].run_mcmc(None, 0)
+    assert len(calls) == 8 and signal.getsignal(signal.SIGINT) is leaves
+    again, _ = guided_run.make(tmp_path / "cache.db")
+    again.run_mcmc(None, 0)
+    assert again.failure_count == 0 and any(np.array_equal(calls[7], theta) for theta in calls[8:])
+    assert again.log_evidence == guided_evidence
