@@ -32,12 +32,6 @@ def press_ctrl_c():
     signal.raise_signal(signal.SIGINT)
 
 
-def press_in_main_thread():
-    """As the terminal does while another thread works."""
-    os.kill(os.getpid(), signal.SIGINT)
-    threading.Event().wait(0.2)
-
-
 def interrupt():
     raise KeyboardInterrupt
 
@@ -144,16 +138,12 @@ def test_dask_jobqueue_sets_sys_exit_and_ctrl_c_still_ends_the_run(tmp_path):
 # pools ---------------------------------------------------------------------------------------------------------------
 
 
-def threads():
-    return ThreadPoolExecutor(2)
-
-
 POOLS = {
     "none": lambda: None,
     "LocalPool": lambda: LocalPool(1),
     "ProcessPoolExecutor": lambda: ProcessPoolExecutor(1),
     "multiprocessing": lambda: Pool(1),
-    "threads": threads,
+    "threads": lambda: ThreadPoolExecutor(2),
     "multiprocessing.pool.ThreadPool": lambda: ThreadPool(2),
 }
 IN_PROCESSES = ("LocalPool", "ProcessPoolExecutor", "multiprocessing")
@@ -201,7 +191,6 @@ class Once(Gaussian):
     """Does something in one call, which is no call of the samplers' first checks."""
 
     fingerprint = "of this target"
-    parent = os.getpid()
 
     def __init__(self, act, at=70):
         super().__init__(2)
