@@ -1,11 +1,61 @@
-"""Ctrl-C that waits for the end of a short piece of work."""
+"""Ctrl-C and SystemExit end a run, and no point that they have interrupted is stored.
+
+`fe_likelihoods.simulation.interrupts` has the same rules for simulations; the two packages do not import each other.
+"""
 
 import contextlib
+import functools
+import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
-__all__ = ["deferred_interrupts"]
+__all__ = [
+    "Ended",
+    "SentFunction",
+    "deferred_interrupts",
+    "interrupts_end_the_run",
+    "raise_if_it_ends_the_run",
+]
+
+
+class _RaisesKeyboardInterrupt:
+    """Handler of SIGINT that calls another one, and raises KeyboardInterrupt in place of what that one raises."""
+
+    def __init__(self, handler: Callable[..., Any]) -> None:
+        self.handler = handler
+
+    def __call__(self, *arguments: Any) -> None:
+        try:
+            self.handler(*arguments)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise KeyboardInterrupt from error
+
+
+@contextlib.contextmanager
+def interrupts_end_the_run() -> Iterator[None]:
+    """Context in which Ctrl-C raises KeyboardInterrupt in the main thread, whichever handler of SIGINT is set.
+
+    A library may have set a handler that raises something else: `dask_jobqueue` calls ``sys.exit``. In this context
+    such a handler is still called, but KeyboardInterrupt is raised in place of its exception. A handler that returns
+    has dealt with Ctrl-C, as one that notes it and lets the present step end: the run goes on. SIGINT that is ignored
+    stays ignored. The handler that was set before is put back at the end.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    raises = handler is signal.default_int_handler or isinstance(handler, _RaisesKeyboardInterrupt)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler) or raises:
+        yield
+        return
+    ours = _RaisesKeyboardInterrupt(handler)
+    signal.signal(signal.SIGINT, ours)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGINT) is ours:  # else the user's code has set another one meanwhile
+            signal.signal(signal.SIGINT, handler)
 
 
 @contextlib.contextmanager
@@ -23,3 +73,65 @@ def deferred_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
         if received:
             handler(*received[0])
+
+
+def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
+    """Raise KeyboardInterrupt or SystemExit if a function has raised it, even as the cause or context of `error`.
+
+    In a worker process, SystemExit is a failed evaluation. `before` is ``sys.exception()`` at the call of the function:
+    what is handled there is the context of its errors, but no cause of them.
+    """
+    causes = _causes(error, before)
+    for kind in (KeyboardInterrupt,) if _is_worker else (KeyboardInterrupt, SystemExit):
+        for cause in causes:
+            if isinstance(cause, kind):
+                raise cause
+
+
+def _causes(error: BaseException, before: BaseException | None) -> list[BaseException]:
+    """An exception with its causes and contexts, apart from what was handled `before`."""
+    found: list[BaseException] = []
+    left = [error]
+    while left:
+        each = left.pop()
+        if each is not before and all(each is not other for other in found):
+            found.append(each)
+            left += [other for other in (each.__cause__, each.__context__) if other is not None]
+    return found
+
+
+_is_worker = False
+
+
+@functools.cache
+def _this_process(pid: int) -> bytes:
+    """Random name of this process; a forked process has a different name."""
+    return os.urandom(16)
+
+
+class Ended(NamedTuple):
+    """Value of a function that was ended by KeyboardInterrupt or SystemExit in a pool: raised in the main thread."""
+
+    error: BaseException
+
+
+class SentFunction:
+    """A function for a pool, in threads of this process or in other processes.
+
+    It returns KeyboardInterrupt and SystemExit as `Ended`. If they were raised, threads and processes of
+    `multiprocessing.pool` and workers of dask would end, and their point would be waited for or evaluated again.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.function, self.sender = function, _this_process(os.getpid())
+
+    def __call__(self, item: Any) -> Any:
+        global _is_worker
+        _is_worker = _is_worker or self.sender != _this_process(os.getpid())
+        try:
+            with interrupts_end_the_run():
+                return self.function(item)
+        except (KeyboardInterrupt, SystemExit) as error:
+            if _is_worker and isinstance(error, SystemExit):
+                raise RuntimeError(f"SystemExit: {error}") from None
+            return Ended(error)

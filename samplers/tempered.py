@@ -34,7 +34,7 @@ from .evaluation.first_values import FirstEvaluations
 from .evaluation.pool_queue import advise_on_pool, check_asynchronous, open_queue
 from .evaluation.returned_values import ErrorCapturing
 from .evaluation.user_functions import UserFunctions
-from .interrupts import deferred_interrupts
+from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
@@ -253,6 +253,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     # ------------------------------------------------------------------ running
 
+    @interrupts_end_the_run()
     def run_mcmc(self, initial_state, nsteps, **kwargs):
         """Anneal to beta = 1 if that has not been done, then make `nsteps` steps at beta = 1.
 
@@ -279,6 +280,17 @@ class TemperedSampler(RunResults, EnsembleSampler):
         -------
         emcee.State
             The last state.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            At Ctrl-C, even if a library has set a handler of SIGINT that raises something else, such as dask_jobqueue,
+            which calls ``sys.exit``. The handler is called, and is put back after the run; a handler that returns has
+            dealt with Ctrl-C, and the run goes on.
+        SystemExit
+            If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
+
+        Nothing is stored for the points that were interrupted.
         """
         state = None
         for each in self.sample(initial_state, iterations=nsteps, **kwargs):
@@ -356,10 +368,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._judge(missing, stored.coords)
             if ended:
                 yield from self._end_early(advanced, stored, new, missing, store)
-        except (Exception, SystemExit):
+        except Exception:
             self._undo(random_state)
             raise
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             with deferred_interrupts():
                 self._undo(random_state)
             logger.warning(

@@ -68,6 +68,14 @@ def figures_are_closed():
         sys.modules["matplotlib.pyplot"].close("all")
 
 
+@pytest.fixture(autouse=True)
+def handler_of_sigint_is_put_back():
+    """A test, or a library that it imports, may set another handler of Ctrl-C: dask_jobqueue sets ``sys.exit``."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def pytest_configure():
     """Let Ctrl-C end runs also where the tests are in the background of a shell, which ignores it there."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -22,9 +22,13 @@ PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy", "umbridge"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-WORKERS = {"faults", "by_value", "user_code", "worker", "local_pool", "sandbox", "program_supervisor", "programs"}
+WORKERS = {"faults", "interrupts", "by_value", "user_code", "worker", "local_pool", "sandbox"} | {
+    "program_supervisor",
+    "programs",
+}
 # a thing and its figure, section of the command, report or other package
 SAME_NAME = {"comparison", "damage", "events", "guide", "inputs", "isolated_bridge", "modes", "priors", "results"} | {
+    "interrupts",
     "sampling",
     "scores",
     "sensors",

@@ -252,7 +252,7 @@ class _Batches:
         points = np.array([request.point for request in batch], dtype=float)
         try:
             outputs = batch[0].evaluator.evaluate(points, batch[0].density)
-        except Exception as error:  # such as TooManyFailures: sent to the clients that wait, and the server goes on
+        except BaseException as error:  # TooManyFailures, SystemExit: sent to the clients that wait; the server goes on
             logger.exception("A batch of %d points could not be evaluated", len(batch))
             outputs = [_Error(type(error).__name__, str(error), 500) for _ in batch]
         for request, output in zip(batch, outputs, strict=True):

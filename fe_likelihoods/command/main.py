@@ -55,6 +55,10 @@ class _Commands(click.Group):
             message = ctx.obj.get("interrupted", "Interrupted: nothing was changed.")
             click.echo(f"\n{message}", err=True)
             ctx.exit(INTERRUPTED)
+        except SystemExit as error:  # of the user's code: exit code 0 would say that the command is done
+            message = ctx.obj.get("interrupted", "Nothing was changed.")
+            click.echo(f"Error: sys.exit({error.code!r}) in the user's code has ended the command. {message}", err=True)
+            ctx.exit(ERROR)
         except (ValueError, OSError, RuntimeError, ImportError) as error:
             if ctx.params["debug"] or isinstance(error, RuntimeError) and type(error).__module__.startswith("click"):
                 raise

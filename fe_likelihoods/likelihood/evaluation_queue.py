@@ -19,6 +19,7 @@ import numpy as np
 from ..cache.memory import distinct_keys
 from ..priors.points import as_points
 from ..priors.priors import Prior
+from ..simulation.interrupts import interrupts_end_the_run
 from ..simulation.model import has_batch_method
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
@@ -278,6 +279,7 @@ class EvaluationQueue:
                     self._error = self._error or running.error
         self._taken.clear()
 
+    @interrupts_end_the_run()
     def _wait(self) -> None:
         """Wait for a simulation, or run some that are not in a pool."""
         here = [part for part in self._parts if part.running and not part.simulator.streams]

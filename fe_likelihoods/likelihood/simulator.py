@@ -28,6 +28,7 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
 from ..simulation.faults import ChangedModel
+from ..simulation.interrupts import interrupts_end_the_run
 from ..simulation.model import (
     Model,
     SimulationBatch,
@@ -371,6 +372,7 @@ class Simulator:
         response = np.full((len(keys), len(self.model.channels), self.model.n_steps), np.nan)
         return Requested.of(keys, self.n_structural, misfit, np.array(known, dtype=bool), response)
 
+    @interrupts_end_the_run()
     def _results(self, keys: list[bytes], responses: bool) -> list[Simulated]:
         """Results of new simulations."""
         arrived: SimpleQueue = SimpleQueue()

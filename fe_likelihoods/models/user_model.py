@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import json
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -22,7 +23,8 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
 from ..simulation.by_value import is_arriving
-from ..simulation.faults import ChangedModel, TransientReason, raise_if_it_ends_the_run, reason_of
+from ..simulation.faults import ChangedModel, TransientReason, reason_of
+from ..simulation.interrupts import raise_if_it_ends_the_run
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
 from .dependencies import Dependencies, content_digest
@@ -123,13 +125,16 @@ class ExternalModel(StructuralModel):
             (see `fe_likelihoods.simulation.faults`).
         ValueError
             If `theta` has another shape.
+        KeyboardInterrupt, SystemExit
+            If the code raises it in this process, even as the cause of another exception: neither is a failed
+            simulation, and a run ends.
         """
         theta = check_theta(theta, self.parameter_names).copy()
-        start = time.perf_counter()
+        start, before = time.perf_counter(), sys.exception()
         try:
             return self._check_response(self._respond(theta))
-        except BaseException as error:  # external code may raise anything, SystemExit among it
-            raise_if_it_ends_the_run(error)
+        except BaseException as error:  # external code may raise anything
+            raise_if_it_ends_the_run(error, before)
             reason = reason_of(error)
             seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
             seconds = time.perf_counter() - start if seconds is None else seconds

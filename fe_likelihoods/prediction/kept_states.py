@@ -13,6 +13,7 @@ simulation.
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections import OrderedDict
 from functools import partial
@@ -20,7 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..simulation.faults import raise_if_it_ends_the_run, reason_of
+from ..simulation.faults import reason_of
+from ..simulation.interrupts import interrupts_end_the_run, raise_if_it_ends_the_run
 from ..simulation.label import items_of, note_own_changes, steady_digest
 from ..simulation.model import (
     Model,
@@ -197,6 +199,7 @@ def _latest_states(model: Model, thetas: np.ndarray, memory: StateMemory) -> lis
     return starts
 
 
+@interrupts_end_the_run()
 def _run(
     model: Model, thetas: np.ndarray, starts: list[_Start], pool: Any, responses: bool
 ) -> list[tuple[np.ndarray | None, np.ndarray | None, str]]:
@@ -215,7 +218,7 @@ def _run(
 
 def _continue(responses: bool, model: Model, item: tuple[np.ndarray, _Start]) -> tuple[tuple | None, str]:
     """Run one simulation from a state; returns response and state with an empty reason, or None and the reason."""
-    theta, (n_done, state) = item
+    (theta, (n_done, state)), before = item, sys.exception()
     try:
         # a model may write into its argument, and the kept state serves later predictions
         response, end = model.simulate_from(theta, None if state is None else np.array(state))
@@ -233,8 +236,8 @@ def _continue(responses: bool, model: Model, item: tuple[np.ndarray, _Start]) ->
                 "numbers (ndarray), of which copies can be kept; put all that the model needs to go on into one array"
             )
         response = real_response(response, model.channels, expected[1])
-    except BaseException as error:  # a model may raise anything, SystemExit among it
-        raise_if_it_ends_the_run(error)
+    except BaseException as error:  # a model may raise anything
+        raise_if_it_ends_the_run(error, before)
         return None, reason_of(error)
     reason = not_finite(model, response)
     return (None, reason) if reason else ((response if responses else None, np.array(end)), "")

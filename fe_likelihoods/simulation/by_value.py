@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import cloudpickle
 
 from .faults import ChangedModel
+from .interrupts import become_worker
 from .user_code import SCRIPTS, is_of_user, sources_digest
 
 __all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "without_addresses"]
@@ -136,7 +137,9 @@ class Pickled(NamedTuple):
             )
         with _lock:
             # a pool may run the function in the sending process, whose modules must not be replaced
-            _arriving = None if self.payload[16:32] == _this_process(os.getpid()) else {}
+            if self.payload[16:32] != _this_process(os.getpid()):
+                _arriving = {}
+                become_worker()
             try:
                 return Arrived(pickle.loads(memoryview(self.payload)[32:]), _arriving or {})
             except ChangedModel:

@@ -9,8 +9,6 @@ limit, a full disk, a missing folder or library. The log-likelihood is -inf in t
 point again. A `MisfitReason` depends on the measurements, so it does not apply to other measurements.
 """
 
-import dis
-import signal
 import subprocess
 from concurrent.futures import BrokenExecutor
 
@@ -22,7 +20,6 @@ __all__ = [
     "TransientReason",
     "UnusableModel",
     "is_transient",
-    "raise_if_it_ends_the_run",
     "reason_of",
     "shortened",
 ]
@@ -92,35 +89,6 @@ def is_transient(error: BaseException) -> bool:
     if isinstance(error, subprocess.CalledProcessError):
         return error.returncode < 0  # killed by a signal
     return isinstance(error, _FAULTS)
-
-
-def raise_if_it_ends_the_run(error: BaseException) -> None:
-    """Raise exceptions that must not become a failed simulation: `UnusableModel`, and the user's Ctrl-C.
-
-    A model that calls ``sys.exit``, or raises KeyboardInterrupt by a ``raise`` statement, has failed. Ctrl-C interrupts
-    code elsewhere; it is also found as the cause of another exception that the model raised.
-    """
-    if isinstance(error, UnusableModel):
-        raise error
-    cause: BaseException | None = error
-    seen: set[int] = set()
-    while cause is not None and id(cause) not in seen:
-        if isinstance(cause, KeyboardInterrupt) and not _is_raised(cause):
-            raise cause
-        seen.add(id(cause))
-        cause = cause.__cause__ or cause.__context__
-
-
-def _is_raised(error: BaseException) -> bool:
-    """Whether an exception comes from a ``raise`` statement outside the handler of Ctrl-C."""
-    handler = signal.getsignal(signal.SIGINT)
-    handler = getattr(handler, "__code__", None) or getattr(type(handler).__call__, "__code__", None)
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        if trace.tb_next.tb_frame.f_code is handler:
-            return False
-        trace = trace.tb_next
-    return trace is not None and dis.opname[trace.tb_frame.f_code.co_code[trace.tb_lasti]] == "RAISE_VARARGS"
 
 
 def reason_of(error: BaseException) -> str:

@@ -6,11 +6,13 @@ parameter set. It raises `SimulationFailed` if a simulation is impossible. No ba
 Samplers request many parameter sets at once. `simulate_batch` and `misfit_batch` use the model's own batch methods if
 it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one by
 one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
-becomes a reason in words and a row of NaN, and does not affect other rows.
+becomes a reason in words and a row of NaN, and does not affect other rows. Ctrl-C and ``sys.exit`` are no failures
+(`fe_likelihoods.simulation.interrupts`).
 """
 
 import logging
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -22,7 +24,8 @@ import numpy as np
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
-from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of, shortened
+from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
+from .interrupts import interrupts_end_the_run, raise_if_it_ends_the_run
 from .opened import Observed, note, unpack
 
 __all__ = [
@@ -201,6 +204,7 @@ def first_part(model: Model, seconds: float) -> Model:
     )
 
 
+@interrupts_end_the_run()
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
     """Responses for many parameter sets.
 
@@ -220,6 +224,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
 
 
+@interrupts_end_the_run()
 def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.ndarray:
     """Derivatives of the responses by the structural parameters, from the model's own ``jacobian``.
 
@@ -264,6 +269,7 @@ def _derivatives(model: Any, theta: np.ndarray) -> np.ndarray:
     return values
 
 
+@interrupts_end_the_run()
 def misfit_batch(
     model: Model,
     thetas: np.ndarray,
@@ -375,9 +381,11 @@ def _misfit(measured: np.ndarray | Comparison, reduce: Statistic, model: Model, 
 
 def _reduced(response: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic) -> np.ndarray:
     """Statistic of a response; `SimulationFailed` if it cannot be computed."""
+    before = sys.exception()
     try:
         return reduce_response(response, measured, reduce)
     except Exception as error:
+        raise_if_it_ends_the_run(error, before)
         raise SimulationFailed(reason_of(error) if is_transient(error) else MisfitReason(reason_of(error))) from error
 
 
@@ -395,10 +403,11 @@ def _attempt(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, theta: np.ndarray
 ) -> tuple[np.ndarray | None, str]:
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
+    before = sys.exception()
     try:
         result = run(model, theta)
-    except BaseException as error:  # a model may raise anything, SystemExit among it
-        raise_if_it_ends_the_run(error)
+    except BaseException as error:  # a model may raise anything
+        raise_if_it_ends_the_run(error, before)
         return None, reason_of(error)
     reason = not_finite(model, result)
     return (None, reason) if reason else (result, "")
@@ -426,10 +435,11 @@ def _run_each(
 @contextmanager
 def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
     """Log a failure of the model's own batch method, which must not make all its parameter sets fail."""
+    before = sys.exception()
     try:
         yield
     except BaseException as error:
-        raise_if_it_ends_the_run(error)
+        raise_if_it_ends_the_run(error, before)
         logger.warning(
             "A batch method of %s failed; its parameter sets are run one by one: %s: %s",
             type(model).__name__,

@@ -7,7 +7,7 @@ from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
 from .local_pool import Outcome
-from .sent_functions import FunctionReference, Missing, PrivateFiles
+from .sent_functions import Ended, FunctionReference, Missing, PrivateFiles
 
 __all__ = ["PoolExecutor", "resolve"]
 
@@ -28,6 +28,8 @@ def resolve(future: Future, result: Any = None, error: BaseException | None = No
     """Set the result or the exception of a future, unless it is cancelled."""
     if future.cancelled() or not future.set_running_or_notify_cancel():
         return
+    if isinstance(result, Ended):
+        error = result.error
     if error is None:
         future.set_result(result)
     else:
@@ -71,6 +73,9 @@ class PoolExecutor:
             carried = self.pool.map(reference.carried(), [items[index] for index in missing])
             for index, outcome in zip(missing, carried, strict=True):
                 outcomes[index] = outcome
+        for outcome in outcomes:
+            if isinstance(outcome, Ended):
+                raise outcome.error
         return outcomes
 
     def submit(self, function: Callable[[Any], Outcome], item: Any) -> Future:

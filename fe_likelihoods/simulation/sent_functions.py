@@ -12,12 +12,32 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .by_value import Pickled, Recent
+from .interrupts import interrupts_end_the_run
 
-__all__ = ["FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
+__all__ = ["Ended", "FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
 
 
 class Missing(NamedTuple):
     """Reply of a worker that does not have the function."""
+
+
+class Ended(NamedTuple):
+    """Reply of a worker whose function raised KeyboardInterrupt or SystemExit: raised in the caller's thread.
+
+    If it were raised in the worker, threads and processes of `multiprocessing.pool` and workers of dask would end, and
+    the item would be waited for or run again.
+    """
+
+    error: BaseException
+
+
+def _called(function: Callable, item: Any) -> Any:
+    """The result of a function for an item, or `Ended`."""
+    try:
+        with interrupts_end_the_run():
+            return function(item)
+    except (KeyboardInterrupt, SystemExit) as error:
+        return Ended(error)
 
 
 class PrivateFiles:
@@ -52,7 +72,7 @@ class FunctionReference:
         self._lock = threading.Lock()
 
     def __call__(self, item: Any) -> Any:
-        return self._function(item)
+        return _called(self._function, item)
 
     def pickle(self) -> Pickled:
         """The function in its state at the first call of this method; ValueError if it cannot be pickled."""
@@ -97,4 +117,4 @@ class _LoadedFunction:
                     return Missing()
                 function = pickled.load()
                 loaded_functions.keep(key, function, len(payload))
-        return function(item)
+        return _called(function, item)

@@ -162,7 +162,7 @@ class Answer(NamedTuple):
     """Answer of a worker: the result of the function, or the exception that it has raised."""
 
     value: Any
-    error: Exception | None
+    error: BaseException | None
 
 
 def _ended(process: subprocess.Popen) -> bool:
@@ -258,8 +258,8 @@ def _packed(value: Any, error: BaseException | None = None) -> bytes:
         data = pickle.dumps((value, error), protocol=5)
         if error is not None:
             pickle.loads(data)  # exceptions with custom constructors can often be pickled but not unpickled
-        if error is None or isinstance(error, Exception):
-            return data  # but SystemExit and KeyboardInterrupt of the function must not end the parent
+        if error is None or isinstance(error, Exception | KeyboardInterrupt):  # which ends the run
+            return data
     except Exception as failure:
         error = error or failure
     text = without_addresses(f"{type(error).__name__}: {error}")

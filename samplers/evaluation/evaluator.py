@@ -17,6 +17,7 @@ import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
 from ..budget import Budget, BudgetExhausted
+from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch, Record, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .first_values import POINTS
@@ -100,6 +101,7 @@ class CallingConvention(NamedTuple):
         named = self.parameter_names
         return coords if named is None else ndarray_to_list_of_dicts(coords, named)
 
+    @interrupts_end_the_run()
     def call(
         self,
         function: Callable,
@@ -118,7 +120,9 @@ class CallingConvention(NamedTuple):
             return function(points)
         results, noted = [], time.perf_counter()
         try:
-            for result in map_in(pool)(function, points):
+            for result in map_in(pool)(function if pool is None else SentFunction(function), points):
+                if isinstance(result, Ended):
+                    raise result.error
                 results.append(result)
                 if observer is not None:
                     observer.finished(1)

@@ -6,11 +6,13 @@ one number per parameter cost two more evaluations. The second check costs two c
 if the object has it.
 """
 
+import sys
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
+from ..interrupts import raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
 from .user_functions import UserFunctions
 
@@ -90,10 +92,12 @@ class FirstEvaluations(NamedTuple):
             return  # the object names all three densities
         log_prior = evaluator.log_prior(coords)
         returned = log_prob - log_prior if is_likelihood else log_prob
+        before = sys.exception()
         try:
             same = owner.log_likelihood == function
             log_likelihood = returned if same else evaluator.call(owner.log_likelihood, coords)
-        except Exception:  # a method with other arguments
+        except Exception as error:  # a method with other arguments
+            raise_if_it_ends_the_run(error, before)
             return
         if not np.all(np.isfinite(log_likelihood)) or np.any(_equal(log_prior, 0.0, log_likelihood)):
             return

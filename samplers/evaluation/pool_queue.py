@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from .returned_values import Failed
 
 __all__ = ["PoolQueue", "advise_on_pool", "check_asynchronous", "map_in", "open_queue", "pool_size"]
@@ -102,7 +103,7 @@ class PoolQueue:
     """
 
     def __init__(self, function: Callable, pool: Any, as_items: Callable[[Any], Sequence]):
-        self._function, self._pool, self._as_items = function, pool, as_items
+        self._function, self._pool, self._as_items = SentFunction(function), pool, as_items
         self._futures: dict[int, Any] = {}  # of points that were not collected
         self._ended: dict[int, None] = {}  # tickets in the order of completion
         self._handed: list[int] = []  # what the last `collect` returned: the caller may not have received it
@@ -132,13 +133,16 @@ class PoolQueue:
         self._ended[ticket] = None
         self._arrived.set()
 
+    @interrupts_end_the_run()
     def collect(self) -> list[tuple[int, Any]]:
         """Wait for a finished point; returns numbers and values of all finished points, in the order of completion.
 
         Raises
         ------
+        KeyboardInterrupt, SystemExit
+            If the function has raised it. Points that finished before are returned first, here and below.
         RuntimeError
-            If no point is running, or the pool cannot continue. Points that finished before are returned first.
+            If no point is running, or the pool cannot continue.
         """
         for ticket in self._handed:
             self._ended.pop(ticket, None)  # first: `ended` may be called if Ctrl-C comes between the two
@@ -150,6 +154,8 @@ class PoolQueue:
             self._arrived.wait()
             self._arrived.clear()
         collected, error = self._fetch()
+        if not collected and isinstance(error, KeyboardInterrupt | SystemExit):
+            raise error
         if not collected:
             raise RuntimeError(
                 f"the pool cannot go on: {type(error).__name__}: {error}. Evaluations that have arrived are kept where "
@@ -176,6 +182,8 @@ class PoolQueue:
                     break  # nothing can be fetched from this pool any more
             if type(error).__name__ == "KilledWorker":
                 error, value = None, Failed("every process that evaluated this point died")
+            if isinstance(value, Ended):
+                error = value.error
             if error is None:
                 fetched.append((ticket, value))
             else:

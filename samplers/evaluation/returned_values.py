@@ -6,10 +6,13 @@ anything that is not a number is refused with an explanation.
 """
 
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from ..interrupts import raise_if_it_ends_the_run
 
 __all__ = ["ErrorCapturing", "Failed", "log_densities", "log_probabilities", "outcomes"]
 
@@ -158,7 +161,8 @@ class ErrorCapturing:
     process.
 
     An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
-    posterior whose model has changed.
+    posterior whose model has changed. KeyboardInterrupt and SystemExit are raised, even as the cause of another
+    exception; SystemExit in a worker process gives `Failed`.
 
     Parameters
     ----------
@@ -178,12 +182,14 @@ class ErrorCapturing:
         self.function, self.args, self.kwargs, self.vectorize = function, args, kwargs or {}, vectorize
 
     def __call__(self, points: Any) -> Any:
+        before = sys.exception()
         try:
             result = self.function(points, *self.args, **self.kwargs)
             owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result
-        except Exception as error:
+        except (Exception, SystemExit) as error:
+            raise_if_it_ends_the_run(error, before)
             if getattr(error, "ends_run", False):
                 raise
             if not self.vectorize:

@@ -1,12 +1,14 @@
 """The user's functions: the posterior as one function or as prior and likelihood, and optional attributes."""
 
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..interrupts import raise_if_it_ends_the_run
 from .starts import SEED, compare_with_draws, draws_to_compare, log_integral, spread_by_metropolis
 
 __all__ = ["OptionalAttributes", "UserFunctions"]
@@ -80,9 +82,11 @@ class OptionalAttributes(NamedTuple):
         unknown = np.ones(len(coords), dtype=bool)
         if not callable(self.possible) or len(coords) == 0:
             return unknown
+        before = sys.exception()
         try:
             found = np.asarray(self.possible(coords))
         except Exception as error:
+            raise_if_it_ends_the_run(error, before)
             logger.warning("the verdict takes all points as possible, since the method possible failed: %r", error)
             return unknown
         if found.shape != (len(coords),) or found.dtype != bool:
@@ -237,9 +241,11 @@ class UserFunctions(NamedTuple):
         if self.start_density is not None or self.optional.sample_prior is None:
             return None
         state, count = np.random.get_state(), draws_to_compare(n)  # noqa: NPY002
+        before = sys.exception()
         try:
             fresh = np.asarray(self.optional.sample_prior(count, np.random.RandomState(SEED)), dtype=float)
         except Exception as error:
+            raise_if_it_ends_the_run(error, before)
             logger.warning("initial_state is tested without fresh draws, since sample_prior failed: %r", error)
             return None
         finally:

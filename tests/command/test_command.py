@@ -563,6 +563,14 @@ def test_debug_shows_where_an_error_was_raised(folder):
     assert isinstance(result.exception, ValueError)
 
 
+def test_sys_exit_of_the_users_code_is_an_error(monkeypatch):
+    monkeypatch.setattr("fe_likelihoods.command.runs.run_job", lambda *arguments, **options: sys.exit(0))
+    output = call("run", "nothing.toml", code=1)
+    assert output.startswith(
+        "Error: sys.exit(0) in the user's code has ended the command. Interrupted. What was computed"
+    )
+
+
 def test_quantities_and_priors_as_text():
     assert read_quantity("48 in", "displacement") == pytest.approx(1.2192)
     assert read_quantity(2, "time") == 2.0

@@ -19,14 +19,6 @@ N, NDIM, WORKERS = 40, 2, 3
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
 
-@pytest.fixture(autouse=True)
-def python_handles_sigint():
-    """Tests that run in the background of a shell start with an ignored SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 class Threads(ThreadPoolExecutor):
     """Threads that keep their futures."""
 
@@ -197,14 +189,14 @@ def test_values_that_the_check_refuses_are_not_kept(tmp_path):
         make(path, Noted(), pool).run_mcmc(None, 0)
 
 
-@pytest.mark.parametrize("kind", ["KeyboardInterrupt", "RuntimeError"])
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, RuntimeError])
 def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
     """A worker that raises what is no failure of a point ends the run; all other points that have ended are kept."""
 
     class Ends(Noted):
         def __call__(self, x):
             if len(self.evaluated) == 2 * N:
-                error = KeyboardInterrupt() if kind == "KeyboardInterrupt" else RuntimeError("changed")
+                error = kind("changed")
                 error.ends_run = True
                 raise error
             return super().__call__(x)
@@ -212,7 +204,8 @@ def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
     path, posterior = tmp_path / "run.h5", Ends()
     with Threads() as pool:
         sampler = make(path, posterior, pool)
-        with pytest.raises(RuntimeError, match=f"the pool cannot go on: {kind}"):
+        message = "the pool cannot go on: RuntimeError: changed" if kind is RuntimeError else "changed"
+        with pytest.raises(kind, match=message):
             sampler.run_mcmc(None, 1)
         sampler._record.close()
         known = points_of(path)

@@ -1,4 +1,4 @@
-"""Whatever a model raises is a failed simulation; Ctrl-C of the user ends the run."""
+"""Whatever a model raises is a failed simulation, apart from KeyboardInterrupt and, in this process, SystemExit."""
 
 import os
 import signal
@@ -19,8 +19,6 @@ class Strange(BaseException):
 
 
 RAISED = {
-    "SystemExit: bye": lambda: sys.exit("bye"),
-    "KeyboardInterrupt: ": lambda: exec("raise KeyboardInterrupt"),
     "GeneratorExit: ": lambda: exec("raise GeneratorExit"),
     "Strange: so": lambda: exec("raise Strange('so')", globals()),
 }
@@ -53,17 +51,68 @@ def of_function(act, **options):
     return FunctionModel(Plain(act).simulate, ("a", "b"), CHANNELS, DT, N_STEPS, version="1", **options)
 
 
-@pytest.mark.parametrize("reason", RAISED)
-@pytest.mark.parametrize("make", [Plain, Batched, of_function, lambda act: of_function(act, isolated=True)])
-@pytest.mark.parametrize("workers", [None, 1])
-def test_any_exception_of_a_model_is_a_failed_simulation(reason, make, workers):
-    pool = None if workers is None else LocalPool(workers)
-    batch = simulate_batch(make(RAISED[reason]), THETAS, pool)
+def isolated(act):
+    return of_function(act, isolated=True)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with LocalPool(1) as pool:
+        yield pool
+
+
+def check_failure(batch, reason):
     assert [bool(why) for why in batch.reasons] == [False, True, False]
     assert batch.reasons[1].startswith(reason)
     assert np.isfinite(batch.response[[0, 2]]).all()
-    if pool is not None:
-        pool.close()
+
+
+@pytest.mark.parametrize("reason", RAISED)
+@pytest.mark.parametrize("make", [Plain, Batched, of_function, isolated])
+@pytest.mark.parametrize("in_pool", [False, True])
+def test_any_exception_of_a_model_is_a_failed_simulation(reason, make, in_pool, pool):
+    check_failure(simulate_batch(make(RAISED[reason]), THETAS, pool if in_pool else None), reason)
+
+
+def leave():
+    sys.exit("bye")
+
+
+def leave_with_another_error():
+    try:
+        sys.exit("bye")
+    except SystemExit as error:
+        raise ValueError("the solver ended") from error
+
+
+@pytest.mark.parametrize("act", [leave, leave_with_another_error])
+@pytest.mark.parametrize("make", [Plain, Batched, of_function])
+def test_sys_exit_in_this_process_ends_the_run_with_advice(make, act, caplog):
+    with pytest.raises(SystemExit, match="bye"):
+        simulate_batch(make(act), THETAS)
+    assert [record.message.count("isolated=True") for record in caplog.records] == [1]
+
+
+@pytest.mark.parametrize(
+    ("make", "in_pool"), [(Plain, True), (Batched, True), (of_function, True), (isolated, False), (isolated, True)]
+)
+def test_sys_exit_in_a_worker_is_a_failed_simulation(make, in_pool, pool):
+    pool = pool if in_pool else None
+    check_failure(simulate_batch(make(leave), THETAS, pool), "SystemExit: bye")
+    check_failure(simulate_batch(make(leave_with_another_error), THETAS, pool), "ValueError: the solver ended")
+
+
+@pytest.mark.parametrize("make", [Plain, of_function, isolated])
+def test_keyboard_interrupt_in_a_worker_ends_the_run(make, pool):
+    with pytest.raises(KeyboardInterrupt):
+        simulate_batch(make(interrupt), THETAS, pool)
+    if make is isolated:
+        with pytest.raises(KeyboardInterrupt):
+            simulate_batch(make(interrupt), THETAS)
+
+
+def interrupt():
+    raise KeyboardInterrupt
 
 
 def turned():
@@ -80,38 +129,41 @@ def repeated():
         raise RuntimeError("the solver was interrupted") from error
 
 
+def hidden():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except BaseException:
+        raise SimulationFailed("the solver was interrupted") from ValueError("another cause")
+
+
+def suppressed():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except BaseException:
+        raise SimulationFailed("the solver was interrupted") from None
+
+
 def press():
     os.kill(os.getpid(), signal.SIGINT)
     for _ in range(10**8):
         pass
 
 
-@pytest.fixture
-def usual_handler():
-    """Another test of this process may have left another handler."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("usual_handler")
 @pytest.mark.parametrize("make", [Plain, Batched, of_function])
-@pytest.mark.parametrize("act", [press, lambda: signal.raise_signal(signal.SIGINT), turned, repeated])
+@pytest.mark.parametrize("act", [press, interrupt, turned, repeated, hidden, suppressed])
 def test_ctrl_c_ends_the_run(make, act):
     with pytest.raises(KeyboardInterrupt):
         simulate_batch(make(act), THETAS)
 
 
-def test_ctrl_c_with_a_handler_of_the_user_ends_the_run():
-    def handler(number, frame):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            simulate_batch(Plain(press), THETAS)
-    finally:
-        signal.signal(signal.SIGINT, before)
+def test_failures_after_an_interrupt_are_failures():
+    """Where a run is repeated in an except clause, Python makes its exception the context of all later errors."""
+    for interrupted in (KeyboardInterrupt, SystemExit):
+        try:
+            raise interrupted
+        except interrupted:
+            for make in (Plain, Batched, of_function):
+                check_failure(simulate_batch(make(lambda: fail("a reason")), THETAS), "a reason")
 
 
 def forks():

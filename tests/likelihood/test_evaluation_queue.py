@@ -311,15 +311,6 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared
         np.testing.assert_array_equal(posterior(SHORT), posterior_of(Treacherous())(SHORT))
 
 
-@pytest.fixture
-def ctrl_c():
-    """Ctrl-C raises KeyboardInterrupt; tests that run in the background of a shell start with an ignored SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("asynchronous", [True, False], ids=["queue", "call"])
 def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
     path = tmp_path / "cache.sqlite"

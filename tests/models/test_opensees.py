@@ -1,12 +1,14 @@
-"""OpenSees models: accurate, repeatable, run in a separate process, restarted after a crash."""
+"""OpenSees models: accurate, repeatable, in a separate process; codes of ``analyze`` that are not handled."""
 
 import importlib.util
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from fe_likelihoods import LinearOscillator, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods import FunctionModel, LinearOscillator, OpenSeesModel, Record, SimulationFailed
+from fe_likelihoods.models.opensees import _Codes
 from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
@@ -112,3 +114,275 @@ def test_wrong_arguments_are_rejected(record, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match="pip install openseespy"):
         model_of(record, 5)
+
+
+# codes of ops.analyze ------------------------------------------------------------------------------------------------
+
+HARD_DT, HARD_N = 0.02, 100
+
+
+def prepare(ops, iterations):
+    """A yielding mass under a pulse: each step converges with 50 iterations, no step with one."""
+    ops.model("basic", "-ndm", 1, "-ndf", 1)
+    ops.node(1, 0.0)
+    ops.node(2, 0.0)
+    ops.fix(1, 1)
+    ops.mass(2, 1.0)
+    ops.uniaxialMaterial("Steel01", 1, 2.0, 70.0, 0.01)
+    ops.element("zeroLength", 1, 1, 2, "-mat", 1, "-dir", 1)
+    ops.timeSeries("Trig", 1, 0.0, 10.0, 1.0, "-factor", 3.0)
+    ops.pattern("UniformExcitation", 1, 1, "-accel", 1)
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", 1e-8, iterations)
+    ops.algorithm("Newton")
+    ops.integrator("Newmark", 0.5, 0.25)
+    ops.analysis("Transient")
+
+
+def step_by_step(step):
+    """Function of iterations that makes a step at each sample, until a step returns False."""
+
+    def run(ops, theta):
+        prepare(ops, int(theta[0]))
+        response = np.zeros((1, HARD_N))
+        for sample in range(HARD_N):
+            if step(ops, sample) is False:
+                break
+            response[0, sample] = ops.nodeDisp(2, 1)
+        return response
+
+    return run
+
+
+def ignores(ops, sample):
+    ops.analyze(1, HARD_DT)
+
+
+def imports(ops, sample):
+    import openseespy.opensees
+
+    openseespy.opensees.analyze(1, HARD_DT)
+
+
+def by_name():
+    from openseespy.opensees import analyze as advance
+
+    def step(ops, sample):
+        advance(1, HARD_DT)
+
+    return step
+
+
+class Held:
+    """An object that has imported the function by name."""
+
+    def __init__(self):
+        from openseespy.opensees import analyze
+
+        self.advance = analyze
+
+    def __call__(self, ops, sample):
+        self.advance(1, HARD_DT)
+
+
+def prints(ops, sample):
+    print(sample, ops.analyze(1, HARD_DT))
+
+
+def says_so_and_goes_on(ops, sample):
+    if ops.analyze(1, HARD_DT) != 0:
+        print("step", sample, "failed")
+
+
+def breaks(ops, sample):
+    return ops.analyze(1, HARD_DT) >= 0
+
+
+def repeats(ops, sample):
+    if ops.analyze(1, HARD_DT) != 0:
+        ops.test("NormDispIncr", 1e-8, 50)
+        ops.algorithm("ModifiedNewton", "-initial")
+        ops.analyze(1, HARD_DT)
+        ops.test("NormDispIncr", 1e-8, 1)
+        ops.algorithm("Newton")
+
+
+def tries_in_turn(ops, sample):
+    for iterations in (1, 50):
+        ops.test("NormDispIncr", 1e-8, iterations)
+        if not ops.analyze(1, HARD_DT):
+            break
+    ops.test("NormDispIncr", 1e-8, 1)
+
+
+def in_one_call(ops, theta):
+    prepare(ops, int(theta[0]))
+    ops.analyze(HARD_N, HARD_DT)
+    return np.full((1, HARD_N), ops.nodeDisp(2, 1))
+
+
+def while_it_converges(ops, theta):
+    prepare(ops, int(theta[0]))
+    response, code, sample = np.zeros((1, HARD_N)), 0, 0
+    while code == 0 and sample < HARD_N:
+        code = ops.analyze(1, HARD_DT)
+        response[0, sample] = ops.nodeDisp(2, 1)
+        sample += 1
+    return response
+
+
+def collects(ops, theta):
+    """Tests all codes at the end, and begins anew if any is not 0."""
+    for iterations in (int(theta[0]), 50):
+        ops.wipe()
+        prepare(ops, iterations)
+        response, codes = np.zeros((1, HARD_N)), []
+        for sample in range(HARD_N):
+            codes.append(ops.analyze(1, HARD_DT))
+            response[0, sample] = ops.nodeDisp(2, 1)
+        if not any(codes):
+            break
+    return response
+
+
+def pushed_after_gravity(ops, theta):
+    """A static stage that is tested, and does not converge with one iteration, before one that converges."""
+    prepare(ops, int(theta[0]))
+    ops.remove("loadPattern", 1)
+    ops.timeSeries("Linear", 2)
+    ops.pattern("Plain", 2, 2)
+    ops.load(2, 0.5)
+    ops.wipeAnalysis()
+    ops.constraints("Plain")
+    ops.numberer("Plain")
+    ops.system("BandGeneral")
+    ops.test("NormDispIncr", 1e-8, int(theta[0]))
+    ops.algorithm("Newton")
+    ops.integrator("LoadControl", 0.25)
+    ops.analysis("Static")
+    if ops.analyze(4) != 0:
+        print("gravity failed")
+    ops.loadConst("-time", 0.0)
+    ops.test("NormDispIncr", 1e-8, 50)
+    ops.timeSeries("Linear", 3)
+    ops.pattern("Plain", 3, 3)
+    ops.load(2, 1.0)
+    ops.integrator("DisplacementControl", 2, 1, 0.001)
+    response = np.zeros((1, HARD_N))
+    for sample in range(HARD_N):
+        if ops.analyze(1) != 0:
+            raise RuntimeError("no convergence")
+        response[0, sample] = ops.nodeDisp(2, 1)
+    return response
+
+
+UNHANDLED = {
+    "ignores": (step_by_step(ignores), "returned -3 at call 1 of 100 and the script did not look at it"),
+    "prints": (step_by_step(prints), "returned -3 at call 1 of 100 and the script did not look at it"),
+    "imports": (step_by_step(imports), "returned -3 at call 1 of 100 and the script did not look at it"),
+    "in one call": (in_one_call, "returned -3 at call 1 of 1 and the script did not look at it"),
+    "says so and goes on": (
+        step_by_step(says_so_and_goes_on),
+        "returned -3 at call 100 of 100 and the script ended there",
+    ),
+    "breaks": (step_by_step(breaks), "returned -3 at call 1 of 1 and the script ended there"),
+    "while it converges": (while_it_converges, "returned -3 at call 1 of 1 and the script ended there"),
+    "gravity": (pushed_after_gravity, "returned -3 at call 1 of 101 and the script went on with ops.loadConst"),
+}
+HANDLED = {"repeats": step_by_step(repeats), "in turn": step_by_step(tries_in_turn), "collects": collects}
+
+
+def hard(function):
+    require_opensees()
+    return OpenSeesModel(function, ("iterations",), CHANNELS[1:], HARD_DT, HARD_N)
+
+
+@pytest.mark.parametrize("script", UNHANDLED)
+def test_a_code_that_the_script_does_not_handle_is_a_failed_simulation(script):
+    function, reason = UNHANDLED[script]
+    model = hard(function)
+    assert np.isfinite(model.simulate([50])).all()
+    with pytest.raises(SimulationFailed, match=reason):
+        model.simulate([1])
+    assert np.isfinite(model.simulate([50])).all()  # codes of the run before do not count
+
+
+@pytest.mark.parametrize("script", HANDLED)
+def test_a_script_may_repeat_what_has_failed(script):
+    model = hard(HANDLED[script])
+    np.testing.assert_allclose(model.simulate([1]), model.simulate([50]), atol=1e-6)
+
+
+@pytest.mark.parametrize("script", ["by name", "object"])
+def test_functions_that_the_script_has_imported_by_name_are_watched(script):
+    """In a process of its own, since this script imports OpenSees."""
+    require_opensees()
+    code = (
+        "import tests.models.test_opensees as t, pytest\n"
+        f"model = t.hard(t.step_by_step({'t.by_name' if script == 'by name' else 't.Held'}()))\n"
+        "assert model.simulate([50]).any()\n"
+        "with pytest.raises(t.SimulationFailed, match='did not look at it'): model.simulate([1])\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_exception_of_the_script_is_the_reason():
+    def collapses(ops, sample):
+        if ops.analyze(1, HARD_DT) != 0:
+            raise SimulationFailed(f"collapse at {ops.getTime():.2f} s")
+
+    with pytest.raises(SimulationFailed, match="^collapse at 0.00 s after"):
+        hard(step_by_step(collapses)).simulate([1])
+
+
+def test_an_isolated_function_may_return_the_response_of_an_analysis_that_stopped():
+    require_opensees()
+
+    def padded(theta):
+        import openseespy.opensees as ops
+
+        ops.wipe()
+        return step_by_step(breaks)(ops, theta)
+
+    model = FunctionModel(padded, ("iterations",), CHANNELS[1:], HARD_DT, HARD_N, isolated=True)
+    assert not model.simulate([1]).any()
+
+
+LOOKS = {
+    "if": lambda code: not code,
+    "comparison": lambda code: code < 0,
+    "reflected comparison": lambda code: 0 == code,
+    "in a tuple": lambda code: code in (0, 1),
+    "in a set": lambda code: code in {0, 1},
+    "any": lambda code: any([0, code]),
+    "sum": lambda code: sum([0, code]),
+    "max": lambda code: max(0, code),
+    "int": int,
+    "float": float,
+    "abs": abs,
+    "in an array": lambda code: np.array([0, code]),
+    "numpy": lambda code: np.any([0, code]),
+}
+NO_LOOKS = {"printed": "{}".format, "repr": repr, "kept": lambda code: [code]}
+
+
+@pytest.mark.parametrize("look", [*LOOKS, *NO_LOOKS])
+def test_what_is_a_look_at_a_code(look):
+    codes = _Codes()
+    code = codes.analyze(lambda *arguments: -3, 1, 0.01)
+    assert type(code) is not int and codes.analyze(lambda: 0) == 0
+    assert (LOOKS | NO_LOOKS)[look](code) is not None
+    assert ("did not look" in codes.reason) == (look in NO_LOOKS) and (codes.reason == "") == (look in LOOKS)
+    assert code == -3 and hash(code) == hash(-3)
+    assert codes.reason == ""
+
+
+def test_a_look_at_a_code_stands_for_those_after_it_and_none_before():
+    codes = _Codes()
+    first, second, third = (codes.analyze(lambda: -3) for _ in range(3))
+    codes.analyze(lambda: 0)
+    assert any([second, third])
+    assert codes.reason.startswith("ops.analyze returned -3 at call 1 of 4 and the script did not look")
+    assert first < 0 and codes.reason == ""
