@@ -1,10 +1,8 @@
-"""Ctrl-C and SystemExit end a run, and no point that they have interrupted is stored.
-
-`fe_likelihoods.simulation.interrupts` has the same rules for simulations; the two packages do not import each other.
-"""
+"""Ctrl-C and SystemExit end a run, and no point that they have interrupted is stored."""
 
 import contextlib
 import functools
+import multiprocessing
 import os
 import signal
 import threading
@@ -14,8 +12,10 @@ from typing import Any, NamedTuple
 __all__ = [
     "Ended",
     "SentFunction",
+    "become_worker",
     "deferred_interrupts",
     "interrupts_end_the_run",
+    "is_worker",
     "raise_if_it_ends_the_run",
 ]
 
@@ -82,7 +82,7 @@ def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None 
     what is handled there is the context of its errors, but no cause of them.
     """
     causes = _causes(error, before)
-    for kind in (KeyboardInterrupt,) if _is_worker else (KeyboardInterrupt, SystemExit):
+    for kind in (KeyboardInterrupt,) if is_worker() else (KeyboardInterrupt, SystemExit):
         for cause in causes:
             if isinstance(cause, kind):
                 raise cause
@@ -101,6 +101,20 @@ def _causes(error: BaseException, before: BaseException | None) -> list[BaseExce
 
 
 _is_worker = False
+
+
+def become_worker() -> None:
+    """Note that this process runs functions of another process."""
+    global _is_worker
+    _is_worker = True
+
+
+def is_worker() -> bool:
+    """Whether this process runs functions of another process, or `multiprocessing` has started it.
+
+    It also starts the workers of other samplers, whose pools wait for ever where a worker ends.
+    """
+    return _is_worker or multiprocessing.parent_process() is not None
 
 
 @functools.cache
@@ -126,12 +140,12 @@ class SentFunction:
         self.function, self.sender = function, _this_process(os.getpid())
 
     def __call__(self, item: Any) -> Any:
-        global _is_worker
-        _is_worker = _is_worker or self.sender != _this_process(os.getpid())
+        if self.sender != _this_process(os.getpid()):
+            become_worker()
         try:
             with interrupts_end_the_run():
                 return self.function(item)
         except (KeyboardInterrupt, SystemExit) as error:
-            if _is_worker and isinstance(error, SystemExit):
+            if is_worker() and isinstance(error, SystemExit):
                 raise RuntimeError(f"SystemExit: {error}") from None
             return Ended(error)

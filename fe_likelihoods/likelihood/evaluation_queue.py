@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from samplers.interrupts import interrupts_end_the_run
+
 from ..cache.memory import distinct_keys
 from ..priors.points import as_points
 from ..priors.priors import Prior
-from ..simulation.interrupts import interrupts_end_the_run
 from ..simulation.model import has_batch_method
 from .joint import JointLikelihood
 from .likelihood import FELikelihood

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from samplers.interrupts import interrupts_end_the_run
+
 from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
 from ..cache.simulation_cache import SimulationCache
@@ -28,7 +30,6 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
 from ..simulation.faults import ChangedModel
-from ..simulation.interrupts import interrupts_end_the_run
 from ..simulation.model import (
     Model,
     SimulationBatch,

@@ -21,8 +21,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.interrupts import interrupts_end_the_run
+
 from ..simulation.faults import reason_of
-from ..simulation.interrupts import interrupts_end_the_run, raise_if_it_ends_the_run
+from ..simulation.interrupts import raise_if_it_ends_the_run
 from ..simulation.label import items_of, note_own_changes, steady_digest
 from ..simulation.model import (
     Model,

@@ -31,8 +31,9 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 
+from samplers.interrupts import become_worker
+
 from .faults import ChangedModel
-from .interrupts import become_worker
 from .user_code import SCRIPTS, is_of_user, sources_digest
 
 __all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "without_addresses"]

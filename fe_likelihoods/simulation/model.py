@@ -21,11 +21,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from samplers.interrupts import interrupts_end_the_run
+
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
-from .interrupts import interrupts_end_the_run, raise_if_it_ends_the_run
+from .interrupts import raise_if_it_ends_the_run
 from .opened import Observed, note, unpack
 
 __all__ = [

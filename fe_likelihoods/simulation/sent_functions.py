@@ -11,8 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from samplers.interrupts import interrupts_end_the_run
+
 from .by_value import Pickled, Recent
-from .interrupts import interrupts_end_the_run
 
 __all__ = ["Ended", "FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
 
