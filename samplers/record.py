@@ -219,6 +219,11 @@ class Record:
         first = max(bisect_right(self._first, self.count - most) - 1, 0)
         return merge_batches(self._batches[first:]) if self._batches else None
 
+    def first(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """The first m <= n evaluated points (m, ndim) that are still known, and their log-probabilities (m,)."""
+        coords, log_prob = (np.concatenate([batch[column][:n] for batch in self._batches])[:n] for column in (0, 1))
+        return coords, log_prob
+
     def best_and_first(self) -> EvaluatedBatch | None:
         """One or two evaluated points that did not fail, to compare the function at; None without any."""
         points = merge_batches(self._batches) if self._batches else None

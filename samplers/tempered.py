@@ -35,6 +35,7 @@ from .evaluation.pool_queue import advise_on_pool, check_asynchronous, open_queu
 from .evaluation.returned_values import ErrorCapturing
 from .evaluation.user_functions import UserFunctions
 from .interrupts import deferred_interrupts, interrupts_end_the_run
+from .judgement.checks import check_likelihood
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
 from .moves.fast_parameters import with_fast_sweeps
@@ -591,7 +592,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         stored, made = self._output.result.ladder, recording.result.ladder
         if [stage._replace(seconds=0.0) for stage in stored] == [stage._replace(seconds=0.0) for stage in made]:
             recording.result = recording.result._replace(ladder=stored)  # with the wall times of the evaluations
-        found = (Concern(not_normalised, False),) if not_normalised else ()
+        coords, log_prob = self._record.first(self.nwalkers)
+        said = check_likelihood(log_prob, self._evaluator.log_prior(coords))
+        for concern in said:
+            warn(concern.message)
+        found = (*said, *((Concern(not_normalised, False),) if not_normalised else ()))
         self._result = recording.result._replace(
             findings=(*recording.result.findings, *found),
             concerns=() if guidance is None else guidance.guide.concerns,

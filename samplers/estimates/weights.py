@@ -19,6 +19,7 @@ Chan & Lai (2013), Ann. Stat. 41(6), doi:10.1214/13-AOS1172 (standard error of t
 import numpy as np
 
 __all__ = [
+    "LOWEST",
     "WHERE_TO_LOOK",
     "EvidenceError",
     "coarse_weights",
@@ -31,6 +32,8 @@ WHERE_TO_LOOK = (
     "check the model and the prior, and see the failures that the model reports (posterior.report() in fe_likelihoods)"
 )
 WEIGHT_GRID = 4096.0
+# Below this log-likelihood, rounding errors exceed 1, so that it compares no points: it is as good as -inf.
+LOWEST = -1.0 / np.finfo(float).eps
 
 
 def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import EvidenceCheck, efficiencies, fits_poorly
-from ..estimates.weights import normalised_weights
+from ..estimates.weights import LOWEST, normalised_weights
 from ..proposals.mixture import Mixture, invert_roots, location_and_root, log_responsibilities
 from ..reports import Concern, Stage
 from .modes import find_modes
@@ -24,6 +24,7 @@ __all__ = [
     "check_fallback",
     "check_fit",
     "check_guide_against_recycling",
+    "check_likelihood",
     "check_mode_shares",
     "check_shares",
     "check_stages",
@@ -54,6 +55,8 @@ SMOOTH_WEIGHTS = 0.6
 # in 10 dimensions, where the nearest points are far away.
 ROUGH_WEIGHTS = 0.25
 NEIGHBOURS = 3
+# Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of long sums.
+ROUNDING = 1e-9
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
 # Differences of evidences and shares, and of means in many parameters, are reported beyond this many standard errors.
@@ -75,6 +78,36 @@ class WeightedRun(Protocol):
 
 def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
     return stage.distinct_ancestors < max(ndim + 2, nwalkers // 50)
+
+
+def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concern]:
+    """A concern if the log-likelihood has one value at all points that a run begins with, so that it tells nothing.
+
+    The posterior is then the prior, or it is where none of these points is, and the value is a penalty or comes from a
+    model that ignores its parameters. A value of 0 beside -inf is the likelihood of an indicator, which is right.
+
+    Parameters
+    ----------
+    log_prob, log_prior : (n,) float
+        Log-probabilities and log-priors of the first evaluated points, which are draws of the prior or of a guide.
+    """
+    known = np.isfinite(log_prob)
+    if np.count_nonzero(known) < 2:
+        return []
+    values = log_prob[known] - log_prior[known]
+    error = ROUNDING * (1.0 + np.abs([log_prob[known], log_prior[known]]).max())
+    if np.ptp(values) > error or (not known.all() and np.abs(values).max() <= error):
+        return []
+    others = (
+        "" if known.all() else f" (the other {len(known) - len(values)} failed or have -inf; inside, an indicator is 0)"
+    )
+    message = (
+        f"the log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with{others}: it is a "
+        "penalty in place of a failure, or the model ignores its parameters, or the data are not used. The result is "
+        "the prior, and a posterior elsewhere was not found. Look at responses to a few draws of the prior; let failed "
+        "simulations raise an exception or return NaN, and narrow the prior to where the model works"
+    )
+    return [Concern(message, True)]
 
 
 def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Concern]:
@@ -286,7 +319,7 @@ def check_fit(
 
 def _neighbour_correlation(coords: np.ndarray, log_weights: np.ndarray) -> float:
     """Correlation of log-weights (n,) with their mean over the three nearest points, in whitened parameters."""
-    possible = log_weights > -np.inf
+    possible = log_weights > LOWEST
     weights = np.where(possible, np.exp(log_weights - log_weights.max()), 0.0)
     _, root = location_and_root(coords, weights / weights.sum())
     white, values = coords[possible] @ invert_roots(root[None])[0].T, log_weights[possible]

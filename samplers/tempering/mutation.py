@@ -14,6 +14,7 @@ from emcee.model import Model
 from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
+from ..estimates.weights import LOWEST
 from ..moves.fast_parameters import WithFastSweeps
 from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
@@ -219,7 +220,8 @@ class StartCorrelation:
 
     @staticmethod
     def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:
-        columns = np.column_stack([coords, records["log_prob"] - records["log_prior"]])
+        log_likelihood = np.maximum(records["log_prob"] - records["log_prior"], LOWEST)  # whose squares are finite
+        columns = np.column_stack([coords, log_likelihood])
         return columns - columns.mean(axis=0)
 
     def update(self, coords: np.ndarray, records: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..estimates.weights import WHERE_TO_LOOK, effective_sample_size
+from ..estimates.weights import LOWEST, WHERE_TO_LOOK, effective_sample_size
 
 __all__ = ["next_beta"]
 
@@ -37,11 +37,12 @@ def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.n
     Raises
     ------
     ValueError
-        If no log-likelihood is finite.
+        If no log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300 are.
     """
     top = np.max(log_likelihood)
-    if top == -np.inf:
-        raise ValueError(f"no point of the population has a finite log-likelihood; {WHERE_TO_LOOK}")
+    if top < LOWEST:
+        finite = "" if top == -np.inf else f" above {LOWEST:.2g}, where rounding errors exceed 1 (largest: {top:.4g})"
+        raise ValueError(f"no point of the population has a finite log-likelihood{finite}; {WHERE_TO_LOOK}")
     alive = log_likelihood > -np.inf
     relative = log_likelihood[alive] - top
     if base is None:

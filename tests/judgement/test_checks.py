@@ -1,5 +1,6 @@
 """Alarms: each one on runs that are wrong and on runs that are right."""
 
+import re
 import warnings
 
 import numpy as np
@@ -8,10 +9,11 @@ from scipy import stats
 
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler
 from samplers.estimates.importance import EvidenceCheck, expected_efficiency
-from samplers.judgement.checks import check_evidence, check_fallback
+from samplers.judgement.checks import check_evidence, check_fallback, check_likelihood
 from samplers.proposals.mixture import fit_mixture, log_density
 from samplers.reports import Stage
 from tests.statistics import analytic_posteriors as analytic
+from tests.tempering.guides import FixedGuide
 
 
 def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
@@ -142,3 +144,93 @@ def test_modes_that_the_moves_do_not_connect_are_no_converged_result(Sampler):
 def test_modes_that_the_moves_connect_are_converged():
     found = _largest_shares(2, 250, range(4), TMCMCSampler)
     assert all(abs(error) < 0.12 and status == "converged" for error, status in found)
+
+
+LOG_PRIOR = np.array([-1.0, -7.3, -900.0, -2.0])
+INF = np.inf
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[0.0] * 4, [-37.25] * 4, [-1e10] * 4, [-1e300] * 4, [-1e10, np.nan, -1e10, -1e10], [-1e10, -INF, -1e10, -1e10],
+     [-1e10, -1e10 + 1e-6, -1e10, -1e10]],
+)  # fmt: skip
+def test_one_log_likelihood_at_all_first_points_is_grave(values):
+    (doubt,) = check_likelihood(np.array(values) + LOG_PRIOR, LOG_PRIOR)
+    assert doubt.grave and f"the log-likelihood is {values[0]:.6g} at all" in doubt.message
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[0.0, 0.0, -INF, 0.0], [0.0, 0.0, 0.0, -1e-3], [-1e300, -1e300, -3.0, -1e300], [-INF, -INF, -3.0, -INF],
+     [-2.0, -2.5, -2.0, -2.0]],
+    ids=["indicator", "weak data", "penalties", "one possible point", "steps"],
+)  # fmt: skip
+def test_log_likelihoods_that_differ_raise_no_doubt(values):
+    assert check_likelihood(np.array(values) + LOG_PRIOR, LOG_PRIOR) == []
+
+
+class Plateau:
+    """Standard normal prior in two dimensions; the log-likelihood is `value` unless the first parameter exceeds `edge`,
+    where the data speak of it, or the likelihood is 1 if `certain`."""
+
+    ndim = 2
+
+    def __init__(self, value, edge=INF, certain=False):
+        self.value, self.edge, self.certain = value, edge, certain
+
+    def log_prior(self, coords):
+        return stats.norm.logpdf(coords).sum(axis=-1)
+
+    def sample_prior(self, n, random):
+        return random.standard_normal((n, 2))
+
+    def __call__(self, coords):
+        inside = coords[..., 0] > self.edge
+        fit = np.where(self.certain, 0.0, -0.5 * np.square(coords).sum(axis=-1))
+        return self.log_prior(coords) + np.where(inside, fit, self.value)
+
+
+@pytest.mark.parametrize(("Sampler", "vectorize"), [(SMCSampler, True), (TMCMCSampler, False)])
+@pytest.mark.parametrize(("value", "edge"), [(0.0, INF), (-1e10, INF), (-1e10, 5.0)], ids=["flat", "all", "far corner"])
+def test_a_plateau_at_all_draws_of_the_prior_is_not_usable_and_is_named(Sampler, value, edge, vectorize):
+    sampler = Sampler(60, 2, Plateau(value, edge), vectorize=vectorize, seed=1)
+    with pytest.warns(SamplingWarning, match=re.escape(f"log-likelihood is {value:.6g} at all 60 points")):
+        sampler.run_mcmc(None, 1)
+    assert sampler.verdict.status == "not usable" and "draws of the prior" in str(sampler.verdict)
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+@pytest.mark.parametrize("recycle", [True, False])
+def test_nearly_minus_infinity_at_all_draws_is_an_error_as_minus_infinity_is(Sampler, recycle):
+    settings = {"recycle": recycle} if Sampler is SMCSampler else {}
+    for value in (-INF, -1e300, -5e29):
+        with pytest.raises(ValueError, match="no point|starting points"):
+            Sampler(60, 2, Plateau(value), vectorize=True, seed=1, **settings).run_mcmc(None, 1)
+
+
+def test_draws_of_a_guide_on_a_plateau_are_not_usable():
+    for value in (-1e10, -1e300):
+        posterior = Plateau(value)
+        guide = FixedGuide(posterior, [[0.0, 0.0]], [np.eye(2)])
+        sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, guide=guide)
+        with pytest.warns(SamplingWarning, match="at all 100 points"):
+            sampler.run_mcmc(None, 0)
+        assert sampler.verdict.status == "not usable"
+
+
+@pytest.mark.parametrize("value", [-1e10, -1e300])
+@pytest.mark.parametrize("certain", [False, True])
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_penalties_at_a_part_of_the_draws_are_a_hard_edge(Sampler, certain, value):
+    """Above 0.5, with or without data: 69 % of the draws have the penalty."""
+    posterior = Plateau(value, 0.5, certain)
+    expected = stats.norm.logsf(0.5) if certain else np.log(0.5) + stats.norm.logsf(np.sqrt(0.5))
+    log_evidences = []
+    for seed in range(12):
+        sampler = Sampler(100, 2, posterior, vectorize=True, seed=seed)
+        sampler.run_mcmc(None, 1)
+        assert "began with" not in str(sampler.verdict) and sampler.get_chain()[..., 0].min() > 0.5
+        log_evidences.append(sampler.log_evidence)
+    error = np.std(log_evidences, ddof=1) / np.sqrt(12)
+    assert abs(np.mean(log_evidences) - expected) < stats.t(11).isf(1e-5) * error
