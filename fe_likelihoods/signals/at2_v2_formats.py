@@ -42,12 +42,15 @@ from .text_files import (
     check_count,
     check_peak,
     decimals_of,
+    decode_text,
     fixed_width_samples,
     is_number,
+    number_cells,
     parse_count,
     parse_number,
     read_bytes,
 )
+from .uneven_times import without_repeated_times
 
 __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
@@ -56,7 +59,7 @@ _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
 _AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
 _SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
-_UNITS_OF = re.compile(r"UNITS\s+OF\s+([^\s,;]+?)[.]?(?=[\s,;]|$)", re.IGNORECASE)
+_UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
 _CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
 _CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
 _CSMIP_END = re.compile(r"^\s*/&")
@@ -133,7 +136,9 @@ def parse_at2(text: str, file: str) -> Series:
             f"{len(lines)} lines; read plain columns of numbers with read_csv"
         )
     units = _UNITS_OF.search("\n".join(lines[:index]))
-    fields = [(index + offset, field) for offset, row in enumerate(lines[index + 1 :], 2) for field in row.split()]
+    rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
+    cells = number_cells([row for _, row in rows])
+    fields = [(number, field) for (number, _), row in zip(rows, cells, strict=True) for field in row]
     values = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
     where = f"{file}: NPTS in line {index + 1}"
     check_count(values.size, parse_count(stated[0], where), where)
@@ -158,15 +163,17 @@ def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Chan
     """Return the channels with acceleration in a V1 or V2 file, or in the V2, else V1 files of an archive."""
     content = read_bytes(path)
     files = list(_unzip(content, str(path))) if zipfile.is_zipfile(io.BytesIO(content)) else [(str(path), content)]
+    files = list(dict.fromkeys(files))  # an archive may hold the same file twice
     if member is not None:
-        files = [(name, data) for name, data in files if name.lower().endswith(member.lower())]
+        exact = [(name, data) for name, data in files if name == f"{path}/{member}"]
+        files = exact or [(name, data) for name, data in files if name.lower().endswith(member.lower())]
     elif len(files) > 1:  # corrected acceleration, if there is any
         for ends in ((".v2", ".v2c"), (".v1", ".v1c")):
             found = [(name, data) for name, data in files if name.lower().endswith(ends)]
             if found:
                 break
         files = found
-    channels = [channel for name, data in files for channel in _split_v2(data.decode("latin-1"), name)]
+    channels = [channel for name, data in files for channel in _split_v2(decode_text(data), name)]
     if not channels:
         raise ValueError(
             f"{path}: expected a CSMIP or COSMOS V1 or V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT "
@@ -263,6 +270,8 @@ def _parse_v1(channel: V2Channel) -> Series:
     largest = scale * float(np.abs(values).max())
     if unit.lower() in ("g", "g/10"):
         check_peak(largest, abs(float(peak)), rounding, where)
+    if times is not None:
+        times, values = without_repeated_times(times, values)
     return Series(f"{channel.label}, uncorrected", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times)
 
 
