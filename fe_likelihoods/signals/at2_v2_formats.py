@@ -56,7 +56,7 @@ __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
 # Expressions are searched from one place in a line, and their parts never match the same text: their time is linear.
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
-_AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
+_AT2_STEP = re.compile(rf"\bDT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
 _SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
 _UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
@@ -153,7 +153,7 @@ def parse_at2(text: str, file: str) -> Series:
 
 def _at2_header(line: str) -> tuple[str, str, str] | None:
     """Number of samples, step and unit of the step, as stated in a line of an AT2 header; None for other lines."""
-    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line, count.end())):
+    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line)):
         return count[1], step[1], step[2]
     old = _AT2_OLD.match(line)
     return (old[1], old[2], "") if old else None

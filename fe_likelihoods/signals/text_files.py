@@ -132,9 +132,9 @@ def number_cells(lines: list[str]) -> list[list[str]]:
     """
     rows = [[part for field in line.split() for part in _apart(field)] for line in lines]
     if any(cell.count(".") > 1 for row in rows for cell in row):
-        for first in (0, 1):  # the first line may announce the others
-            if fields := _aligned([line.rstrip() for line in lines[first:]]):
-                return rows[:first] + fields
+        first = sum(cell.count(".") for cell in rows[0]) == 1  # a line that announces number and step of the others
+        fields = _aligned([line.rstrip() for line in lines[first:]])
+        return rows if fields is None else rows[:first] + fields
     return rows
 
 
@@ -145,22 +145,22 @@ def _apart(field: str) -> list[str]:
 
 
 def _aligned(lines: list[str]) -> list[list[str]] | None:
-    """The fields of a Fortran format, whose decimal points are at equal distances in the same columns; else None."""
+    """The fields of a Fortran format with three numbers or more, whose points are at equal distances; else None."""
     points = [[match.start() for match in re.finditer(r"\.", line)] for line in lines]
     most = max(points, key=len, default=[])
-    if len(most) < 2 or any(found != most[: len(found)] or not found for found in points):
+    if len(most) < 3 or any(found != most[: len(found)] or not found for found in points):
         return None
     width, after = most[1] - most[0], len(lines[0]) - points[0][-1]  # columns of a field, and from its point to its end
     starts = [point + after - width for point in most]
     fields = [
-        [line[max(start, 0) : start + width].strip() for start in starts[: len(found)]]
+        [line[start : start + width].strip() for start in starts[: len(found)]]
         for line, found in zip(lines, points, strict=True)
     ]
     whole = (
-        len(line) == starts[len(row) - 1] + width and not line[: max(starts[0], 0)].strip()
+        len(line) == starts[len(row) - 1] + width and not line[: starts[0]].strip()
         for line, row in zip(lines, fields, strict=True)
     )
-    even = all(b - a == width for a, b in itertools.pairwise(most))
+    even = all(b - a == width for a, b in itertools.pairwise(most)) and starts[0] >= 0
     return fields if even and all(whole) and all(is_number(cell) for row in fields for cell in row) else None
 
 
@@ -265,6 +265,8 @@ def fixed_width_samples(
         values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
     if len(values) < 2:
         raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
+    if len(line) % width and len(lines[start].rstrip()) % width == 0:  # the last line ends within a number
+        raise ValueError(f"{where}: expected numbers of {width} columns, the last one is cut; the file is truncated")
     return np.array(values)
 
 
