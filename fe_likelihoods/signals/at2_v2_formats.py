@@ -36,6 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .header_statements import check_peaks, read_statements
 from .text_files import (
     NUMBER,
     Series,
@@ -75,6 +76,7 @@ _V1_UNITS = re.compile(r"units\s+of\s+uncor\s+\w+\s+are\s+sec\s+and\s+(g/10|g)\b
 _V1_TEXT, _V1_INTEGERS, _V1_REALS = 13, (100, 16, 5), (50, 8, 10)  # lines; numbers, per line, columns
 _V1_COUNT, _V1_LENGTH, _V1_PEAK, _V1_PAIRS = 28, 3, 7, (10, 7)  # positions in the headers, from 1
 _V1_HEADER = _V1_TEXT + math.ceil(100 / 16) + math.ceil(50 / 8)
+_V2_TEXT = 25
 _CSMIP_FORMAT = (8, 10)  # numbers per line, columns per number
 _CSMIP_REALS, _CSMIP_DT = (
     100,
@@ -137,6 +139,8 @@ def parse_at2(text: str, file: str) -> Series:
         )
     units = _UNITS_OF.search("\n".join(lines[:index]))
     rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
+    while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
+        rows.pop()  # a closing remark in any words: the number of samples is stated
     cells = number_cells([row for _, row in rows])
     fields = [(number, field) for (number, _), row in zip(rows, cells, strict=True) for field in row]
     values = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
@@ -226,6 +230,9 @@ def parse_v2(channel: V2Channel) -> Series:
         )
     count = parse_count(match[1], f"{where}, line {channel.first + index}")
     values = _fixed_width(channel, index + 1, count, (per_line, width))
+    if _CSMIP_DATA.match(line):
+        decimals = decimals_of(lines[index + 1][:width].strip())
+        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, where)
     return Series(channel.label + uncorrected, dt, unit, values)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import find_unit
-from .table_statements import Statements, check_peaks
+from .header_statements import Statements, check_peaks
 from .table_times import row_times, table_step, time_column
 from .tables import Table, listed_columns, named_places, stated_unit
 from .text_files import Series, agree_on_unit
@@ -113,17 +113,15 @@ def _text_unit(table: Table, place: int, dimension: str, others: bool) -> str | 
 
     With other units known (`others`), text that is no unit is ignored, except for counts.
     """
-    alone = len(_value_columns(table)) == 1
+    columns = _value_columns(table)
     for _, name in table.stated.units:
-        known = _dimension(name)
+        known, alone = _dimension(name), len(columns) == 1
         if known == dimension or (alone and known != "time" and (known or not others or "count" in name.lower())):
             return name
-    if dimension == "acceleration" and not others:
-        return next(
-            (peak.unit for peak in table.stated.peaks if peak.unit and peak.printed_of(_name(table, place), alone)),
-            None,
-        )
-    return None
+    if dimension != "acceleration" or others or place not in columns:
+        return None
+    names, index = [_name(table, k) for k in columns], columns.index(place)
+    return next((peak.unit for peak in table.stated.peaks if peak.unit and peak.printed_of(names, index)), None)
 
 
 def _dimension(unit: str) -> str | None:
@@ -143,10 +141,10 @@ def unit_of_column(table: Table, place: int, given: str | None, dimension: str, 
     text = _text_unit(table, place, dimension, others=named is not None or given is not None)
     stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
     unit = agree_on_unit(stated, given, dimension, where)
-    values = table.values[:, place]
+    values, columns = table.values[:, place], _value_columns(table)
     if dimension == "acceleration" and table.stated.peaks and not np.isnan(values).any():
-        alone = len(_value_columns(table)) == 1
-        check_peaks(table.stated.peaks, _name(table, place), alone, values, table.decimals[place], unit, table.file)
+        names = [_name(table, k) for k in columns]
+        check_peaks(table.stated.peaks, names, columns.index(place), values, table.decimals[place], unit, table.file)
     return unit
 
 

@@ -73,7 +73,8 @@ def table_step(table: Table, dt: float | None = None) -> float:
     for each in table.stated.steps:
         if not each.fits(chosen, tolerance):
             raise ValueError(
-                f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one"
+                f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one, "
+                "or give skip= to leave out text that is about other samples"
             )
     return chosen
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..units import find_unit
 from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight
+from .header_statements import Statements, read_statements
 from .table_rows import read_rows
-from .table_statements import Statements, read_statements
-from .text_files import agree_on_unit, check_count, decimals_of, is_number, parse_number
+from .text_files import agree_on_unit, decimals_of, is_number, parse_number
 
 __all__ = ["Table", "column_unit", "listed_columns", "named_places", "read_table", "stated_unit"]
 
@@ -132,7 +132,11 @@ def read_table(
     numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
     stated = read_statements([*rows.comments, *rows.above])
     for text, count in stated.counts:
-        check_count(len(values), count, f"{file}: {text!r}")
+        if len(values) != count:
+            raise ValueError(
+                f"{file}: {text!r} announces {count} samples, the file has {len(values)}; it is truncated or damaged. "
+                "If the text is about other samples, give skip= to leave it out"
+            )
     table = Table(file, *numbers, frozenset(clocks), frozenset(dates), clock, None, stated)
     return table if time is None else table._replace(time=_time_place(table, time))
 

@@ -137,8 +137,13 @@ def test_overflow_and_words_at_the_end_are_no_closing_remarks(tmp_path):
     for last in ("*******", "overload", "NaN", "0.03,***", "0.03"):
         with pytest.raises(ValueError, match="line 4: expected"):
             read(tmp_path, "a.csv", f"time_s,acc_g\n0.00,1\n0.01,2\n{last}\n")
-        with pytest.raises(ValueError, match="line 13: expected|announces"):
-            read(tmp_path, "a.AT2", at2(end=(last.replace(",", " "),)))
+        if last != "overload":  # the number of samples is stated
+            with pytest.raises(ValueError, match="line 13: expected|announces"):
+                read(tmp_path, "a.AT2", at2(end=(last.replace(",", " "),)))
+    lines = at2(end=("Processed by nobody",)).splitlines()
+    assert read(tmp_path, "a.AT2", text(*lines)).n_steps == 40
+    with pytest.raises(ValueError, match="announces 40 samples, the file has 35"):
+        read(tmp_path, "a.AT2", text(*lines[:-2], lines[-1]))
 
 
 @pytest.mark.parametrize("units", ["UNITS OF G", "UNITS OF G.", "the units are (g)", "units: g", "UNIT = G"])
@@ -250,6 +255,10 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
     np.testing.assert_allclose(record.acceleration, 0.02 * SAMPLES, rtol=1e-12)
     measured = read_columns(tmp_path / "a.txt", [TOP], ["U-D"])
     np.testing.assert_allclose(measured.values[0], 0.03 * SAMPLES, rtol=1e-12)
+    unnamed = text(*(line for line in afad(names).splitlines() if not line.startswith("N-S")))
+    assert same(read(tmp_path, "a.txt", unnamed, column=2), record)
+    with pytest.raises(ValueError, match="states 'PGA VALUES"):
+        read_record(tmp_path / "a.txt", column=2, units="g")
 
 
 @pytest.mark.parametrize(
@@ -299,6 +308,7 @@ def test_a_contradiction_of_what_a_header_states_is_refused(tmp_path, content, g
         ("Sampling period [ms] : 5", 0.005),
         ("dt = 5 ms", 0.005),
         ("Time step 0.005 seconds", 0.005),
+        ("2 points at equal spacing of 0.005 sec", 0.005),
     ],
 )
 def test_the_stated_step_is_used(tmp_path, line, step):
@@ -316,6 +326,8 @@ def test_the_stated_step_is_used(tmp_path, line, step):
         "DT=0.010",
         "Time steps: 4000",
         "Time unit: s",
+        "Scan interval: 10 min",
+        "Samples per second: 100",
         "Peak velocity: 12.5 cm/s",
         "PGA: 4",
         "PGA (g): 4.0",
@@ -382,6 +394,14 @@ def test_a_scale_factor_without_a_number_is_one_gal(tmp_path):
 def test_a_unit_with_a_period_is_read(tmp_path):
     record = read(tmp_path, "a.V1c", text(*cosmos(1, 1e-3 * VALUES, 0.005, units="g. (2)")))
     np.testing.assert_allclose(record.acceleration, 1e-3 * VALUES * G0, rtol=1e-6)
+
+
+def test_the_stated_peak_of_v2_is_compared(tmp_path):
+    lines = csmip(1, VALUES, 0.0125, " .013 sec, in cm/sec2. (8f10.6)")
+    lines[18] = f"Peak acceleration = {VALUES[np.argmax(np.abs(VALUES))]:9.3f}    cm/sec/sec   at  0.063 sec"
+    assert read(tmp_path, "a.V2", text(*lines)).n_steps == 61
+    with pytest.raises(ValueError, match="the file states 'Peak acceleration"):
+        read(tmp_path, "a.V2", text(*lines).replace("in cm/sec2", "in mm/sec2"))
 
 
 def test_samples_of_geonet_may_be_cut_to_fewer_digits_than_the_peak(tmp_path):
@@ -488,6 +508,6 @@ def test_components_and_columns_that_are_there_twice_are_listed_in_valid_toml(tm
 
 def test_a_bad_at2_file_is_still_named(tmp_path):
     path = tmp_path / "a.AT2"
-    path.write_bytes(at2().encode() + b"abc\x1a")
-    with pytest.raises(ValueError, match="line 13: expected a number, got 'abc'"):
+    path.write_bytes(at2().replace("E-02", "E-abc", 1).encode() + b"\x1a")
+    with pytest.raises(ValueError, match="line 5: expected a number, got '.*E-abc'"):
         read_at2(path)

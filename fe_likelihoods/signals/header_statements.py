@@ -1,4 +1,4 @@
-"""What the text above a table states about its samples: step, number, unit and peak.
+"""What the text above samples states about them: step, number, unit and peak.
 
 Loggers and networks print such lines in their own words (``SAMPLING INTERVAL (sec) : 0.01``, ``Sampling rate,200 Hz``,
 ``NPTS=40, DT=0.01``, ``RAW PGA VALUES (gal) : (N-S) 97.4``). They are compared with the arguments of a reader and with
@@ -22,12 +22,14 @@ __all__ = ["StatedPeak", "StatedStep", "Statements", "check_peaks", "read_statem
 _IS = r"\s*[:=,;\t]*\s*"
 _UNIT = r"(?:[\[(]\s*([^\])]{1,20}?)\s*[\])])?"
 _STEP = re.compile(
-    r"\b(?:dt|delta[ _]?t|(?:sampl(?:ing|e)|time|scan)[ _-]?(?:interval|step|period|increment))"
+    r"\b(?:dt|delta[ _]?t|(?:sampl(?:ing|e)|time|scan)[ _-]?(?:interval|step|period|increment)|"
+    r"equal(?:ly)?\s+spac(?:ing\s+of|ed\s+at)|intervals\s+of)"
     rf"(?:_(s|ms)\b)?\s*{_UNIT}{_IS}({NUMBER})\s*([a-z]*)",
     re.IGNORECASE,
 )
 _RATE = re.compile(
-    rf"\b(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)\s*{_UNIT}{_IS}({NUMBER})\s*"
+    r"\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|samples per sec(?:ond)?\b)"
+    rf"\s*{_UNIT}{_IS}({NUMBER})\s*"
     r"(k?hz|sps|(?:samples|pts|points)\s*(?:per|/)\s*s(?:ec(?:ond)?)?)?",
     re.IGNORECASE,
 )
@@ -36,7 +38,7 @@ _COUNT = re.compile(
     rf"(?:number|no\.?|num)[ _]of[ _]points){_IS}(\d+)(?![\d.])",
     re.IGNORECASE,
 )
-_UNIT_LINE = re.compile(r"\bunits?(?:\s+of(?:\s+acceleration)?)?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
+_UNIT_LINE = re.compile(r"\bunits?(?:\s+of\s+[a-z]{1,20})?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
 _UNITS_ARE = re.compile(r"\bunits?\s+(?:of|are|is)\s+[(\[]?\s*([^\s,;()\[\]]+)", re.IGNORECASE)
 _PEAK = re.compile(
     rf"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?)(?:\s+values?)?\s*{_UNIT}\s*[:=]\s*(.{{0,200}})",
@@ -44,8 +46,10 @@ _PEAK = re.compile(
 )
 _NAMED = re.compile(rf"\(([^)]{{1,40}})\)\s*({NUMBER})")
 _PLAIN = re.compile(rf"({NUMBER})\s*(\S*)")
+_LONGER = ("min", "minutes", "h", "hours")  # loggers of temperature
+_LONGEST = 10_000  # letters of a line that are searched
 _HERTZ = {"khz": 1e3}
-_LARGEST_ROUNDING = 0.005  # of a step; more than this is another step
+_LARGEST_ROUNDING = 0.005  # relative, of a number with three digits; with fewer ones, such as 0.01, a step is exact
 
 
 class StatedStep(NamedTuple):
@@ -87,10 +91,11 @@ class StatedPeak(NamedTuple):
     unit: str | None
     printed: dict[str, str]
 
-    def printed_of(self, name: str, alone: bool) -> str | None:
-        """The number for a column; if the file has no other column of values (`alone`), the only number."""
-        only = next(iter(self.printed.values())) if alone and len(self.printed) == 1 else None
-        return self.printed.get(name, only)
+    def printed_of(self, names: Sequence[str], index: int) -> str | None:
+        """The number for one of the columns of values: by its name, or where no name is there by its place."""
+        if any(name in self.printed for name in names):
+            return self.printed.get(names[index])
+        return list(self.printed.values())[index] if len(self.printed) == len(names) else None
 
 
 class Statements(NamedTuple):
@@ -115,10 +120,10 @@ class Statements(NamedTuple):
 def read_statements(lines: Sequence[str]) -> Statements:
     """Return what lines of text state."""
     steps, counts, units, peaks = [], [], [], []
-    for line in (each[:1000] for each in lines):
+    for line in (each[:_LONGEST] for each in lines):
         steps += [found for match in _STEP.finditer(line) if (found := _stated_step(match))]
         steps += [found for match in _RATE.finditer(line) if (found := _stated_rate(match))]
-        counts += [(match[0], parse_count(match[1], match[0])) for match in _COUNT.finditer(line)]
+        counts += [(match[0], parse_count(match[1], match[0][:60])) for match in _COUNT.finditer(line)]
         units += [(match[0], match[1]) for match in _UNIT_LINE.finditer(line)]
         units += [(match[0], match[1]) for match in _UNITS_ARE.finditer(line) if _is_acceleration(match[1])]
         peaks += [found for match in _PEAK.finditer(line) if (found := _stated_peak(match)).printed]
@@ -129,7 +134,7 @@ def _stated_step(match: re.Match[str]) -> StatedStep | None:
     ending, bracket, printed, unit = match.groups()
     number, stated = float(printed), [_time_unit(each) for each in (ending, bracket, unit) if each]
     known = [each for each in stated if each is not None]
-    if not number > 0.0 or (bracket and not known):  # brackets around something else
+    if not number > 0.0 or (bracket and not known) or unit.lower() in _LONGER:  # brackets around something else
         return None
     factors = known[:1] or [1.0, 1e-3, 1e-6]
     return StatedStep(match[0].strip(), tuple(number * factor for factor in factors), _rounding(printed))
@@ -173,8 +178,8 @@ def _is_acceleration(unit: str) -> bool:
 
 def check_peaks(
     peaks: Sequence[StatedPeak],
-    name: str,
-    alone: bool,
+    names: Sequence[str],
+    index: int,
     values: NDArray[np.float64],
     decimals: int,
     unit: str,
@@ -186,10 +191,10 @@ def check_peaks(
     ----------
     peaks : sequence of StatedPeak
         What the file states.
-    name : str
-        Name of the column.
-    alone : bool
-        Whether the file has no other column of values, so that a peak without a name is the peak of this one.
+    names : sequence of str
+        Names of all columns of values.
+    index : int
+        Place of the column among them.
     values : ndarray, shape (n_rows,)
         The samples as printed, without missing ones.
     decimals : int
@@ -202,7 +207,7 @@ def check_peaks(
     factor = float(to_si(1.0, unit))
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
     for peak in peaks:
-        printed = peak.printed_of(name, alone)
+        printed = peak.printed_of(names, index)
         if printed is None:
             continue
         known = (
