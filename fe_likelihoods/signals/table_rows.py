@@ -129,15 +129,21 @@ def _cells_of(lines: list[tuple[int, str]], separator: str, file: str) -> list[t
 
 
 def _along_rows(lines: list[tuple[int, list[str]]], file: str) -> list[tuple[int, list[str]]]:
-    """One row per number of the last lines, all of which but the last one have the same number of cells."""
-    first = len(lines)
-    while first and all(map(_known, lines[first - 1][1])):
-        first -= 1
-    width = len(lines[first][1]) if first < len(lines) else 0
-    for number, cells in lines[first:]:
+    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them."""
+    above = sum(1 for _ in itertools.takewhile(lambda line: _is_title(line[1]), lines))
+    width = len(lines[above][1]) if above < len(lines) else 0
+    for number, cells in lines[above:]:
+        if not all(map(_known, cells)):
+            wrong = next(cell for cell in cells if not _known(cell))
+            raise ValueError(f"{file}, line {number}: expected numbers below lines of text, got {wrong[:100]!r}")
         if len(cells) != width and (number != lines[-1][0] or len(cells) > width):
             raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
-    return [(number, [cell]) for number, cells in lines[first:] for cell in cells]
+    return [(number, [cell]) for number, cells in lines[above:] for cell in cells]
+
+
+def _is_title(cells: list[str]) -> bool:
+    """Whether a line has words, and no more numbers than other cells: a damaged row of numbers is no title."""
+    return any(re.search("[A-Za-z]{2}", cell) for cell in cells) and 2 * sum(map(_known, cells)) <= len(cells)
 
 
 def _announced(lines: list[tuple[int, list[str]]], file: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:

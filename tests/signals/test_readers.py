@@ -25,6 +25,7 @@ REAL_RECORDS = {
     "imperial_valley_1979_meloland_freefield_270": (0.299, 5694, 0.01),
     "imperial_valley_1979_meloland_freefield_360": (0.311, 5690, 0.01),
     "kobe_1995_nishi_akashi_090": (0.503, 4096, 0.01),
+    "kobe_1995_takatori_000": (0.618, 4096, 0.01),
     "loma_prieta_1989_apeel2_redwood_city_133": (0.227, 7183, 0.005),
     "loma_prieta_1989_apeel2_redwood_city_43": (0.278, 7184, 0.005),
     "loma_prieta_1989_apeel2_redwood_city_up": (0.086, 7165, 0.005),

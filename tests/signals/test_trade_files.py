@@ -178,6 +178,17 @@ def test_numbers_that_touch(tmp_path, rows, expected):
     np.testing.assert_allclose(read(tmp_path, "a.AT2", text(*header, *rows)).acceleration, G0 * np.array(expected))
 
 
+@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("mark", ["'", ";", ",", "x", " x ", "..", " ' "])
+def test_a_damaged_row_never_shortens_the_samples(tmp_path, place, mark):
+    for rows in (ROWS, [" 12.34567100.12345111.00000"] * 5):
+        damaged = [*rows[:place], rows[place][:14] + mark + rows[place][14:], *rows[place + 1 :]]
+        with pytest.raises(ValueError, match="expected"):
+            read(tmp_path, "a.dat", text("A title of 1999", *damaged), units="g", dt=0.01, column="rows")
+        intact = read(tmp_path, "a.dat", text("A title of 1999", *rows), units="g", dt=0.01, column="rows")
+        assert intact.n_steps == (39 if rows is ROWS else 15)
+
+
 @pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3", "2-1.5.0", "-12.34567100.123456"])
 def test_numbers_that_may_be_split_in_two_ways_are_refused(tmp_path, row):
     for before in ("1.00000   2.00000", "1.00000   2.00000   3.00000", ""):
