@@ -277,9 +277,12 @@ def _parse_v1(channel: V2Channel) -> Series:
     largest = scale * float(np.abs(values).max())
     if unit.lower() in ("g", "g/10"):
         check_peak(largest, abs(float(peak)), rounding, where)
+    note = ""
     if times is not None:
-        times, values = without_repeated_times(times, values)
-    return Series(f"{channel.label}, uncorrected", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times)
+        times, values, note = without_repeated_times(times, values)
+    return Series(
+        f"{channel.label}, uncorrected{note}", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times
+    )
 
 
 class _Allowance:

@@ -184,6 +184,7 @@ def check_peaks(
     decimals: int,
     unit: str,
     file: str,
+    advice: str = "",
 ) -> None:
     """Raise ValueError if a stated peak is not the peak of a column, with its mean or without it.
 
@@ -203,6 +204,8 @@ def check_peaks(
         Unit of the samples.
     file : str
         The file, for messages.
+    advice : str
+        What else may be done, at the end of the message.
     """
     factor = float(to_si(1.0, unit))
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
@@ -222,5 +225,5 @@ def check_peaks(
         ):
             raise ValueError(
                 f"{file}: the file states {peak.text!r}, the samples have a peak of {found[0]:g} {unit}; the unit is "
-                "wrong, or the file is damaged. If the peak is that of other samples, give skip= to leave the text out"
+                f"wrong, or the file is damaged{advice}"
             )

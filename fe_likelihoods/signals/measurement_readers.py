@@ -226,6 +226,6 @@ def _channel_values(
     for channel, column, unit in zip(channels, columns, given, strict=True):
         place = value_column(table, column)
         where = f"{table.file}, column {column!r}"
-        unit = unit_of_column(table, place, unit, channel.dimension, where)
-        rows.append(to_si(column_values(table, place, missing), unit))
+        values = column_values(table, place, missing)
+        rows.append(to_si(values, unit_of_column(table, place, values, unit, channel.dimension, where)))
     return np.array(rows)

@@ -197,10 +197,11 @@ def parse_smc(text: str, file: str) -> Series:
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
             check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
+    note = ""
     if times is not None:
-        times, values = without_repeated_times(times, values)
+        times, values, note = without_repeated_times(times, values)
     station = next((line.strip() for line in lines[2:_SMC_TEXT] if line.startswith("station")), title)
-    return Series(re.sub(r"\s+", " ", station), math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
+    return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 
 
 def parse_geonet(text: str, file: str) -> list[GeonetComponent]:

@@ -135,16 +135,22 @@ def _name(table: Table, place: int) -> str:
     return table.names[place] if table.names else str(place + 1)
 
 
-def unit_of_column(table: Table, place: int, given: str | None, dimension: str, where: str) -> str:
-    """Return the unit of a column, on which the file and the caller agree; a stated peak acceleration is compared."""
+def unit_of_column(
+    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
+) -> str:
+    """Return the unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
     named = stated_unit(table, place, dimension)
     text = _text_unit(table, place, dimension, others=named is not None or given is not None)
     stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
     unit = agree_on_unit(stated, given, dimension, where)
-    values, columns = table.values[:, place], _value_columns(table)
     if dimension == "acceleration" and table.stated.peaks and not np.isnan(values).any():
-        names = [_name(table, k) for k in columns]
-        check_peaks(table.stated.peaks, names, columns.index(place), values, table.decimals[place], unit, table.file)
+        columns = _value_columns(table)
+        names, advice = (
+            [_name(table, k) for k in columns],
+            ". If the text is about other samples, give skip= to leave it out",
+        )
+        index, decimals = columns.index(place), table.decimals[place]
+        check_peaks(table.stated.peaks, names, index, values, decimals, unit, table.file, advice)
     return unit
 
 
@@ -158,8 +164,8 @@ def csv_series(
 ) -> Series:
     """Return one column of a table as a series, checked against what the file states (see `read_csv`)."""
     place = value_column(table, column)
-    unit = unit_of_column(table, place, units, "acceleration", table.file)
     values = column_values(table, place, missing)
+    unit = unit_of_column(table, place, values, units, "acceleration", table.file)
     warn_if_absent(table, [place], missing, stacklevel=4)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:

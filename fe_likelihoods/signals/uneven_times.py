@@ -147,11 +147,12 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
 
 def without_repeated_times(
     times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return times and samples of a digitised record with the mean of the samples that have the same printed time.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
+    """Return times and samples of a digitised record with the mean of the samples of equal times, and what was done.
 
     Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
     """
     first = np.concatenate([[True], np.diff(times) != 0.0])
     number = np.cumsum(first) - 1
-    return times[first], np.bincount(number, weights=values) / np.bincount(number)
+    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
+    return times[first], np.bincount(number, weights=values) / np.bincount(number), note

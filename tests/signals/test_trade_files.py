@@ -378,6 +378,20 @@ def test_arguments_must_agree_with_a_file_that_states_them(tmp_path, form, unit)
             read_record(tmp_path / name, **{key: value})
 
 
+def test_text_about_other_samples_is_left_out_by_skip(tmp_path):
+    expected = read(tmp_path, "a.txt", afad())
+    for wrong in (afad(peaks=[0.2]), afad(count=41), afad(dt="0.02")):
+        with pytest.raises(ValueError, match="give skip= to leave"):
+            read(tmp_path, "a.txt", wrong, units="gal", dt=0.01)
+        assert same(read_record(tmp_path / "a.txt", skip=4, units="gal", dt=0.01), expected)
+
+
+def test_a_stated_peak_is_compared_without_numbers_for_missing_samples(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(text("PGA (g): 4.0", "time_s acc_g", "0.00 1", "0.01 -9999", "0.02 -4"))
+    assert np.isnan(read_columns(path, [TOP], ["acc_g"], missing=(-9999,)).values[0, 1])
+
+
 def test_read_record_takes_the_arguments_of_a_plain_table(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("Test 7\nt,a,b\n0,1,5\n10,2,6\n20,4,7\n")
@@ -446,6 +460,7 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         record = read_record(path, resample=advised_step(error))
+    assert "mean of samples of equal times (1)" in record.source
     kept = np.delete(np.arange(61), 31)
     values[30] += 0.5  # the mean of the two
     expected = np.interp(record.time, times[kept], values[kept])
