@@ -15,7 +15,7 @@ from ..signals.records import Record
 from ..signals.smc_geonet_knet_esm_formats import parse_geonet
 from ..signals.table_columns import column_values
 from ..signals.table_times import row_times, table_step, time_column
-from ..signals.tables import Table, read_table, stated_unit
+from ..signals.tables import Table, column_names, read_table, stated_unit
 from ..signals.text_files import read_text
 from ..signals.uneven_times import uniform_times
 from ..text_tables import number, text_table
@@ -182,14 +182,12 @@ def _dataset(path: Path) -> _Lines:
 
 def _table(path: Path) -> _Lines:
     table = read_table(path)
-    if not table.names:
-        raise ValueError(f"{path}: the table has {table.values.shape[1]} columns without names; write a header line")
     place = time_column(table)
     options, remarks = _sampling(table, place)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks = [], [], set()
     taken: set[str] = set()
-    for k, name in enumerate(table.names):
+    for k, name in enumerate(column_names(table)):
         if k in table.dates or k in table.clocks or k == place:
             continue
         values = table.values[:, k]
@@ -205,7 +203,7 @@ def _table(path: Path) -> _Lines:
         if table.names.count(name) > 1:
             remarks.append(f"the name {name!r} is that of several columns: rename them")
             continue
-        channel = _name_of_channel(name, taken)
+        channel = _name_of_channel(name if table.names else f"column {name}", taken)
         columns.append((channel, name))
         if unit is None or not _is_unit(unit):
             unstated.append((channel, "?"))
@@ -258,7 +256,7 @@ def _sampling(table: Table, place: int | None) -> tuple[list[str], list[str]]:
             f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
             + (f", {even.gaps.size} gap(s) of up to {even.gaps.max():.4g} s" if even.gaps.size else "")
         ]
-    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {table.names[place]!r}"
+    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {column_names(table)[place]!r}"
     if table.clock is not None:
         start += f", first clock time {_clock_text(table)}"
     return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"]

@@ -321,7 +321,8 @@ def read_csv(
     """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``, or from an Excel workbook.
 
     Cells are separated by commas, semicolons, tabs or blanks. Decimal commas are read where commas do not separate.
-    The text is UTF-8 or Latin-1. Text above the table is left out. Workbooks need the package openpyxl.
+    The text is UTF-8, UTF-16 with a byte-order mark, or Latin-1. Text above the table is not data. Workbooks need the
+    package openpyxl.
 
     The unit is the suffix of the column name (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line
     of units below the header line, the comment ``# units: g``, or `units`. If several are given, they must agree. Times

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..units import find_unit
 from .header_statements import Statements, check_peaks
 from .table_times import row_times, table_step, time_column
-from .tables import Table, listed_columns, named_places, stated_unit
+from .tables import Table, column_names, listed_columns, named_places, stated_unit
 from .text_files import Series, agree_on_unit
 
 __all__ = ["column_values", "csv_series", "unit_of_column", "value_column", "warn_if_absent"]
@@ -120,7 +120,7 @@ def _text_unit(table: Table, place: int, dimension: str, others: bool) -> str | 
             return name
     if dimension != "acceleration" or others or place not in columns:
         return None
-    names, index = [_name(table, k) for k in columns], columns.index(place)
+    names, index = [column_names(table)[k] for k in columns], columns.index(place)
     return next((peak.unit for peak in table.stated.peaks if peak.unit and peak.printed_of(names, index)), None)
 
 
@@ -129,10 +129,6 @@ def _dimension(unit: str) -> str | None:
         return find_unit(unit).dimension
     except ValueError:
         return None
-
-
-def _name(table: Table, place: int) -> str:
-    return table.names[place] if table.names else str(place + 1)
 
 
 def unit_of_column(
@@ -146,7 +142,7 @@ def unit_of_column(
     if dimension == "acceleration" and table.stated.peaks and not np.isnan(values).any():
         columns = _value_columns(table)
         names, advice = (
-            [_name(table, k) for k in columns],
+            [column_names(table)[k] for k in columns],
             ". If the text is about other samples, give skip= to leave it out",
         )
         index, decimals = columns.index(place), table.decimals[place]

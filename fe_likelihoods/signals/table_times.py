@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
 from .clock_times import parse_clock
-from .tables import Table, stated_unit
+from .tables import Table, column_names, stated_unit
 from .text_files import agree_on_unit
 from .uneven_times import uniform_times
 
@@ -153,7 +153,7 @@ def _time_unit(table: Table, place: int) -> str:
         return "s"
     stated, unix = stated_unit(table, place), _unix_unit(table, place)
     if stated is None and table.time_unit is None:
-        name = table.names[place] if table.names else str(place + 1)
+        name = column_names(table)[place]
         if unix is not None and _UNIX.search(name):
             return unix
         hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"

@@ -17,7 +17,7 @@ from .header_statements import Statements, read_statements
 from .table_rows import read_rows
 from .text_files import agree_on_unit, decimals_of, is_number, parse_number
 
-__all__ = ["Table", "column_unit", "listed_columns", "named_places", "read_table", "stated_unit"]
+__all__ = ["Table", "column_names", "column_unit", "listed_columns", "named_places", "read_table", "stated_unit"]
 
 _LONGEST_UNIT = 100
 
@@ -151,10 +151,14 @@ def _time_place(table: Table, time: int | str) -> int:
     return places[0]
 
 
+def column_names(table: Table) -> tuple[str, ...]:
+    """Names of the columns, without a header line their numbers, from 1."""
+    return table.names or tuple(str(k + 1) for k in range(table.values.shape[1]))
+
+
 def named_places(table: Table, column: int | str) -> list[int]:
     """Columns with a name, or without a header line with a number, from 1."""
-    names = table.names or tuple(str(k + 1) for k in range(table.values.shape[1]))
-    return [place for place, name in enumerate(names) if name == str(column)]
+    return [place for place, name in enumerate(column_names(table)) if name == str(column)]
 
 
 def listed_columns(table: Table) -> str:

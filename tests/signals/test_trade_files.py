@@ -520,6 +520,17 @@ def test_an_archive_that_holds_channels_twice_is_listed_in_valid_toml(tmp_path):
     assert len(read_columns(path, channels, list(columns.values())).channels) == 3
 
 
+def test_outputs_without_a_header_line_are_listed_by_numbers(tmp_path):
+    path = tmp_path / "disp.out"
+    path.write_text("0.01 -1.0 0.65\n0.02 -2.0 3.05\n")
+    found = sections(describe_data(path))
+    assert found["measurements"]["columns"] == {"column_1": "1", "column_2": "2", "column_3": "3"}
+    assert (found["record"]["column"], found["record"]["dt"]) == ("1", "? s")
+    path.write_text(EQSIG)
+    found = sections(describe_data(path))["record"]
+    assert read_record(path, column=found["column"], units="g").n_steps == 40 and "dt" not in found
+
+
 def test_components_and_columns_that_are_there_twice_are_listed_in_valid_toml(tmp_path):
     path = tmp_path / "a.V2A"
     path.write_text(text(*geonet({"N 1": VALUES, "Up": VALUES}, 0.02), *geonet({"Up": VALUES, "n": VALUES}, 0.02)))
