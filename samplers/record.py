@@ -341,6 +341,14 @@ class Record:
             self._file.close()
             self._file = None
 
+    def renew(self) -> Path | None:
+        """Begin with an empty record; returns the new name of its file, if it has one."""
+        if self.path is None or not self.path.exists():
+            self._clear()
+            return None
+        self.open()  # another process that writes to the file owns it
+        return self.set_aside("before_reset")
+
     def set_aside(self, ending: str) -> Path:
         """Rename the file, and begin with an empty record; returns the new name."""
         self.close()

@@ -96,9 +96,12 @@ class CallingConvention(NamedTuple):
         return f"a {'list of dictionaries' if self.vectorize else 'dictionary'} of parameters by name (parameter_names)"
 
     def as_points(self, coords: np.ndarray) -> Any:
-        """Points (n, ndim) as functions take them: rows of an array, or dictionaries."""
+        """Points (n, ndim) as functions take them: rows of an array, or dictionaries.
+
+        They are copies, since a function may change its argument.
+        """
         named = self.parameter_names
-        return coords if named is None else ndarray_to_list_of_dicts(coords, named)
+        return coords.copy() if named is None else ndarray_to_list_of_dicts(coords.copy(), named)
 
     def call(
         self,

@@ -5,6 +5,7 @@ stacked; text and blobs of different lengths become objects. Unlike in emcee, Na
 anything that is not a number is refused with an explanation.
 """
 
+import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -179,7 +180,8 @@ class ErrorCapturing:
 
     def __call__(self, points: Any) -> Any:
         try:
-            result = self.function(points, *self.args, **self.kwargs)
+            # a copy, since the points are needed after a function that changes them
+            result = self.function(copy.deepcopy(points), *self.args, **self.kwargs)
             owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result
