@@ -17,10 +17,11 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
-from .emcee_internals import cut_chain, restore_counts, trim_chain
+from .blobs import converted
+from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
 from .judgement.verdict import Verdict
-from .output_file import FileHeld, patient_open, read_object, replace_file
+from .output_file import FileHeld, open_file, patient_open, read_object, replace_file
 from .record import Record
 from .reports import AnnealingResult, Stage, warn
 
@@ -85,7 +86,8 @@ class Output:
     def check_file(self) -> None:
         """Raise ValueError if another program holds the file, which must be written before a run begins."""
         if self._file is not None:
-            self._file.open_to_write().close()
+            self._file.write_back(wait=False)
+            open_file(self._backend, "r+").close()
 
     def keep_in_memory(self) -> None:
         """From now on, a chain whose file another program holds open is kept in memory, up to `write_behind`."""
@@ -106,6 +108,21 @@ class Output:
         elif self._is_unnoted:
             self.step_stored()
 
+    def change_blobs(self, blobs: np.ndarray | None) -> None:
+        """Store the blobs of the chain in the type of the blobs (n, ...) that are stored next."""
+        if blobs is None:
+            return
+
+        def convert(stored: np.ndarray) -> np.ndarray:
+            """Blobs (steps, n, ...) in the new type."""
+            steps, n, *shape = stored.shape
+            flat = converted(stored.reshape(steps * n, *shape), blobs.dtype, tuple(shape))
+            return flat.reshape(stored.shape)
+
+        if change_blobs(self._backend, blobs.dtype, convert):
+            self._summed = 0, 0
+            self.step_stored()
+
     def undo_half_a_step(self) -> None:
         """Remove a step that an error or Ctrl-C has left incomplete."""
         try:
@@ -118,7 +135,7 @@ class Output:
         self.result, self.verdict = result, verdict
         try:
             self._write()
-        except OSError as error:
+        except (OSError, FileHeld) as error:
             logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
 
     def _write(self, run: str | None = None) -> None:
@@ -299,7 +316,7 @@ def run_of_file(backend: HDFBackend) -> str | None:
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
     try:
-        with backend.open() as file:
+        with open_file(backend, "r") as file:
             group = file.get(backend.name)
             if group is None:
                 return None
@@ -325,7 +342,7 @@ def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
             file[made.name].attrs["run"] = run
 
     try:
-        present = backend.open()
+        present = open_file(backend, "r")
     except OSError as error:
         logger.debug("no group is copied from %s: %s", backend.filename, error)
         replace_file(backend, make, None)

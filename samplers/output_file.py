@@ -12,14 +12,13 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 from emcee.backends import Backend, HDFBackend
 
 from .reports import warn
 
-__all__ = ["FileHeld", "PatientOpen", "patient_open", "read_object", "replace_file"]
+__all__ = ["FileHeld", "PatientOpen", "open_file", "patient_open", "read_object", "replace_file"]
 
 logger = logging.getLogger(__name__)
 
@@ -54,17 +53,11 @@ class PatientOpen:
             self.write_back(wait=False)
         if self._copy is None:
             try:
-                return _wait(lambda: type(self._backend).open(self._backend, mode), SECONDS)
+                return _wait(lambda: type(self._backend).open(self._backend, mode))
             except FileHeld:
                 if not self.goes_on or not self._take_copy():
                     raise
         return h5py.File(self._copy, "r" if mode == "r" else "r+")
-
-    def open_to_write(self) -> h5py.File:
-        """The file itself, open for writing; `FileHeld` if another program holds it."""
-        if not self.write_back(wait=True):
-            raise FileHeld(f"another program holds {self._backend.filename} open: close it there, and try again")
-        return self("a")
 
     def _take_copy(self) -> bool:
         """Copy the file to memory; False if another program is changing it."""
@@ -90,7 +83,7 @@ class PatientOpen:
         backend = self._backend
         try:
             with (
-                _wait(lambda: h5py.File(backend.filename, "r+"), SECONDS if wait else 0.0) as present,
+                open_file(backend, "r+", wait) as present,
                 h5py.File(self._copy, "r") as ours,
             ):
 
@@ -106,12 +99,12 @@ class PatientOpen:
         return True
 
 
-def _wait(open_file: Callable[[], Any], seconds: float) -> Any:
+def _wait(opens: Callable[[], h5py.File], seconds: float | None = None) -> h5py.File:
     """The file that a function opens; `FileHeld` if another program holds it open for longer than some seconds."""
-    end = time.monotonic() + seconds
+    end = time.monotonic() + (SECONDS if seconds is None else seconds)
     while True:
         try:
-            return open_file()
+            return opens()
         except OSError as error:
             if not isinstance(error, BlockingIOError) and "already open" not in str(error):
                 raise
@@ -120,6 +113,11 @@ def _wait(open_file: Callable[[], Any], seconds: float) -> Any:
                     f"another program holds the file open ({error}): close it there, and try again"
                 ) from error
         time.sleep(PAUSE)
+
+
+def open_file(backend: HDFBackend, mode: str, wait: bool = True) -> h5py.File:
+    """The file of a backend itself, not its copy in memory; `FileHeld` if another program holds it open."""
+    return _wait(lambda: h5py.File(backend.filename, mode), None if wait else 0.0)
 
 
 def patient_open(backend: Backend) -> PatientOpen | None:

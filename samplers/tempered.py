@@ -327,9 +327,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         start, provisional = time.perf_counter(), self._output.provisional
         random_state = get_random(self).get_state()
         try:
+            self._output.keep_in_memory()
             state = self._first_state(state, skip_initial_state_check)
             failures, self._was_reset = self.failure_count, False
-            self._output.keep_in_memory()
             skip = skip_initial_state_check
             if isinstance(state, RunStart):
                 state, skip = self._anneal(state, bar), True
@@ -341,6 +341,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self.seconds += time.perf_counter() - start
             self._evaluator.evaluates_parts = False
             trim_chain(self.backend)
+            state.blobs = self._evaluator.typed(state.blobs)
+            if store:
+                self._output.change_blobs(state.blobs)
             ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
             steps = () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
             per_step = 1 if thin else int(thin_by)

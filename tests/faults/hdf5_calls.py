@@ -104,5 +104,5 @@ def kill_everywhere(kind, places=None):
 
 
 if __name__ == "__main__":
-    for each in ("smc", "guided", "tmcmc", "moves", "limit", "reset", "thin"):
-        print(each, *kill_everywhere(each), sep="\n")
+    for each in ("smc", "without blobs", "guided", "tmcmc", "moves", "limit", "reset", "thin"):
+        print(each, *kill_everywhere(each), sep="\n", flush=True)
