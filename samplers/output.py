@@ -311,7 +311,7 @@ def run_of_file(backend: HDFBackend) -> str | None:
     -------
     str or None
         "damaged" for a chain that cannot be read completely, the empty string for a chain without a run, None if there
-        is no file, the file is empty, or it has no chain with this name.
+        is no file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
@@ -323,6 +323,8 @@ def run_of_file(backend: HDFBackend) -> str | None:
             group.visititems(read_object)
             if "tempering" in group:
                 json.loads(group["tempering"][...].tobytes())
+            if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
+                return None  # emcee was killed while it made the group
             complete = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
             return group.attrs.get("run", "") if complete else DAMAGED
     except FileHeld:

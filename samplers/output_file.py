@@ -53,7 +53,7 @@ class PatientOpen:
             self.write_back(wait=False)
         if self._copy is None:
             try:
-                return _wait(lambda: type(self._backend).open(self._backend, mode))
+                return _wait(self._backend, lambda: type(self._backend).open(self._backend, mode))
             except FileHeld:
                 if not self.goes_on or not self._take_copy():
                     raise
@@ -82,10 +82,7 @@ class PatientOpen:
             return True
         backend = self._backend
         try:
-            with (
-                open_file(backend, "r+", wait) as present,
-                h5py.File(self._copy, "r") as ours,
-            ):
+            with open_file(backend, "r+", wait) as present, h5py.File(self._copy, "r") as ours:
 
                 def make(path: Path) -> None:
                     with h5py.File(path, "w") as new:
@@ -99,9 +96,9 @@ class PatientOpen:
         return True
 
 
-def _wait(opens: Callable[[], h5py.File], seconds: float | None = None) -> h5py.File:
-    """The file that a function opens; `FileHeld` if another program holds it open for longer than some seconds."""
-    end = time.monotonic() + (SECONDS if seconds is None else seconds)
+def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True) -> h5py.File:
+    """The file that a function opens; `FileHeld` if another program holds it open, now or after a wait."""
+    end = time.monotonic() + (SECONDS if wait else 0.0)
     while True:
         try:
             return opens()
@@ -109,15 +106,14 @@ def _wait(opens: Callable[[], h5py.File], seconds: float | None = None) -> h5py.
             if not isinstance(error, BlockingIOError) and "already open" not in str(error):
                 raise
             if time.monotonic() >= end:
-                raise FileHeld(
-                    f"another program holds the file open ({error}): close it there, and try again"
-                ) from error
+                held = f"{backend.filename} is held open by another program ({error})"
+                raise FileHeld(f"{held}: close the file there, and try again") from error
         time.sleep(PAUSE)
 
 
 def open_file(backend: HDFBackend, mode: str, wait: bool = True) -> h5py.File:
     """The file of a backend itself, not its copy in memory; `FileHeld` if another program holds it open."""
-    return _wait(lambda: h5py.File(backend.filename, mode), None if wait else 0.0)
+    return _wait(backend, lambda: h5py.File(backend.filename, mode), wait)
 
 
 def patient_open(backend: Backend) -> PatientOpen | None:
@@ -130,14 +126,21 @@ def patient_open(backend: Backend) -> PatientOpen | None:
 
 
 def replace_file(backend: HDFBackend, make: Callable[[Path], None], present: h5py.File | None) -> None:
-    """Replace the file of a backend in one step by a file that `make` writes; other readable groups are kept."""
+    """Replace the file of a backend in one step by a file that `make` writes; other readable groups are kept.
+
+    The present file is closed, since Windows replaces no open file.
+    """
     path = Path(backend.filename).resolve()
     new = path.with_name(f"{path.name}.new")
     new.unlink(missing_ok=True)
     make(new)
     if present is not None:
         with h5py.File(new, "a") as file:
-            _copy_missing(present, file, backend.name)
+            try:
+                _copy_missing(present, file, backend.name)
+            except OSError as error:
+                logger.debug("not all groups of %s can be kept: %s", path, error)
+        present.close()
     os.replace(new, path)
 
 

@@ -71,8 +71,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         walk by default. If `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
-        support of the prior are not evaluated. With an emcee `HDFBackend`, a record of all evaluations is kept beside
-        the file, and a killed run continues without repeating an evaluation (`run_mcmc`).
+        support of the prior are not evaluated. Blobs are stored exactly: without `blobs_dtype`, in a type that holds
+        the blobs of the first evaluations, and later blobs that this type cannot hold are refused. With an emcee
+        `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
+        an evaluation (`run_mcmc`). While another program holds the file open, the chain is kept in memory.
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -502,8 +504,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             get_random(self).seed(self._stream)  # as in a new file
         count, aside = self._record.count, self._record.renew()
         if aside is not None:
-            logger.warning("a new run begins in %s: the record of %d evaluations of the earlier run is kept as %s",
-                self.backend.filename, count, aside)  # fmt: skip
+            said = "a new run begins in %s: the record of %d evaluations of the earlier run is kept as %s"
+            logger.warning(said, self.backend.filename, count, aside)
         self._budget.forget()
         set_previous_state(self, None)
         self._reopened, self._is_compared = False, True
@@ -524,10 +526,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 f"{self.backend.filename} contains another run: {'; '.join(found)}. Use another file, or "
                 "backend.reset(nwalkers, ndim)"
             )
-        self._is_compared = True
 
     def _differences(self) -> list[str]:
-        """Differences of a stored run in its posterior or settings, as text."""
+        """Differences of a stored run in its posterior or settings, as text; none after they were found to agree."""
         if self._is_compared:
             return []
         stored = self._record.start
@@ -539,6 +540,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         known = points_to_compare(self._record, get_previous_state(self))
         if not found and known is not None and getattr(self._functions.function, "fingerprint", None) is None:
             found = compare(known, self._evaluator.compute)
+        self._is_compared = not found
         return found
 
     def _header(self) -> dict:

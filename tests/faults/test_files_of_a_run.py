@@ -326,12 +326,12 @@ def test_a_run_does_not_begin_with_a_file_that_another_process_holds(whole_smc, 
     monkeypatch.setattr(output_file, "SECONDS", 0.1)
     path, log = tmp_path / "run.h5", tmp_path / "log"
     sampler = make(path, "smc", log=log)
-    with held(path, "r"), pytest.raises(ValueError, match="another program holds the file open .*: close it there"):
+    with held(path, "r"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
         sampler.run_mcmc(None, STEPS)
     assert not points_of(log)
     sampler.run_mcmc(None, STEPS)
     assert outcome(sampler) == whole_smc
-    with held(path, "a"), pytest.raises(ValueError, match="another program holds the file open .*: close it there"):
+    with held(path, "a"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
         make(path, "smc")
 
 
@@ -540,3 +540,19 @@ def test_parts_of_a_batch_that_fail_do_not_end_a_run_that_goes_on(tmp_path):
     again = sampler(posterior)
     again.run_mcmc(None, 1)
     assert again.failure_count > 0
+
+
+ATTRIBUTES = ("version", "nwalkers", "ndim", "has_blobs", "iteration")
+
+
+@pytest.mark.parametrize("made", range(len(ATTRIBUTES) + 3))
+def test_a_half_made_file_of_emcee_is_made_again(made, whole_smc, tmp_path):
+    """A script was killed in `reset` of the backend, which makes five attributes, and then three datasets."""
+    path = tmp_path / "run.h5"
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    with h5py.File(path, "a") as file:
+        for name in ATTRIBUTES[made:]:
+            del file["mcmc"].attrs[name]
+        for name in ("accepted", "chain", "log_prob")[max(made - len(ATTRIBUTES), 0) :]:
+            del file["mcmc"][name]
+    assert outcome(go_on(make(path, "smc"))) == whole_smc
