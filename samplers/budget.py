@@ -94,6 +94,11 @@ class Budget:
         self._of_record = 0.0 if noted is None else float(noted[0])
         self._running.clear()
 
+    def forget(self) -> None:
+        """Another run begins, with an empty record."""
+        self._allowed = 0.0
+        self.restart(0.0)
+
     def note(self) -> None:
         """Note in the record how many simulations guides have made, including the last allowed batch."""
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))

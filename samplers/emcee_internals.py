@@ -4,7 +4,8 @@ They are used in this module only, and pinned by `tests.contract.test_emcee_cont
 later version of emcee (``emcee>=3.1.4,<4``) differs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from emcee import EnsembleSampler, State
@@ -56,20 +57,56 @@ def cut_chain(backend: Backend, steps: int) -> None:
             group.attrs["iteration"] = steps
             if steps == 0:
                 group["accepted"][...] = 0.0
+                group.attrs["has_blobs"] = False
+            _remove_half_made_blobs(group)
         return
     backend.iteration = steps
     if steps == 0:
-        backend.accepted = np.zeros_like(backend.accepted)
+        backend.accepted, backend.blobs = np.zeros_like(backend.accepted), None
     trim_chain(backend)
 
 
 def trim_chain(backend: Backend) -> None:
-    """Drop the space allocated for steps that were not made, from which emcee's backend in memory cannot grow."""
+    """Remove what an interrupted step or allocation has left, from which emcee's backends cannot grow."""
+    if isinstance(backend, HDFBackend):
+        with backend.open() as file:
+            whole = file[backend.name].attrs["has_blobs"] or "blobs" not in file[backend.name]
+        if not whole:
+            with backend.open("a") as file:
+                _remove_half_made_blobs(file[backend.name])
+        return
+    for name in ("chain", "log_prob", "blobs"):
+        values = vars(backend)[name]
+        if values is not None:
+            setattr(backend, name, values[: backend.iteration])
+
+
+def _remove_half_made_blobs(group: Any) -> None:
+    """Remove a dataset of blobs that emcee does not know: it sets `has_blobs` after it has made the dataset."""
+    if not group.attrs["has_blobs"]:
+        group.pop("blobs", None)
+
+
+def change_blobs(backend: Backend, dtype: np.dtype, convert: Callable[[np.ndarray], np.ndarray]) -> bool:
+    """Store the blobs of a chain as another type, which emcee would convert new blobs from; whether this was needed."""
     if not isinstance(backend, HDFBackend):
-        for name in ("chain", "log_prob", "blobs"):
-            values = vars(backend)[name]
-            if values is not None:
-                setattr(backend, name, values[: backend.iteration])
+        if backend.blobs is None or backend.blobs.dtype == dtype:
+            return False
+        backend.blobs = convert(backend.blobs)
+        return True
+    with backend.open() as file:
+        group = file[backend.name]
+        if not group.attrs["has_blobs"] or group["blobs"].dtype.base == dtype:
+            return False
+        blobs = group["blobs"][...]
+    blobs = convert(blobs)
+    options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
+    with backend.open("a") as file:
+        group, shape = file[backend.name], blobs.shape[:2]
+        del group["blobs"]
+        stored = np.dtype((dtype, blobs.shape[2:]))
+        group.create_dataset("blobs", shape, maxshape=(None, shape[1]), dtype=stored, **options)[...] = blobs
+    return True
 
 
 def restore_counts(backend: Backend, steps: int, accepted: np.ndarray) -> None:

@@ -5,7 +5,6 @@ emcee's backend writes the chain. In an HDF5 file, the group of the chain has th
 attributes of the backend.
 """
 
-import contextlib
 import json
 import logging
 import os
@@ -18,11 +17,13 @@ import numpy as np
 from emcee import State
 from emcee.backends import Backend, HDFBackend
 
-from .emcee_internals import cut_chain, restore_counts, trim_chain
+from .blobs import converted
+from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
 from .judgement.verdict import Verdict
+from .output_file import FileHeld, open_file, patient_open, read_object, replace_file
 from .record import Record
-from .reports import AnnealingResult, Stage
+from .reports import AnnealingResult, Stage, warn
 
 __all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file", "stored_result"]
 
@@ -57,9 +58,10 @@ class Output:
     """
 
     def __init__(self, backend: Backend, record: Record):
-        self._backend, self._record = backend, record
+        self._backend, self._record, self._file = backend, record, patient_open(backend)
         self._counts = int(backend.iteration), np.array(backend.accepted)
         self._summed = 0, 0  # steps, and their checksum
+        self._is_unnoted = False  # whether the last step was in memory only
         stored = _read(backend)
         self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
@@ -75,9 +77,51 @@ class Output:
     def step_stored(self) -> None:
         """Note in the record how the chain ends, since a killed process may have stored half a step."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
-        if isinstance(self._backend, HDFBackend):
+        # a step in memory is not noted: a new process goes on from the last step in the file
+        self._is_unnoted = self._file is not None and self._file.is_behind
+        if self._file is not None and not self._is_unnoted:
             *self._summed, rest = _checksums(self._backend, *self._summed)
             self._record.note(STORED, np.array([self._summed[1], rest]))
+
+    def check_file(self) -> None:
+        """Raise ValueError if another program holds the file, which must be written before a run begins."""
+        if self._file is not None:
+            self._file.write_back(wait=False)
+            open_file(self._backend, "r+").close()
+
+    def keep_in_memory(self) -> None:
+        """From now on, a chain whose file another program holds open is kept in memory, up to `write_behind`."""
+        if self._file is not None:
+            self._file.goes_on = True
+
+    def write_behind(self) -> None:
+        """Write a chain that was kept in memory to the file; warns if another program still holds the file."""
+        if self._file is None:
+            return
+        self._file.goes_on = False
+        if not self._file.write_back(wait=True):
+            warn(
+                f"{self._backend.filename} is still held open by another program, and its last steps are in this "
+                "sampler only. Close the file in the other program and call run_mcmc(None, 0), which writes the steps. "
+                f"A new process makes them again from {self._record.path}, without a simulation"
+            )
+        elif self._is_unnoted:
+            self.step_stored()
+
+    def change_blobs(self, blobs: np.ndarray | None) -> None:
+        """Store the blobs of the chain in the type of the blobs (n, ...) that are stored next."""
+        if blobs is None:
+            return
+
+        def convert(stored: np.ndarray) -> np.ndarray:
+            """Blobs (steps, n, ...) in the new type."""
+            steps, n, *shape = stored.shape
+            flat = converted(stored.reshape(steps * n, *shape), blobs.dtype, tuple(shape))
+            return flat.reshape(stored.shape)
+
+        if change_blobs(self._backend, blobs.dtype, convert):
+            self._summed = 0, 0
+            self.step_stored()
 
     def undo_half_a_step(self) -> None:
         """Remove a step that an error or Ctrl-C has left incomplete."""
@@ -91,7 +135,7 @@ class Output:
         self.result, self.verdict = result, verdict
         try:
             self._write()
-        except OSError as error:
+        except (OSError, FileHeld) as error:
             logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
 
     def _write(self, run: str | None = None) -> None:
@@ -131,6 +175,16 @@ class Output:
                 return None
             values = {name: dataset[...] for name, dataset in group.items()}
         return State(values.pop("coords"), **values, random_state=backend.random_state)
+
+    def mark_again(self, run: str) -> bool:
+        """Mark a file whose chain emcee has reset as the file of a run; returns whether this was needed."""
+        if self._file is None:
+            return False
+        with self._backend.open() as file:
+            if "run" in file[self._backend.name].attrs:
+                return False
+        self._write(run)
+        return True
 
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
@@ -244,7 +298,7 @@ def is_whole(backend: HDFBackend, record: Record) -> bool:
                 return True
         noted = record.noted(STORED)
         return noted is not None and tuple(noted.tolist()) == _checksums(backend)[1:]
-    except BlockingIOError:  # another process writes to it
+    except FileHeld:
         raise
     except Exception:  # HDF5 raises nearly anything
         return False
@@ -257,62 +311,43 @@ def run_of_file(backend: HDFBackend) -> str | None:
     -------
     str or None
         "damaged" for a chain that cannot be read completely, the empty string for a chain without a run, None if there
-        is no file, the file is empty, or it has no chain with this name.
+        is no file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
     try:
-        with h5py.File(backend.filename, "r") as file:
+        with open_file(backend, "r") as file:
             group = file.get(backend.name)
             if group is None:
                 return None
-            group.visititems(_read_object)
+            group.visititems(read_object)
             if "tempering" in group:
                 json.loads(group["tempering"][...].tobytes())
+            if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
+                return None  # emcee was killed while it made the group
             complete = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
             return group.attrs.get("run", "") if complete else DAMAGED
-    except BlockingIOError:  # another process writes to it
+    except FileHeld:
         raise
     except Exception:  # HDF5 raises nearly anything
         return DAMAGED
 
 
-def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
-    """Copy the readable objects of a group that a new group lacks, except the group `ours`."""
-    if present.name.strip("/") == ours.strip("/"):
-        return
-    for name, value in present.attrs.items():
-        new.attrs[name] = value
-    for name in present:
-        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
-            if name not in new:
-                present.copy(name, new)
-            elif isinstance(present[name], h5py.Group):
-                _copy_missing(present[name], new[name], ours)
-
-
-def _read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
-    """Read a complete object of a file."""
-    dict(node.attrs)
-    if isinstance(node, h5py.Dataset):
-        node[...]
-
-
 def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
     """Make the file of a backend, with an empty chain, in one step; other readable groups are kept."""
-    path = Path(backend.filename).resolve()
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
-    made = HDFBackend(str(new), backend.name, dtype=backend.dtype if backend.dtype_set else None, **options)
-    made.reset(nwalkers, ndim)
-    with made.open("a") as file:
-        file[made.name].attrs["run"] = run
-        try:
-            with h5py.File(path, "r") as present:
-                _copy_missing(present, file, made.name)
-        except BlockingIOError:  # another process writes to it
-            raise
-        except OSError as error:
-            logger.debug("no group is copied from %s: %s", path, error)
-    os.replace(new, path)
+
+    def make(path: Path) -> None:
+        options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
+        made = HDFBackend(str(path), backend.name, dtype=backend.dtype if backend.dtype_set else None, **options)
+        made.reset(nwalkers, ndim)
+        with made.open("a") as file:
+            file[made.name].attrs["run"] = run
+
+    try:
+        present = open_file(backend, "r")
+    except OSError as error:
+        logger.debug("no group is copied from %s: %s", backend.filename, error)
+        replace_file(backend, make, None)
+        return
+    with present:
+        replace_file(backend, make, present)

@@ -106,7 +106,7 @@ class _Level:
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points: the log-density as log_prior and log_prob (-inf below the bound), values as blobs."""
         records = np.zeros(len(coords), [("log_prob", float), ("log_prior", float), ("blobs", float)])
-        log_density = _checked(self._log_density(coords), len(coords), "log_prob_fn")
+        log_density = _checked(self._log_density(coords.copy()), len(coords), "log_prob_fn")
         records["log_prior"] = np.where(np.isnan(log_density), -np.inf, log_density)
         inside = records["log_prior"] > -np.inf
         records["blobs"] = -np.inf

@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from .blobs import joined
 from .interrupts import deferred_interrupts
 
 try:
@@ -84,12 +85,11 @@ class EvaluatedBatch(NamedTuple):
 
 
 def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
-    """Several batches as one; at least one is needed. Points of a batch without blobs get blobs of zeros."""
+    """Several batches as one; at least one is needed. Failed points of a batch without blobs get blobs of zeros."""
     blobs = next((batch.blobs for batch in batches if batch.blobs is not None), None)
     if blobs is not None:
         shape, dtype = blobs.shape[1:], blobs.dtype
-        filled = [np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches]
-        blobs = np.concatenate(filled)
+        blobs = joined([np.zeros((len(b.coords), *shape), dtype) if b.blobs is None else b.blobs for b in batches])
     first = np.cumsum([0, *(len(batch.coords) for batch in batches)]).tolist()
     reasons = {start + row: text for start, b in zip(first, batches, strict=False) for row, text in b.reasons.items()}
     coords, log_prob = (np.concatenate([batch[column] for batch in batches]) for column in (0, 1))
@@ -183,12 +183,17 @@ class Record:
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter evaluated points; they are in the file on return. ValueError for blobs that a file cannot hold."""
-        if self.path is not None and batch.blobs is not None:
-            _check_blobs(batch.blobs.dtype)
+        if batch.blobs is not None:
+            self.check_blobs(batch.blobs.dtype)
         blobs = [] if batch.blobs is None else [batch.blobs]
         with deferred_interrupts():
             self._write(b"EVAL", [batch.coords, batch.log_prob, _text(batch.reasons), *blobs])
             self._enter(batch)
+
+    def check_blobs(self, dtype: np.dtype) -> None:
+        """Raise ValueError for blobs that the file of the record, if there is one, cannot hold."""
+        if self.path is not None:
+            _check_blobs(dtype)
 
     def _enter(self, batch: EvaluatedBatch) -> None:
         self._first.append(self.count)
@@ -346,6 +351,14 @@ class Record:
             self._file.close()
             self._file = None
 
+    def renew(self) -> Path | None:
+        """Begin with an empty record; returns the new name of its file, if it has one."""
+        if self.path is None or not self.path.exists():
+            self._clear()
+            return None
+        self.open()  # another process that writes to the file owns it
+        return self.set_aside("before_reset")
+
     def set_aside(self, ending: str) -> Path:
         """Rename the file, and begin with an empty record; returns the new name."""
         self.close()
@@ -437,8 +450,8 @@ def _check_blobs(dtype: np.dtype) -> None:
         reason = str(error)
     if reason:
         raise ValueError(
-            f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, or pass blobs_dtype, as "
-            "for text blobs_dtype='S20'"
+            f"blobs of dtype {dtype} cannot be stored in a file ({reason}): return numbers, as many for each point "
+            "(numpy.nan for None), or pass blobs_dtype, as for text blobs_dtype='S20'"
         )
 
 

@@ -20,6 +20,7 @@ from emcee.moves import Move
 
 from .moves.population_moves import describe
 from .output import DAMAGED, is_whole, make_group, run_of_file
+from .output_file import open_file, patient_open
 from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings
 from .tempering.guide import Guide, guide_fingerprint
@@ -47,6 +48,9 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
+    if patient_open(backend).is_behind:  # of a sampler whose last steps are in memory only
+        open_file(backend, "r+").close()
+        patient_open(backend).write_back(wait=True)
     path = Path(backend.filename).resolve()
     record = Record(path.with_name(f"{path.name}.{quote(backend.name, safe='')}.record"), slow)
     stored = run_of_file(backend)

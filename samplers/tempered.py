@@ -72,8 +72,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
         walk by default. If `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
         them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
         `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
-        support of the prior are not evaluated. With an emcee `HDFBackend`, a record of all evaluations is kept beside
-        the file, and a killed run continues without repeating an evaluation (`run_mcmc`).
+        support of the prior are not evaluated. Blobs are stored exactly: without `blobs_dtype`, in a type that holds
+        the blobs of the first evaluations, and later blobs that this type cannot hold are refused. With an emcee
+        `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
+        an evaluation (`run_mcmc`). While another program holds the file open, the chain is kept in memory.
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -161,6 +163,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._budget = Budget(self._record, as_limit(max_simulations))
         # whether the annealing of the record must be repeated, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
+        self._was_reset = False  # and no call has been made since
         self.seconds = 0.0
         set_previous_state(self, None)
         super().__init__(
@@ -193,13 +196,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
-        drawn = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
+        self._stream = np.random.randint(2**32, size=8, dtype=np.uint32) if seed is None else seed  # noqa: NPY002
         if self._reopened and self._seed not in (None, stored := self._record.start.header["seed"]):
             logger.warning(
                 "%s contains a run with seed=%s: seed=%s has no effect", self.backend.filename, stored, self._seed
             )
         elif self.backend.random_state is None:
-            get_random(self).seed(drawn)
+            get_random(self).seed(self._stream)
 
     def _make_evaluator(self, blobs_dtype: Any) -> Evaluator:
         """The evaluator of the user's function."""
@@ -242,8 +245,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return {**self.__dict__, "pool": None}
 
     def reset(self):
-        """Clear the chain, as in emcee. Ladder and state at beta = 1 are kept: burn in, reset, continue."""
+        """Clear the chain, as in emcee: burn in, reset, and continue with None or the last State.
+
+        Other draws, or the same draws with another log-density or other settings, begin a new run, as in emcee. The
+        evaluations of the earlier run then neither serve nor count any more. With a file, its record is kept under
+        another name, which the log says.
+        """
         if hasattr(self, "_output"):
+            self._was_reset = True
             if not self._must_repeat:
                 state = get_previous_state(self)
             else:  # the annealing of a file, whose chain may end with an estimate that is replaced
@@ -330,10 +339,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.pool = self.pool
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
-        failures, start, provisional = self.failure_count, time.perf_counter(), self._output.provisional
+        start, provisional = time.perf_counter(), self._output.provisional
         random_state = get_random(self).get_state()
         try:
+            self._output.keep_in_memory()
             state = self._first_state(state, skip_initial_state_check)
+            failures, self._was_reset = self.failure_count, False
             skip = skip_initial_state_check
             if isinstance(state, RunStart):
                 state, skip = self._anneal(state, bar), True
@@ -345,6 +356,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self.seconds += time.perf_counter() - start
             self._evaluator.evaluates_parts = False
             trim_chain(self.backend)
+            state.blobs = self._evaluator.typed(state.blobs)
+            if store:
+                self._output.change_blobs(state.blobs)
             ended, advanced, stored, new = self._must_repeat, None, State(state, copy=True), 0
             steps = () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
             per_step = 1 if thin else int(thin_by)
@@ -382,6 +396,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}",
             )
             raise
+        finally:
+            self._output.write_behind()
         if self.failure_count > failures:
             warn(
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
@@ -451,6 +467,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _first_state(self, given: State | None, skip_check: bool) -> State | RunStart:
         """The state at beta = 1 from which a call continues, or the start of the annealing that comes first."""
+        if self._record.start is not None and self._output.mark_again(self._record.start.header["run"]):
+            self.reset()  # the user has called the method reset of the backend
+        if self._begins_anew(given):
+            return self._new_start(given, skip_check, anew=True)
         self._open_record()
         if self._record.start is not None:
             self._output.drop_provisional_step()
@@ -483,35 +503,58 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
         return self._new_start(given, skip_check)
 
+    def _begins_anew(self, given: State | None) -> bool:
+        """Whether a call after `reset` begins another run, with other draws, another log-density or other settings."""
+        if not self._was_reset or given is None or (given.log_prob is not None and self._result.finished):
+            return False
+        known = get_previous_state(self), self._output.last_state(), self._record.start
+        same = [each is not None and np.array_equal(given.coords, each.coords) for each in known]
+        return not any(same) or (same == [False, False, True] and bool(self._differences()))
+
+    def _forget_run(self) -> None:
+        """Begin an empty record, where the evaluations of the earlier run are not counted."""
+        if self._reopened:
+            get_random(self).seed(self._stream)  # as in a new file
+        count, aside = self._record.count, self._record.renew()
+        if aside is not None:
+            said = "a new run begins in %s: the record of %d evaluations of the earlier run is kept as %s"
+            logger.warning(said, self.backend.filename, count, aside)
+        self._budget.forget()
+        set_previous_state(self, None)
+        self._reopened, self._is_compared = False, True
+
     def _open_record(self) -> None:
         """Lock the record of a file, and find out once whether this sampler made the stored run."""
         if self._record.start is not None:
             self._record.open()
         if self._is_compared:
             return
+        if self._record.start is None and self._record.path is not None and self._result.finished:
+            logger.warning(
+                "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
+                self.backend.filename,
+            )
+        if found := self._differences():
+            raise ValueError(
+                f"{self.backend.filename} contains another run: {'; '.join(found)}. Use another file, or "
+                "backend.reset(nwalkers, ndim)"
+            )
+
+    def _differences(self) -> list[str]:
+        """Differences of a stored run in its posterior or settings, as text; none after they were found to agree."""
+        if self._is_compared:
+            return []
         stored = self._record.start
         found = [] if stored is None else differences(stored.header, self._header())
         if stored is not None and not found:
             log_prior = float(np.sum(self._evaluator.log_base(stored.coords)))
             if not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
                 found = ["the log-prior of the draws that it started from differs"]
-        if stored is None and self._record.path is not None and self._result.finished:
-            logger.warning(
-                "%s has no record: the chain goes on from its last step, and other settings cannot be noticed",
-                self.backend.filename,
-            )
-        self._compare(found, points_to_compare(self._record, get_previous_state(self)))
-        self._is_compared = True
-
-    def _compare(self, found: list[str], known: EvaluatedBatch | None) -> None:
-        """Raise ValueError if a stored run has another posterior or other settings."""
+        known = points_to_compare(self._record, get_previous_state(self))
         if not found and known is not None and getattr(self._functions.function, "fingerprint", None) is None:
             found = compare(known, self._evaluator.compute)
-        if found:
-            raise ValueError(
-                f"{self.backend.filename} contains another run: {'; '.join(found)}. Use another file, or "
-                "backend.reset(nwalkers, ndim)"
-            )
+        self._is_compared = not found
+        return found
 
     def _header(self) -> dict:
         """The start of this run, in the form that JSON returns."""
@@ -539,14 +582,17 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._drawn = start.coords  # tested when the run began
         return start
 
-    def _new_start(self, state: State, skip_check: bool) -> RunStart:
-        """Draws of the prior, or of the start density, checked and entered in the record."""
+    def _new_start(self, state: State, skip_check: bool, anew: bool = False) -> RunStart:
+        """Draws of the prior, or of the start density, checked and entered in the record, or in a new record."""
         check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
         log_base = self._evaluator.log_base_of_start(coords)
         if not np.array_equal(coords, self._drawn):
             self._functions.check_start(coords, self._evaluator.log_base)
+        self._output.check_file()
+        if anew:
+            self._forget_run()
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
         run["log_prior"] = float(np.sum(log_base))
         start = RunStart(self._header() | run, coords, self.random_state)

@@ -63,11 +63,11 @@ ORDER = {
         ("reporting",),
         ("evaluation", "replay"),
         ("output", "tempering"),
-        ("judgement",),
+        ("judgement", "output_file"),
         ("presets", "reports"),
         ("budget", "estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("emcee_internals", "interrupts", "resampling"),
+        ("blobs", "emcee_internals", "interrupts", "resampling"),
     ),
 }
 FOREIGN = ("hasattr", "getattr")

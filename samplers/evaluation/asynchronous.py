@@ -104,8 +104,10 @@ class AsynchronousEvaluator(Evaluator):
                 fitting = fitting if fitting == len(wanted) or self.evaluates_parts else 0
                 if fitting < len(wanted):
                     refused, end, wanted = True, int(wanted[fitting]), wanted[:fitting]
-            elif self.observer is not None:
-                self.observer.repeated(len(wanted))
+            else:
+                self._check_blobs(known)
+                if self.observer is not None:
+                    self.observer.repeated(len(wanted))
             self.budget.submitted(coords[wanted])
             self.evaluations += len(wanted)
             numbers.append((known, wanted))

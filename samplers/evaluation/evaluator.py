@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
+from ..blobs import converted
 from ..budget import Budget, BudgetExhausted
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch, Record, merge_batches
@@ -97,9 +98,12 @@ class CallingConvention(NamedTuple):
         return f"a {'list of dictionaries' if self.vectorize else 'dictionary'} of parameters by name (parameter_names)"
 
     def as_points(self, coords: np.ndarray) -> Any:
-        """Points (n, ndim) as functions take them: rows of an array, or dictionaries."""
+        """Points (n, ndim) as functions take them: rows of an array, or dictionaries.
+
+        They are copies, since a function may change its argument.
+        """
         named = self.parameter_names
-        return coords if named is None else ndarray_to_list_of_dicts(coords, named)
+        return coords.copy() if named is None else ndarray_to_list_of_dicts(coords.copy(), named)
 
     @interrupts_end_the_run()
     def call(
@@ -218,6 +222,7 @@ class Evaluator:
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self.record, self._limit = Record() if record is None else record, limit
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
+        self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.budget = Budget(self.record) if budget is None else budget
         self.evaluates_parts = True
         self.pool: Any = None
@@ -335,6 +340,7 @@ class Evaluator:
                 observe(part)
             if known is not None:
                 self._check = None  # the first batch of the run was checked when it was evaluated
+                self._check_blobs(known)
                 if self.observer is not None:
                     self.observer.repeated(len(part))
                 batches.append(known)
@@ -403,15 +409,41 @@ class Evaluator:
 
     def _pack(self, log_base: np.ndarray, inside: np.ndarray, batch: EvaluatedBatch | None) -> np.ndarray:
         """Records of points with log-density (n,) at beta = 0; only the points `inside` (n,) are evaluated."""
-        if batch is not None and batch.blobs is not None and len(self._fields) == 2:
-            self._fields.append(("blobs", batch.blobs.dtype, batch.blobs.shape[1:]))
+        blobs = None if batch is None else self.typed(batch.blobs)
         records = np.zeros(len(log_base), dtype=self._fields)
         records["log_prob"], records["log_prior"] = -np.inf, log_base
         if batch is not None:
             records["log_prob"][inside] = np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)
-            if batch.blobs is not None:
-                records["blobs"][inside] = batch.blobs
+            if blobs is not None:
+                records["blobs"][inside] = blobs
         return records
+
+    def typed(self, blobs: np.ndarray | None) -> np.ndarray | None:
+        """Blobs (n, ...) in the type of all blobs of the run, which the first evaluations have, or which is declared.
+
+        Raises
+        ------
+        ValueError
+            If this type cannot hold one of them.
+        """
+        if blobs is None:
+            return None
+        declared = self._convention.blobs_dtype
+        if len(self._fields) == 2:
+            dtype = blobs.dtype if declared is None or np.dtype(declared).itemsize == 0 else np.dtype(declared)
+            self.record.check_blobs(dtype)
+            self._fields.append(("blobs", dtype, blobs.shape[1:]))
+        return converted(blobs, *self._fields[2][1:], declared is not None)
+
+    def _check_blobs(self, batch: EvaluatedBatch) -> None:
+        """Raise ValueError if points that have not failed have blobs and others have none."""
+        if len(batch.reasons) == len(batch.coords):
+            return
+        has_blobs = batch.blobs is not None
+        self._has_blobs = has_blobs if self._has_blobs is None else self._has_blobs
+        if has_blobs != self._has_blobs:
+            this, before = ("blobs", "none") if has_blobs else ("no blobs", "some")
+            raise ValueError(f"{self._name} must return blobs with every point or with none; got {this} after {before}")
 
     def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
         """Records of the points before the first point that was not evaluated."""
@@ -432,7 +464,9 @@ class Evaluator:
         log_prob, blobs, reasons = outcomes(results, len(coords), self._convention.blobs_dtype, self._name)
         if self._name == "log_likelihood_fn":
             log_prob = log_prob + self.log_prior(coords)
-        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+        batch = EvaluatedBatch(coords, log_prob, blobs, reasons)
+        self._check_blobs(batch)
+        return batch
 
     def unpack(self, records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """log_prob and blobs (or None), as emcee takes them."""

@@ -5,6 +5,7 @@ stacked; text and blobs of different lengths become objects. Unlike in emcee, Na
 anything that is not a number is refused with an explanation.
 """
 
+import copy
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..blobs import stacked
 from ..interrupts import raise_if_it_ends_the_run
 
 __all__ = ["ErrorCapturing", "Failed", "log_densities", "log_probabilities", "outcomes"]
@@ -40,25 +42,6 @@ def _number(value: Any, name: str) -> float:
         ) from None
 
 
-def _stack(blobs: list, dtype: Any) -> np.ndarray:
-    """Blobs of several points as one array (n, ...), as emcee stores them."""
-    if dtype is None:
-        try:
-            dtype = np.atleast_1d(blobs[0]).dtype
-        except ValueError:
-            dtype = np.dtype(object)
-        if dtype.kind in "US":  # a string type would truncate longer text
-            dtype = np.dtype(object)
-    try:
-        stacked = np.array(blobs, dtype=dtype)
-    except ValueError:
-        # rows of different lengths: each becomes one object
-        stacked = np.empty(len(blobs), dtype=object)
-        stacked[:] = blobs
-    single = tuple(axis for axis in range(1, stacked.ndim) if stacked.shape[axis] == 1)
-    return np.squeeze(stacked, single) if single else stacked
-
-
 def log_probabilities(
     results: Any, n: int, name: str = "log_prob_fn", blobs_dtype: Any = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -73,7 +56,7 @@ def log_probabilities(
     name : str
         Name of the function in messages.
     blobs_dtype : dtype, optional
-        dtype of the blobs, as in emcee; by default the dtype of the first blobs.
+        dtype of the blobs, as in emcee; by default a dtype that holds all of them.
 
     Returns
     -------
@@ -85,7 +68,7 @@ def log_probabilities(
     Raises
     ------
     ValueError
-        If the number of results is not `n`, or a result is not a number or is +inf.
+        If the number of results is not `n`, a result is not a number or is +inf, or `blobs_dtype` cannot hold a blob.
     """
     if hasattr(results, "__array__"):
         results = np.asarray(results)
@@ -108,7 +91,7 @@ def log_probabilities(
         if tails and len(tails) != n:
             raise ValueError(f"{name} must return blobs with every point or with none; got {len(tails)} of {n}")
         if tails:
-            blobs = _stack(tails, blobs_dtype)
+            blobs = stacked(tails, blobs_dtype, name)
     if np.any(log_prob == np.inf):
         raise ValueError(f"{name} returned +inf for {np.sum(log_prob == np.inf)} of {n} points: no density is infinite")
     return log_prob, blobs
@@ -184,7 +167,8 @@ class ErrorCapturing:
     def __call__(self, points: Any) -> Any:
         before = sys.exception()
         try:
-            result = self.function(points, *self.args, **self.kwargs)
+            # a copy, since the points are needed after a function that changes them
+            result = self.function(copy.deepcopy(points), *self.args, **self.kwargs)
             owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result

@@ -84,7 +84,7 @@ class OptionalAttributes(NamedTuple):
             return unknown
         before = sys.exception()
         try:
-            found = np.asarray(self.possible(coords))
+            found = np.asarray(self.possible(coords.copy()))
         except Exception as error:
             raise_if_it_ends_the_run(error, before)
             logger.warning("the verdict takes all points as possible, since the method possible failed: %r", error)
@@ -187,7 +187,7 @@ class UserFunctions(NamedTuple):
                 f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
                 "prior"
             )
-        return np.asarray(self.optional.sample_prior(n, random), dtype=float)
+        return np.array(self.optional.sample_prior(n, random), dtype=float)
 
     def check_start(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> None:
         """Raise ValueError for points that cannot be draws of their density (`samplers.evaluation.starts`).

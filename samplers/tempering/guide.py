@@ -157,7 +157,7 @@ class AdaptedGuide:
 
     def log_density(self, coords: np.ndarray) -> np.ndarray:
         """Log-density (n,); ValueError for any other shape, NaN or +inf."""
-        values = np.asarray(self.guide.log_density(coords), dtype=float)
+        values = np.asarray(self.guide.log_density(coords.copy()), dtype=float)
         if values.shape != (len(coords),) or np.any(np.isnan(values) | (values == np.inf)):
             raise ValueError(
                 f"guide.log_density must return one number per point, {len(coords)} in all, neither NaN nor +inf; got "

@@ -5,6 +5,7 @@ evaluated again: not after a kill, not with a larger limit, not without the file
 """
 
 from collections import Counter
+from contextlib import nullcontext
 from functools import cache
 
 import emcee
@@ -53,7 +54,8 @@ def make(kind, path, posterior, seed=7, **changes):
     """A sampler on a file; `seed` is that of its first run."""
     Sampler, settings = KINDS[kind]
     np.random.seed(seed)  # noqa: NPY002  all three take their seed from the global generator
-    return Sampler(N, NDIM, posterior, backend=emcee.backends.HDFBackend(str(path)), **settings, **changes)
+    backend = None if path is None else emcee.backends.HDFBackend(str(path))
+    return Sampler(N, NDIM, posterior, backend=backend, **settings, **changes)
 
 
 def begin(sampler, nsteps):
@@ -136,16 +138,111 @@ def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
     assert np.array_equal(reopened.get_chain(), whole_run(kind, 2, 3).get_chain())
 
 
+def interrupted(kind, path):
+    """A run on a file that Ctrl-C has ended in its annealing."""
+    sampler = make(kind, path, Counted(interrupt_at=N + 5))
+    with pytest.raises(KeyboardInterrupt):
+        begin(sampler, 3)
+    return sampler
+
+
+@pytest.mark.parametrize("of", ["backend", "sampler"])
+@pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("kind", MARKED)
-def test_reset_begins_anew(kind, tmp_path):
+def test_reset_begins_anew(kind, finished, of, tmp_path):
     """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
-    begin(make(kind, tmp_path / "run.h5", Counted()), 3)
-    emcee.backends.HDFBackend(str(tmp_path / "run.h5")).reset(N, NDIM)
+    path = tmp_path / "run.h5"
+    begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
     other = {"posterior": Counted("other", centre=0.3), "seed": 9}
-    anew = begin(make(kind, tmp_path / "run.h5", **other), 2)
+    if of == "backend":
+        emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+        anew = make(kind, path, **other)
+    else:
+        anew = make(kind, path, **other)
+        anew.reset()
+    begin(anew, 2)
     assert anew.iteration == 2
     other["posterior"] = Counted("other", centre=0.3)
-    assert same(anew, begin(make(kind, tmp_path / "new.h5", **other), 2))
+    new = begin(make(kind, tmp_path / "new.h5", **other), 2)
+    if kind == "EnsembleSampler" and of == "sampler":  # emcee goes on with the random state that it found in the file
+        assert anew.get_chain().shape == new.get_chain().shape
+        return
+    assert same(anew, new)
+    if kind != "EnsembleSampler":
+        assert anew.report() == new.report()
+        assert same(make(kind, path, Counted("other", centre=0.3)), new)
+
+
+@pytest.mark.parametrize("in_file", [True, False])
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("kind", OURS)
+def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished, in_file, tmp_path):
+    path = tmp_path / "run.h5"
+    sampler = make(kind, path if in_file else None, Counted(interrupt_at=None if finished else N + 5))
+    with nullcontext() if finished else pytest.raises(KeyboardInterrupt):
+        begin(sampler, 3)
+    sampler.reset()
+    sampler.run_mcmc(np.random.default_rng(2).standard_normal((N, NDIM)), 2)
+    ladder, evaluations = sampler.ladder, sampler.evaluations
+    assert sampler.iteration == 2
+    if in_file:
+        reopened = make(kind, path, Counted())
+        assert reopened.ladder == ladder and reopened.evaluations == evaluations
+        assert len(list(tmp_path.glob("*.before_reset"))) == 1
+    sampler.run_mcmc(np.random.default_rng(3).standard_normal((N, NDIM)), 1)  # without a reset: added to the chain
+    assert sampler.iteration == 3 and sampler.evaluations > evaluations
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, whole_run):
+    whole = whole_run(kind, 2, 2)
+    for given in (None, "state", "draws"):
+        sampler = begin(make(kind, tmp_path / f"{given}.h5", Counted()), 2)
+        last = sampler.get_last_sample()
+        sampler.reset()
+        draws = np.random.default_rng(1).standard_normal((N, NDIM))
+        sampler.run_mcmc({None: None, "state": last, "draws": draws}[given], 2)
+        assert np.array_equal(sampler.get_chain(), whole.get_chain()[2:])
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
+    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    sampler = make(kind, tmp_path / "run.h5", Counted())
+    sampler.reset()
+    evaluations = sampler.evaluations
+    with pytest.raises(ValueError, match="must consist of draws of the prior"):
+        sampler.run_mcmc(0.7 + 1e-3 * np.random.default_rng(1).standard_normal((N, NDIM)), 1)
+    assert sampler.evaluations == evaluations
+    begin(sampler, 1)
+    assert sampler.iteration == 1
+
+
+@pytest.mark.parametrize("kind", OURS)
+def test_reset_of_the_backend_of_a_living_sampler(kind, tmp_path, whole_run):
+    """The chain goes on as after a reset of the sampler, and its file can be opened again."""
+    sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
+    sampler.backend.reset(N, NDIM)
+    sampler.run_mcmc(None, 2)
+    assert np.array_equal(sampler.get_chain(), whole_run(kind, 2, 2).get_chain()[2:])
+    sampler.backend.reset(N, NDIM)
+    sampler.run_mcmc(np.random.default_rng(2).standard_normal((N, NDIM)), 1)
+    posterior = Counted()
+    again = make(kind, tmp_path / "run.h5", posterior)
+    again.run_mcmc(None, 0)
+    assert same(again, sampler) and not posterior.evaluated
+
+
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("kind", KINDS)
+def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_path):
+    path = tmp_path / "run.h5"
+    begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
+    emcee.backends.HDFBackend(str(path)).reset(N + 4, NDIM)
+    Sampler, settings = KINDS[kind]
+    sampler = Sampler(N + 4, NDIM, Counted(), backend=emcee.backends.HDFBackend(str(path)), **settings)
+    sampler.run_mcmc(np.random.default_rng(1).standard_normal((N + 4, NDIM)), 2)
+    assert sampler.get_chain().shape == (2, N + 4, NDIM)
 
 
 # ---------------------------------------------------------------- the record makes the file again

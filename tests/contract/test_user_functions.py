@@ -4,8 +4,9 @@ import emcee
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, TemperedSampler, TMCMCSampler
+from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from tests.contract.targets import Box, Gaussian, WithBlobs
+from tests.faults.resumable_run import InOrder
 
 N = 24
 SAMPLERS = [SMCSampler, TMCMCSampler]
@@ -273,3 +274,80 @@ def test_a_log_likelihood_that_cannot_be_called_is_not_compared():
     posterior.log_likelihood = lambda residuals, sigma: 0.0
     posterior.__class__ = type("Other", (Gaussian,), {"__call__": lambda self, x: self.log_prior(x) - np.sum(x**2, -1)})
     assert np.isfinite(run(SMCSampler, posterior, vectorize=True).log_evidence)
+
+
+# ---------------------------------------------------------------- functions that change their argument
+
+
+def spoiling(function):
+    """The function, which then changes its argument in place."""
+
+    def spoils(x, *args):
+        value = function(x)
+        x.clear() if isinstance(x, dict) else np.multiply(x, 2e11, out=x)
+        return value
+
+    return spoils
+
+
+def functions_of(how, wrap):
+    """The log-density and the settings of a sampler, whose functions are wrapped."""
+    posterior = Gaussian()
+
+    def named(function):
+        return (lambda x: function(np.array([*x.values()]))) if how == "names" else function
+
+    settings = {"vectorize": how == "batch", "log_prior_fn": wrap(named(posterior.log_prior))}
+    if how == "names":
+        settings["parameter_names"] = ["a", "b", "c"]
+    if how == "args":
+        settings["args"] = (1.0,)
+    if how == "asynchronous":
+        settings |= {"asynchronous": True, "recycle": True}
+    if how in ("pool", "asynchronous"):
+        settings["pool"] = InOrder()
+    if how == "start_density":
+        settings["start_density"] = wrap(posterior.log_prior)
+    if how == "likelihood":
+        return None, settings | {"log_likelihood_fn": wrap(posterior.log_likelihood)}
+    return wrap(named(posterior)), settings
+
+
+WAYS = ("point", "batch", "names", "args", "pool", "start_density", "likelihood")
+
+
+@pytest.mark.parametrize(
+    ("Sampler", "how"), [*((each, how) for each in SAMPLERS for how in WAYS), (SMCSampler, "asynchronous")]
+)
+def test_a_function_that_changes_its_argument_changes_no_point(Sampler, how, tmp_path):
+    """Nor a run that is stopped and goes on from its file."""
+    function, settings = functions_of(how, lambda function: lambda x, *args: function(x))
+    expected = run(Sampler, function, nsteps=2, **settings)
+    function, settings = functions_of(how, spoiling)
+    settings["backend"] = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    with pytest.warns(SamplingWarning):
+        run(Sampler, function, max_simulations=60, **settings)
+    sampler = Sampler(N, 3, function, seed=1, **settings)
+    sampler.run_mcmc(None, 1)  # and the step that the limit has replaced by an estimate
+    assert np.array_equal(sampler.get_chain(), expected.get_chain())
+    assert np.array_equal(sampler.get_log_prob(), expected.get_log_prob())
+    assert sampler.simulations == expected.simulations
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_a_point_that_fails_after_it_was_changed_is_recorded_as_it_was(vectorize):
+    """A batch that raises is evaluated point by point."""
+    posterior = Gaussian()
+
+    def log_prob(x):
+        value, fails = posterior(x), np.any(x[..., 0] < -1.0)
+        x += 1e9
+        if fails:
+            raise RuntimeError("no convergence")
+        return value
+
+    with pytest.warns(SamplingWarning, match="evaluations failed"):
+        sampler = run(SMCSampler, log_prob, log_prior_fn=posterior.log_prior, vectorize=vectorize, n=50)
+    assert sampler.failures and all(-6.0 < failure["parameters"][0] < -1.0 for failure in sampler.failures)
+    chain = sampler.get_chain(flat=True)
+    assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain))

@@ -80,7 +80,7 @@ class Events:
 
             def __init__(self, name, mode="r", **kwargs):
                 if isinstance(name, str | Path) and mode != "r":
-                    kept = mode == "a" and Path(name).exists()
+                    kept = mode in ("a", "r+") and Path(name).exists()
                     name, mode = Counted(plain_open(name, "r+b" if kept else "w+b", buffering=0)), "r+" if kept else "w"
                 super().__init__(name, mode, **kwargs)
 

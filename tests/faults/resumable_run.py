@@ -45,8 +45,9 @@ WAYS = {
     "limit": (SMCSampler, {"recycle": True}),
     "reset": (SMCSampler, {"recycle": False}),
     "thin": (SMCSampler, {"recycle": False}),
+    "without blobs": (SMCSampler, {"recycle": True}),
 }
-IN_ARRAYS = {*SAMPLERS, "asynchronous, guided", "limit", "reset", "thin"}
+IN_ARRAYS = {*SAMPLERS, "asynchronous, guided", "limit", "reset", "thin", "without blobs"}
 
 
 class Queue:
@@ -101,6 +102,13 @@ class Watched(WithBlobs):
         return Queue(self)
 
 
+class WatchedWithoutBlobs(Watched):
+    """The same without blobs."""
+
+    def __call__(self, x):
+        return super().__call__(x)[..., 0]
+
+
 def calls(log) -> list[tuple[int, list[bytes]]]:
     """Calls in a log: process and points of each."""
     rows = np.frombuffer(Path(log).read_bytes()).reshape(-1, NDIM) if Path(log).exists() else np.empty((0, NDIM))
@@ -120,7 +128,7 @@ def points_of(log) -> list[bytes]:
 def make(path, kind, seconds=0.0, sd=0.01, log=None, event=None, **changes):
     """The sampler with a file, or in memory without a path."""
     Sampler, settings = {**SAMPLERS, **WAYS}[kind]
-    posterior = Watched(log, seconds, event, ndim=NDIM, sd=sd)
+    posterior = (WatchedWithoutBlobs if kind == "without blobs" else Watched)(log, seconds, event, ndim=NDIM, sd=sd)
     backend = None if path is None else emcee.backends.HDFBackend(str(path))
     settings = {"seed": 5, **settings, **changes}
     if "guide" in settings:

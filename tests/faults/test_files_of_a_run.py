@@ -8,7 +8,9 @@ import resource
 import shutil
 import subprocess
 import sys
+import threading
 import warnings
+from contextlib import contextmanager
 from pathlib import Path
 
 import emcee
@@ -16,7 +18,7 @@ import h5py
 import numpy as np
 import pytest
 
-from samplers import SMCSampler
+from samplers import SMCSampler, output_file
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
@@ -233,24 +235,106 @@ def test_groups_of_one_file_are_runs_of_their_own(tmp_path):
     assert other.iteration == 3
 
 
-def test_a_reader_of_the_file_costs_no_evaluation(tmp_path):
-    """HDF5 refuses to store a step while another process reads the file: the same call goes on later."""
-    expected = outcome(go_on(make(tmp_path / "whole.h5", "smc")))
-    path, log = tmp_path / "run.h5", tmp_path / "log"
-    make(path, "smc", log=log).run_mcmc(None, 1)
-    code = "import h5py, sys\nwith h5py.File(sys.argv[1]):\n    print('open', flush=True)\n    sys.stdin.read()"
-    sampler = make(path, "smc", log=log)
+HOLDER = """
+import h5py, sys
+with h5py.File(sys.argv[1], sys.argv[2]) as file:
+    if sys.argv[2] != "r":
+        file.create_group("of another program").attrs["kept"] = True
+    print("open", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held(path, mode):
+    """Another process holds a file open; yields a function that ends it."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", code, str(path)], **pipes) as reader:
-        assert reader.stdout.readline() == "open\n"
-        with pytest.raises(OSError, match="lock"):
-            sampler.run_mcmc(None, STEPS - sampler.iteration)
-        reader.communicate("")
-    go_on(sampler)
-    assert outcome(sampler) == expected
-    assert (
-        len(points_of(log)) - sampler.evaluations <= 4
-    )  # two for the check of the first values, two for the comparison
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(path), mode], **pipes) as process:
+        assert process.stdout.readline() == "open\n"
+        yield lambda: process.communicate("")
+        process.stdin.close()
+
+
+@pytest.fixture(scope="module")
+def whole_smc(tmp_path_factory):
+    return outcome(go_on(make(tmp_path_factory.mktemp("smc") / "run.h5", "smc")))
+
+
+def held_open(found):
+    """The warnings that another program holds a file open."""
+    return [str(each.message) for each in found if "held open by another program" in str(each.message)]
+
+
+@pytest.mark.parametrize("mode", ["r", "a"])
+@pytest.mark.parametrize("until", ["at once", "step 3", "the end", "after the end"])
+def test_a_file_that_another_process_holds_open_ends_no_run(mode, until, whole_smc, tmp_path, monkeypatch):
+    """Every bit is the one of a run without it, nothing is evaluated again, and what the other process wrote stays."""
+    monkeypatch.setattr(output_file, "SECONDS", 10.0 if until == "at once" else 0.2)
+    path, log = tmp_path / "run.h5", tmp_path / "log"
+    sampler = make(path, "smc", log=log)
+    sampler.run_mcmc(None, 1)
+    with held(path, mode) as release, warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        if until == "at once":
+            threading.Timer(0.3, release).start()
+        for step, _ in enumerate(sampler.sample(None, iterations=STEPS - 1), 2):
+            if until == "step 3" and step == 3:
+                release()
+            if until == "the end" and step == STEPS:
+                release()
+    assert len(held_open(found)) == {"at once": 0, "after the end": 2}.get(until, 1)
+    assert outcome(sampler) == whole_smc
+    if until == "after the end":
+        assert "call run_mcmc(None, 0), which writes the steps" in held_open(found)[1]
+        sampler.run_mcmc(None, 0)
+    sampler._record.close()
+    if mode == "a":
+        with h5py.File(path) as file:
+            assert file["of another program"].attrs["kept"]
+    again = make(path, "smc", log=log)
+    assert again.iteration == STEPS and outcome(go_on(again)) == whole_smc
+    assert not list(tmp_path.glob("*.damaged"))
+    assert evaluated_again(log, "smc") == 0
+
+
+def test_a_new_process_goes_on_where_the_file_ends_that_could_not_be_written(whole_smc, tmp_path, monkeypatch):
+    monkeypatch.setattr(output_file, "SECONDS", 0.1)
+    path, log = tmp_path / "run.h5", tmp_path / "log"
+    sampler = make(path, "smc", log=log)
+    sampler.run_mcmc(None, 1)
+    with held(path, "r"):
+        go_on(sampler)
+    assert copy.deepcopy(sampler).iteration == pickle.loads(pickle.dumps(sampler)).iteration == STEPS
+    sampler._record.close()
+    again = make(path, "smc", log=log)
+    assert again.iteration == 1 and not list(tmp_path.glob("*.damaged"))
+    assert outcome(go_on(again)) == whole_smc
+    assert evaluated_again(log, "smc") == 0
+
+
+def test_a_file_that_the_same_process_reads_ends_no_run(whole_smc, tmp_path, monkeypatch):
+    monkeypatch.setattr(output_file, "SECONDS", 0.1)
+    sampler = make(tmp_path / "run.h5", "smc")
+    sampler.run_mcmc(None, 1)
+    with h5py.File(tmp_path / "run.h5", "r"):
+        go_on(sampler)
+    sampler.run_mcmc(None, 0)
+    assert outcome(sampler) == whole_smc
+    assert emcee.backends.HDFBackend(str(tmp_path / "run.h5")).iteration == STEPS
+
+
+def test_a_run_does_not_begin_with_a_file_that_another_process_holds(whole_smc, tmp_path, monkeypatch):
+    """Nothing is evaluated, and the same call goes on when the file is free."""
+    monkeypatch.setattr(output_file, "SECONDS", 0.1)
+    path, log = tmp_path / "run.h5", tmp_path / "log"
+    sampler = make(path, "smc", log=log)
+    with held(path, "r"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
+        sampler.run_mcmc(None, STEPS)
+    assert not points_of(log)
+    sampler.run_mcmc(None, STEPS)
+    assert outcome(sampler) == whole_smc
+    with held(path, "a"), pytest.raises(ValueError, match="held open by another program .*: close the file there"):
+        make(path, "smc")
 
 
 def test_two_processes_and_two_samplers_on_one_file(tmp_path):
@@ -458,3 +542,19 @@ def test_parts_of_a_batch_that_fail_do_not_end_a_run_that_goes_on(tmp_path):
     again = sampler(posterior)
     again.run_mcmc(None, 1)
     assert again.failure_count > 0
+
+
+ATTRIBUTES = ("version", "nwalkers", "ndim", "has_blobs", "iteration")
+
+
+@pytest.mark.parametrize("made", range(len(ATTRIBUTES) + 3))
+def test_a_half_made_file_of_emcee_is_made_again(made, whole_smc, tmp_path):
+    """A script was killed in `reset` of the backend, which makes five attributes, and then three datasets."""
+    path = tmp_path / "run.h5"
+    emcee.backends.HDFBackend(str(path)).reset(N, NDIM)
+    with h5py.File(path, "a") as file:
+        for name in ATTRIBUTES[made:]:
+            del file["mcmc"].attrs[name]
+        for name in ("accepted", "chain", "log_prob")[max(made - len(ATTRIBUTES), 0) :]:
+            del file["mcmc"][name]
+    assert outcome(go_on(make(path, "smc"))) == whole_smc

@@ -1,0 +1,165 @@
+"""The HDF5 file of a chain, which another program may hold open.
+
+emcee opens the file for each step. HDF5 refuses this while another program has the file open, such as a notebook that
+reads it. So a backend waits for the file. If the file is not free in time, a run goes on in a copy of the file in
+memory, and its chain is written when the file is free again.
+"""
+
+import contextlib
+import io
+import logging
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+from emcee.backends import Backend, HDFBackend
+
+from .reports import warn
+
+__all__ = ["FileHeld", "PatientOpen", "open_file", "patient_open", "read_object", "replace_file"]
+
+logger = logging.getLogger(__name__)
+
+SECONDS, PAUSE = 5.0, 0.05  # longest wait for a file, and between two trials
+
+
+class FileHeld(ValueError):
+    """Another program holds a file open."""
+
+
+class PatientOpen:
+    """Takes the place of the method ``open`` of an emcee `HDFBackend`, through which all its methods use the file.
+
+    Attributes
+    ----------
+    goes_on : bool
+        Whether a file that is held open is replaced by its copy in memory; `FileHeld` is raised otherwise.
+    is_behind : bool
+        Whether the copy in memory has a chain that the file does not have.
+    """
+
+    def __init__(self, backend: HDFBackend):
+        self._backend, self._copy = backend, None
+        self.goes_on = self._has_warned = False
+
+    @property
+    def is_behind(self) -> bool:
+        return self._copy is not None
+
+    def __call__(self, mode: str = "r") -> h5py.File:
+        if self._copy is not None and mode != "r":
+            self.write_back(wait=False)
+        if self._copy is None:
+            try:
+                return _wait(self._backend, lambda: type(self._backend).open(self._backend, mode))
+            except FileHeld:
+                if not self.goes_on or not self._take_copy():
+                    raise
+        return h5py.File(self._copy, "r" if mode == "r" else "r+")
+
+    def _take_copy(self) -> bool:
+        """Copy the file to memory; False if another program is changing it."""
+        copy = io.BytesIO(Path(self._backend.filename).read_bytes())
+        try:
+            with h5py.File(copy, "r") as file:
+                file[self._backend.name].visititems(read_object)
+        except Exception:  # HDF5 raises nearly anything
+            return False
+        self._copy = copy
+        if not self._has_warned:
+            self._has_warned = True
+            warn(
+                f"{self._backend.filename} is held open by another program: the run goes on, and keeps its chain in "
+                "memory until the file is free. Close the file in the other program"
+            )
+        return True
+
+    def write_back(self, wait: bool) -> bool:
+        """Write a chain in memory to the file if it is free, now or after a wait; returns whether the file has it."""
+        if self._copy is None:
+            return True
+        backend = self._backend
+        try:
+            with open_file(backend, "r+", wait) as present, h5py.File(self._copy, "r") as ours:
+
+                def make(path: Path) -> None:
+                    with h5py.File(path, "w") as new:
+                        ours.copy(ours[backend.name], new, backend.name)
+
+                replace_file(backend, make, present)
+        except (FileHeld, OSError) as error:  # also a full disk: the chain is still in memory
+            logger.info("the chain is kept in memory: %s", error)
+            return False
+        self._copy = None
+        return True
+
+
+def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True) -> h5py.File:
+    """The file that a function opens; `FileHeld` if another program holds it open, now or after a wait."""
+    end = time.monotonic() + (SECONDS if wait else 0.0)
+    while True:
+        try:
+            return opens()
+        except OSError as error:
+            if not isinstance(error, BlockingIOError) and "already open" not in str(error):
+                raise
+            if time.monotonic() >= end:
+                held = f"{backend.filename} is held open by another program ({error})"
+                raise FileHeld(f"{held}: close the file there, and try again") from error
+        time.sleep(PAUSE)
+
+
+def open_file(backend: HDFBackend, mode: str, wait: bool = True) -> h5py.File:
+    """The file of a backend itself, not its copy in memory; `FileHeld` if another program holds it open."""
+    return _wait(backend, lambda: h5py.File(backend.filename, mode), wait)
+
+
+def patient_open(backend: Backend) -> PatientOpen | None:
+    """The method ``open`` of a backend with a file that can be written, which waits for the file from now on."""
+    if not isinstance(backend, HDFBackend) or backend.read_only:
+        return None
+    if not isinstance(backend.open, PatientOpen):
+        vars(backend)["open"] = PatientOpen(backend)
+    return backend.open
+
+
+def replace_file(backend: HDFBackend, make: Callable[[Path], None], present: h5py.File | None) -> None:
+    """Replace the file of a backend in one step by a file that `make` writes; other readable groups are kept.
+
+    The present file is closed, since Windows replaces no open file.
+    """
+    path = Path(backend.filename).resolve()
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)
+    make(new)
+    if present is not None:
+        with h5py.File(new, "a") as file:
+            try:
+                _copy_missing(present, file, backend.name)
+            except OSError as error:
+                logger.debug("not all groups of %s can be kept: %s", path, error)
+        present.close()
+    os.replace(new, path)
+
+
+def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
+    """Copy the readable objects of a group that a new group lacks, except the group `ours`."""
+    if present.name.strip("/") == ours.strip("/"):
+        return
+    for name, value in present.attrs.items():
+        new.attrs[name] = value
+    for name in present:
+        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
+            if name not in new:
+                present.copy(name, new)
+            elif isinstance(present[name], h5py.Group):
+                _copy_missing(present[name], new[name], ours)
+
+
+def read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:
+    """Read a complete object of a file."""
+    dict(node.attrs)
+    if isinstance(node, h5py.Dataset):
+        node[...]

@@ -1,0 +1,199 @@
+"""Blobs are stored as they are returned, or refused: never cut or rounded, in memory and in a file.
+
+The function returns other types of blobs where the first parameter is large: in the first evaluations, which are draws
+of the prior, or only near the posterior.
+"""
+
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+
+import emcee
+import numpy as np
+import pytest
+
+from samplers import SMCSampler, TMCMCSampler
+from samplers.blobs import joined, stacked
+from tests.contract.targets import Gaussian
+
+N, NDIM, BIG = 24, 2, 2**60 + 1
+FIRST, LATER = -0.6, 1.9  # places that draws of the prior reach, and that only the posterior reaches
+pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")  # 24 walkers are few
+
+
+class Changing(Gaussian):
+    """Returns one blob of a type below a place, and of another type above; notes the points that it evaluates."""
+
+    def __init__(self, below, above, place):
+        super().__init__(NDIM, centre=2.0, sd=0.3)
+        self.below, self.above, self.place, self.seen = below, above, place, Counter()
+
+    def blob(self, x):
+        return (self.above if x[0] > self.place else self.below)(x)
+
+    def __call__(self, x):
+        if np.ndim(x) == 2:
+            return [self(row) for row in x]
+        self.seen[x.tobytes()] += 1
+        return super().__call__(x), self.blob(x)
+
+
+def draws():
+    return np.clip(np.random.default_rng(1).standard_normal((N, NDIM)), -LATER, LATER - 0.2)
+
+
+def make(posterior, path=None, Sampler=SMCSampler, **kwargs):
+    backend = None if path is None else emcee.backends.HDFBackend(str(path))
+    return Sampler(N, NDIM, posterior, backend=backend, seed=1, **kwargs)
+
+
+def run(posterior, path=None, nsteps=3, **kwargs):
+    sampler = make(posterior, path, **kwargs)
+    sampler.run_mcmc(draws(), nsteps)
+    return sampler
+
+
+def exact(sampler, as_stored=lambda value: value):
+    """Whether every blob of the chain is the blob of its point."""
+    posterior = sampler.log_prob_fn.f
+    chain, blobs = sampler.get_chain(flat=True), sampler.get_blobs(flat=True)
+    expected = [as_stored(posterior.blob(x)) for x in chain]
+    changed = {x[0] > posterior.place for x in chain}
+    assert True in changed
+    return all(np.array_equal(found, value) for found, value in zip(blobs.tolist(), expected, strict=True))
+
+
+ints, floats = (lambda x: int(100 * x[0])), (lambda x: float(x[0]))
+PAIRS = {
+    "float after int": (ints, floats),
+    "int after float": (floats, lambda x: BIG),
+    "larger int": (ints, lambda x: 2**70),
+    "longer text": (lambda x: "a", lambda x: f"text of {x[0]!r}"),
+    "None": (floats, lambda x: None),
+    "object": (ints, lambda x: {"x": x[0]}),
+    "text after number": (ints, lambda x: "many"),
+    "longer array": (lambda x: [1.0, x[0]], lambda x: [1.0, x[0], x[1]]),
+    "more digits": (lambda x: np.float32(x[0]), floats),
+}
+EXACT_IN_FILE = ("float after int", "more digits")
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+@pytest.mark.parametrize("pair", PAIRS)
+def test_types_are_found_from_all_first_values(pair, vectorize):
+    assert exact(run(Changing(*PAIRS[pair], FIRST), vectorize=vectorize))
+
+
+@pytest.mark.parametrize(
+    ("pair", "Sampler"), [*((pair, SMCSampler) for pair in PAIRS), ("float after int", TMCMCSampler)]
+)
+def test_types_in_a_file(pair, Sampler, tmp_path):
+    """Numbers are stored exactly; what HDF5 has no type for is refused."""
+    posterior = Changing(*PAIRS[pair], FIRST)
+    if pair in EXACT_IN_FILE:
+        assert exact(run(posterior, tmp_path / "run.h5", Sampler=Sampler))
+        return
+    with pytest.raises(ValueError, match="cannot be stored in a file .*pass blobs_dtype"):
+        run(posterior, tmp_path / "run.h5", Sampler=Sampler)
+
+
+@pytest.mark.parametrize(("where", "vectorize"), [("memory", False), ("file", True)])
+@pytest.mark.parametrize("pair", PAIRS)
+def test_another_type_in_later_values_is_stored_exactly_or_refused(pair, where, vectorize, tmp_path):
+    posterior = Changing(*PAIRS[pair], LATER)
+    path = tmp_path / "run.h5" if where == "file" else None
+    if pair == "longer text" and where == "memory":
+        assert exact(run(posterior, path, vectorize=vectorize))
+        return
+    with pytest.raises(ValueError, match="pass blobs_dtype=|return numbers"):
+        run(posterior, path, vectorize=vectorize)
+
+
+@pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair != "longer array"])
+def test_objects_may_be_declared_in_memory(pair):
+    assert exact(run(Changing(*PAIRS[pair], LATER), blobs_dtype=object))
+
+
+def test_a_refused_run_goes_on_with_a_wider_type(tmp_path):
+    """Nothing is evaluated again, and the run is the one with this type from the start."""
+    path = tmp_path / "run.h5"
+    posterior = Changing(*PAIRS["float after int"], LATER)
+    with pytest.raises(ValueError, match="pass blobs_dtype=float64"):
+        run(posterior, path, vectorize=True)
+    sampler = make(posterior, path, vectorize=True, blobs_dtype=float)
+    sampler.run_mcmc(None, 3)
+    assert exact(sampler) and sampler.get_blobs().dtype == float
+    assert sum(posterior.seen.values()) - len(posterior.seen) <= 4  # comparisons
+    whole = run(Changing(*PAIRS["float after int"], LATER), vectorize=True, blobs_dtype=float)
+    assert np.array_equal(sampler.get_chain(), whole.get_chain())
+    assert np.array_equal(sampler.get_blobs(), whole.get_blobs())
+
+
+def test_a_chain_of_one_type_goes_on_with_a_wider_type(tmp_path):
+    """The stored steps are converted, and a step is stored exactly."""
+    path = tmp_path / "run.h5"
+    run(Changing(ints, ints, FIRST), path, 2)
+    sampler = make(Changing(ints, ints, FIRST), path, blobs_dtype=float)
+    sampler.run_mcmc(None, 1)
+    assert sampler.get_blobs().dtype == float and sampler.get_blobs().shape == (3, N) and exact(sampler)
+    again = make(Changing(ints, ints, FIRST), path, blobs_dtype=float)
+    again.run_mcmc(None, 0)
+    assert again.iteration == 3 and not path.with_name("run.h5.damaged").exists()
+    with pytest.raises(ValueError, match="cannot hold"):
+        make(Changing(ints, ints, FIRST), path, blobs_dtype=bool).run_mcmc(None, 1)
+
+
+@pytest.mark.parametrize(
+    ("pair", "dtype"),
+    [
+        ((ints, floats), int),
+        ((floats, lambda x: 1e300), np.float32),
+        ((lambda x: "a", lambda x: "abcdef"), "S5"),
+        ((lambda x: "a", lambda x: 1.5), "S9"),
+        ((ints, lambda x: BIG), np.int32),
+        ((floats, lambda x: BIG), float),
+        ((floats, lambda x: {}), float),
+        ((lambda x: True, ints), bool),
+        ((lambda x: [1.0, 2.0], lambda x: [1.0]), float),
+    ],
+)
+@pytest.mark.parametrize("place", [FIRST, LATER])
+def test_a_value_that_a_declared_type_cannot_hold_is_refused(pair, dtype, place, tmp_path):
+    for path in (None, tmp_path / "run.h5"):
+        with pytest.raises(ValueError, match="blobs_dtype|the blobs of each point"):
+            run(Changing(*pair, place), path, blobs_dtype=dtype)
+
+
+def test_a_declared_type_may_have_fewer_digits(tmp_path):
+    sampler = run(Changing(floats, floats, FIRST), tmp_path / "run.h5", blobs_dtype=np.float32)
+    assert exact(sampler, lambda value: np.float32(value).item())
+    text = run(Changing(lambda x: "a", lambda x: repr(x[0]), LATER), tmp_path / "text.h5", blobs_dtype="S30")
+    assert exact(text, lambda value: value.encode())
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("where", ["memory", "file"])
+def test_blobs_of_some_points_only_are_refused(where, first, tmp_path):
+    posterior = Changing(ints, ints, LATER)
+    posterior.__class__ = type(
+        "Some", (Changing,), {"__call__": lambda self, x: Gaussian.__call__(self, x) if (x[0] > LATER) == first else
+                              (Gaussian.__call__(self, x), 1)}
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="must return blobs with every point or with none"):
+        run(posterior, tmp_path / "run.h5" if where == "file" else None)
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_types_with_a_pool(asynchronous):
+    with ThreadPoolExecutor(2) as pool:
+        settings = {"recycle": True, "asynchronous": True} if asynchronous else {}
+        sampler = run(Changing(*PAIRS["longer text"], FIRST), pool=pool, **settings)
+    assert exact(sampler)
+
+
+def test_arrays_of_batches():
+    assert joined([np.array([1]), np.array([0.5])]).tolist() == [1.0, 0.5]
+    assert joined([np.array([BIG]), np.array([0.5])]).tolist() == [BIG, 0.5]
+    assert joined([np.array([[1, 2]]), np.array([[1]])]).tolist() == [[1, 2], [1]]
+    assert joined([np.array([b"a"]), np.array([1.0])]).tolist() == [b"a", 1.0]
+    assert stacked([(1,), (2**63,), (-1,)]).tolist() == [1, 2**63, -1]
+    assert stacked([(1,), (2.5,)]).dtype == float and stacked([(1,), (2,)]).dtype == int
