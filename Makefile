@@ -24,7 +24,7 @@ update: $(READY) ## update the bridge column on bundled data; writes report.html
 
 test: $(READY)   ## run the quick tests on all cores
 	$(BIN)/python -m tests.compile_kernels
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -p no:randomly -n auto --dist worksteal
 
 .venv-newer/.ready: pyproject.toml
 	$(NEWER_PYTHON) -m venv .venv-newer
@@ -34,8 +34,10 @@ test: $(READY)   ## run the quick tests on all cores
 test-newer: .venv-newer/.ready ## tests that use arviz, with arviz 1 and NEWER_PYTHON (from 3.12 on)
 	.venv-newer/bin/python -m pytest tests/reporting/test_arviz_data.py
 
-test-slow: $(READY) ## run the slow tests
-	$(BIN)/python -m pytest -m slow --timeout 7200
+# `PYTEST_ADDOPTS=--randomly-seed=n make test-slow` repeats an order: the first lines of the output name the seed
+test-slow: $(READY) ## run the slow tests on all cores, in random order
+	$(BIN)/python -m tests.compile_kernels
+	$(BIN)/python -m pytest -m slow -n auto --dist worksteal --timeout 3600
 
 clients:         ## run every client on one posterior and compare with quadrature (makes two environments, 3 GB)
 	PYTHON=$(PYTHON) .ci/clients

@@ -59,7 +59,14 @@ def test_python_blocks_run_as_printed(page, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(2000)
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if blocks(page, "python") != blocks(page, "python", slow=False)], ids=name_of
+    "page",
+    [
+        page
+        for page in PAGES
+        if blocks(page, "python") != blocks(page, "python", slow=False)
+        and page.name != "decisions.rst"  # tests/prediction/test_page_of_decisions.py runs its blocks
+    ],
+    ids=name_of,
 )
 def test_slow_python_blocks_run_as_printed(page, tmp_path):
     run(page, tmp_path, slow=True)

@@ -16,6 +16,7 @@ import sqlite3
 import threading
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,21 @@ SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
 RETRY_SECONDS = 60.0  # wait after a failed access to the file
+# results of SQLite whose cause is outside of the file: locks, rights, the disk, memory
+OUTSIDE = (
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_INTERRUPT,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PROTOCOL,
+    sqlite3.SQLITE_AUTH,
+    sqlite3.SQLITE_NOLFS,
+)
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
 _files_lock = threading.Lock()
@@ -109,6 +125,17 @@ class _Damaged(sqlite3.DatabaseError):
     """Damage that SQLite does not detect."""
 
     sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+
+
+@contextlib.contextmanager
+def _reading_the_layout() -> Iterator[None]:
+    """Any error of SQLite in reading the layout of a file is damage, unless its cause is outside of the file."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        if _code(error) in OUTSIDE:
+            raise
+        raise _Damaged(str(error)) from error
 
 
 class CacheFile:
@@ -182,7 +209,8 @@ class CacheFile:
         connection = None
         try:
             connection = self._connect(read_options(self.path))
-            self._identify(connection)
+            with _reading_the_layout():
+                self._identify(connection)
             self._check_integrity(connection, seconds=math.inf)
         except (sqlite3.Error, UnicodeDecodeError) as error:
             if not _is_damage(error):
@@ -354,11 +382,12 @@ class CacheFile:
     def _open(self) -> sqlite3.Connection:
         connection = self._connect("mode=rwc")
         try:
-            if self._is_empty(connection):
-                self._create(connection)
-            self._identify(connection)
-            self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = NORMAL")
+            with _reading_the_layout():
+                if self._is_empty(connection):
+                    self._create(connection)
+                self._identify(connection)
+                self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
+                connection.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
             connection.close()
             raise
@@ -369,7 +398,8 @@ class CacheFile:
         for options in ("mode=ro", "mode=ro&immutable=1"):
             connection = self._connect(options)
             try:
-                self._identify(connection)
+                with _reading_the_layout():
+                    self._identify(connection)
                 return connection
             except sqlite3.OperationalError as error:
                 connection.close()
@@ -380,13 +410,15 @@ class CacheFile:
         raise last
 
     def _connect(self, options: str) -> sqlite3.Connection:
-        return sqlite3.connect(
+        connection = sqlite3.connect(
             f"{self.path.as_uri()}?{options}",
             uri=True,
             timeout=self.timeout,
             isolation_level=None,
             check_same_thread=False,
         )
+        connection.text_factory = bytes  # damaged texts cannot be decoded
+        return connection
 
     @staticmethod
     def _is_empty(connection: sqlite3.Connection) -> bool:
@@ -420,18 +452,19 @@ class CacheFile:
         """ValueError for a file of another program or release; `_Damaged` for unexpected tables."""
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
-        layout = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall())
+        layout = connection.execute("SELECT sql, name FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
         if identity != APPLICATION_ID:
+            names = ", ".join(sorted(name.decode("utf-8", "replace") for _, name in layout if isinstance(name, bytes)))
             raise ValueError(
                 f"{self.path} is another program's SQLite file (application id {identity:#x}, expected "
-                f"{APPLICATION_ID:#x}; tables and indices {', '.join(sorted(layout)) or 'none'}); give another path"
+                f"{APPLICATION_ID:#x}; tables and indices {names or 'none'}); give another path"
             )
         if version != SCHEMA_VERSION:
             raise ValueError(
                 f"{self.path} is a cache of another release (layout {version}); this release reads and writes layout "
                 f"{SCHEMA_VERSION}: give another path, or remove the file"
             )
-        if sorted(layout.values()) != sorted(LAYOUT):
+        if Counter(sql for sql, _ in layout) != Counter(statement.encode() for statement in LAYOUT):
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
@@ -447,8 +480,8 @@ class CacheFile:
             return
         finally:
             connection.set_progress_handler(None, 0)
-        if answer != "ok":
-            raise _Damaged(answer)
+        if answer != b"ok":
+            raise _Damaged(answer.decode("utf-8", "replace"))
 
     def _refuse_other_files(self) -> None:
         """ValueError if a damaged file may be a user's file, such as a table, and not a cache.

@@ -87,7 +87,8 @@ def _copy(
     kept = 0
     try:
         with _opened(damaged) as source:
-            query = f"SELECT {columns} FROM {table} WHERE id BETWEEN ? AND ?"
+            # by `rowid`: where the layout is damaged, the column `id` may be no number
+            query = f"SELECT {columns} FROM {table} WHERE rowid BETWEEN ? AND ?"
             for rows in _ranges(source, query, _largest_id(source, table, damaged), rows_per_query):
                 if good := [row for row in rows if check(*row)]:
                     with transaction(connection):
@@ -123,7 +124,7 @@ def _ranges(source: sqlite3.Connection, query: str, largest: int, rows_per_query
 def _largest_id(source: sqlite3.Connection, table: str, damaged: Path) -> int:
     """The largest row number, or an upper bound if it cannot be read."""
     try:
-        (largest,) = source.execute(f"SELECT max(id) FROM {table}").fetchone()
+        (largest,) = source.execute(f"SELECT max(rowid) FROM {table}").fetchone()
         return largest or 0
     except (sqlite3.DatabaseError, MemoryError) as error:
         if _is_absent(error):

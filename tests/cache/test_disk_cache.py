@@ -512,7 +512,7 @@ def test_forks_while_threads_write(path, rng):
     finally:
         stop.set()
         thread.join()
-    assert cache.file.connection().execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    assert cache.file.connection().execute("PRAGMA integrity_check").fetchall() == [(b"ok",)]
 
 
 def test_threads_share_a_cache(path, rng):

@@ -258,7 +258,7 @@ def test_data_sets_that_cannot_be_stacked():
 def test_ranks_of_the_truth_are_uniform(seed):
     """Simulation-based calibration: the truth is a draw of the prior, and so is the noise of each event."""
     ranks, simulations, inside, scores, statuses = [], [], [], [], []
-    for number in range(40):
+    for number in range(20):
         truth = joint(marginal=False).sample_prior(1, np.random.default_rng(1000 * seed + number))[0]
         posterior = joint(marginal=False, truth=truth[:2], sd=truth[2:], seed=1000 * seed + number)
         sampler = guided(posterior, limit=800, seed=number)

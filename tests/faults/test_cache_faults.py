@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import pickle
+import re
 import signal
 import sqlite3
 import subprocess
@@ -401,6 +402,37 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
         again = likelihood_of(path)
         np.testing.assert_array_equal(again.misfit(thetas), expected)
     assert how != "bytes" or served > 0
+
+
+TEXTS = [b"PRIMARY KEY", b"n_channels", b"time_limit", b"simulation_generations"]
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.decode())
+def test_a_layout_with_a_wrong_bit_is_set_aside_and_its_rows_are_salvaged(filled, thetas, expected, text):
+    """Bytes that are no UTF-8, names that are no names, a column of row numbers that is none."""
+    data = filled.read_bytes()
+    for bit in (0, 3, 7):
+        damaged = bytearray(data)
+        damaged[data.rindex(text) + len(text) // 2] ^= 1 << bit
+        path = filled.with_name(f"{bit}.sqlite")
+        path.write_bytes(damaged)
+        likelihood = likelihood_of(path)
+        assert path.with_name(f"{path.name}.damaged-1").read_bytes() == damaged
+        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
+        assert likelihood.simulator.disk_hits == len(thetas)
+
+
+@pytest.mark.parametrize("place", range(16, 100, 7))
+def test_a_wrong_byte_in_the_header_is_damage_or_another_file(filled, thetas, expected, place):
+    damaged = bytearray(filled.read_bytes())
+    damaged[place] ^= 0xFF
+    filled.write_bytes(damaged)
+    try:
+        likelihood = likelihood_of(filled)
+    except ValueError as error:
+        assert re.search("another program's SQLite file|a cache of another release", str(error))
+    else:
+        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
 
 
 @pytest.mark.parametrize(
