@@ -72,7 +72,7 @@ _IN_MODULES = {
     "signals.response_spectrum": "ResponseSpectrum response_spectrum",
     "simulation.faults": "TransientReason",
     "simulation.local_pool": "LocalPool",
-    "simulation.model": "ContinuedResponse Model",
+    "simulation.model": "Model",
 }
 
 

@@ -29,7 +29,6 @@ from ..kernels.isolated_bridge import N_STATES
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_sampling, sample_window
-from ..simulation.model import ContinuedResponse
 from .base import History, remark_on_range
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
@@ -327,40 +326,12 @@ class IsolatedBridge(ThreadedModel):
         Parameters and errors as for `simulate`.
         """
         prepared = self._prepared
-        run = run_bridge(self, prepared, check_theta(theta, self.parameters), None)
+        run = run_bridge(self, prepared, check_theta(theta, self.parameters))
         beyond = np.abs(prepared.linear.kinematics @ run.values[:5]).max(axis=1) / prepared.rubber_range
         rows = csr_array(channel_matrix(self.matrices, self.piers, ALL_CHANNELS)) @ run.drivers
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
         kept = np.concatenate([run.values[:N_STATES], run.values[14:16], rows])[:, :: self.every]
         return BridgeHistory(names, kept, beyond, run.iterations)
-
-    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
-        """Simulate from the state at a sample of the response, and return the state at the last sample.
-
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            As for `simulate`.
-        state : ndarray, optional
-            State that this method returned for the same theta and the same bridge, under the first part of its
-            excitation. Default: the bridge at rest.
-
-        Returns
-        -------
-        ContinuedResponse
-            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
-            state at the last sample (168 bytes).
-
-        Raises
-        ------
-        SimulationFailed
-            As for `simulate`.
-        ValueError
-            If `state` is not a state of this bridge.
-        """
-        theta = check_theta(theta, self.parameters)
-        run = run_bridge(self, self._prepared, theta, state)
-        return ContinuedResponse(self._outputs_of(run, theta), run.state)
 
     def exchange_piers(self, thetas: np.ndarray) -> np.ndarray:
         """Exchange the devices of the two piers: multiples (..., 10) with the same physical values at the other pier.
@@ -387,7 +358,7 @@ class IsolatedBridge(ThreadedModel):
         return plot_bearing_loops(replace(self, every=1).history(theta))
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return self._outputs_of(run_bridge(self, self._prepared, theta, None), theta)
+        return self._outputs_of(run_bridge(self, self._prepared, theta), theta)
 
     def _outputs_of(self, run: BridgeRun, theta: np.ndarray) -> np.ndarray:
         """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber law."""

@@ -38,7 +38,6 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
-from ..simulation.model import ContinuedResponse
 from .circular_section import Confinement, gauss_lobatto
 from .rc_column_analysis import ColumnHistory, check_loading
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
@@ -415,7 +414,7 @@ class RCColumn(ThreadedModel):
         where the column bends towards positive displacements: ``history["base_moment"]`` is
         ``-history["base moment"]``.
         """
-        history, outputs, _ = run_column(self, self._prepared, check_theta(theta, self.parameters), None)
+        history, outputs = run_column(self, self._prepared, check_theta(theta, self.parameters))
         sensors = {name: values for name, values in outputs.items() if name not in history.names}
         values = np.vstack([history.values, *sensors.values()])
         return replace(history, names=(*history.names, *sensors), values=values)
@@ -432,39 +431,8 @@ class RCColumn(ThreadedModel):
 
         return plot_column_loops(self, self.history(theta))
 
-    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
-        """Simulate from the state at a sample of the response, and return the state at the last sample.
-
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            As for `simulate`.
-        state : ndarray, optional
-            State that this method returned for the same theta and the same column, under the first part of this
-            excitation. Default: the beginning, before the gravity load.
-
-        Returns
-        -------
-        ContinuedResponse
-            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
-            state at the last sample (64 kB for the default mesh and two elements).
-
-        Raises
-        ------
-        SimulationFailed
-            As for `simulate`.
-        ValueError
-            For a column under imposed displacement, or a `state` that is not a state of this column.
-        """
-        if not isinstance(self.loading, Record):
-            raise invalid(
-                "a column under a Record", type(self.loading).__name__, "use simulate for imposed displacements"
-            )
-        run = run_column(self, self._prepared, check_theta(theta, self.parameters), state)
-        return ContinuedResponse(np.stack(list(run.outputs.values())), run.state)
-
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return np.stack(list(run_column(self, self._prepared, theta, None).outputs.values()))
+        return np.stack(list(run_column(self, self._prepared, theta).outputs.values()))
 
     def _prepare(self) -> PreparedColumn:
         return prepare_column(self, self._parsed_outputs)

@@ -166,28 +166,8 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(
-        self,
-        column: Column,
-        dynamics: Dynamics,
-        iteration: Iteration,
-        recorded: ToRecord,
-        first: int,
-        energies: np.ndarray,
-    ) -> Analysis:
+    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, recorded: ToRecord) -> Analysis:
         """Integrate the equations of motion; SimulationFailed at collapse, or if a step does not converge.
-
-        Parameters
-        ----------
-        column : Column
-        dynamics : Dynamics
-        iteration : Iteration
-        recorded : ToRecord
-        first : int
-            0 for an analysis from the beginning. Otherwise the response sample whose state `column` and `energies`
-            hold; the histories begin after this sample.
-        energies : ndarray[4]
-            Written, as by `newmark`.
 
         Returns
         -------
@@ -199,9 +179,7 @@ class BaseMotion(NamedTuple):
             column, self.n_steps, sections=recorded.sections, motion=3 * recorded.motion, fibers=recorded.fibers
         )
         loading = self.acceleration, self.dt, self.substeps
-        status, retries, _ = newmark(
-            column, dynamics, *loading, iteration, history, out, first * self.substeps, energies
-        )
+        status, retries, _ = newmark(column, dynamics, *loading, iteration, history, out)
         if status < -1:
             raise SimulationFailed(
                 f"collapse: at t = {-(status + 1) * self.dt:.4g} s, the displacement of the top exceeded the limit of "
@@ -210,11 +188,8 @@ class BaseMotion(NamedTuple):
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
-        start = first + 1 if first else 0
-        motion, stresses, ground = out.motion[start:], out.stresses[start:], self.acceleration[:: self.substeps][start:]
-        return Analysis(
-            HISTORY_ROWS, history[:, start:], retries, _by_section(out.sections[start:]), motion, stresses, ground
-        )
+        ground = self.acceleration[:: self.substeps]
+        return Analysis(HISTORY_ROWS, history, retries, _by_section(out.sections), out.motion, out.stresses, ground)
 
 
 class ImposedMotion(NamedTuple):

@@ -202,13 +202,6 @@ def test_the_instants_of_stick_and_slip_do_not_depend_on_the_step(rng):
         assert np.abs((replace(model, step=model.record.dt).simulate(np.ones(10)) - fine) / peak).max() > 1e-3
 
 
-def test_a_bridge_with_coulombs_law_continues_with_the_same_bits(rng):
-    model = IsolatedBridge(shaking(rng, duration=2.0), friction="coulomb")
-    whole, start = model.simulate(np.ones(10)), model.first(1.0).simulate_from(np.ones(10))
-    rest = model.simulate_from(np.ones(10), start.state)
-    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
-
-
 def test_bearings_that_stick_have_the_force_that_keeps_them_at_rest(rng):
     """The deck and both piers move together, so that the bearings have no acceleration."""
     model = IsolatedBridge(shaking(rng, duration=1.0).scale(0.01), friction="coulomb", outputs=("Ud", "acc_d", "Ub_1"))

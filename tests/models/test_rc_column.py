@@ -194,9 +194,7 @@ def test_the_system_of_units_does_not_matter(strong, theta):
     history = np.zeros((len(HISTORY_ROWS), strong.n_steps))
     ground = strong.acceleration / INCH
     dynamics = Dynamics(gravity, mass, peer.a0, peer.a1, 0.0)
-    newmark(
-        kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history, recorder(kernels), 0, np.zeros(4)
-    )
+    newmark(kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history, recorder(kernels))
     assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
 
 

@@ -304,16 +304,3 @@ def test_material_and_section_curves_include_the_failure(column):
     there = np.concatenate([np.linspace(0.0, 0.04, 30), np.linspace(0.04, -0.04, 60)])
     moments = [moment_curvature(m, [1.0], there).moment for m in (column, model)]
     assert abs(moments[1][-1]) < 0.97 * abs(moments[0][-1])
-
-
-def test_an_earthquake_continues_from_a_damaged_state():
-    """A run in two parts has the bits of one run, memory of fatigue and buckling included."""
-    record = bridge_column_data().record.scale(4.0).trim(5.0, 11.0)
-    model = RCColumn.lhpost(record, fatigue=WEAK, buckling=SLENDER)
-    theta = np.ones(5)
-    whole = model.simulate(theta)
-    first = model.first(3.0)
-    start = first.simulate_from(theta)
-    rest = model.simulate_from(theta, start.state)
-    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
-    assert 0.0 < model.history(theta).bar_damage.max() < 1.0
