@@ -11,7 +11,6 @@ from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
 from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
-from .information.value import value_of_information
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -38,7 +37,6 @@ from .plots.materials import plot_material, plot_moment_curvature
 from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.structures import plot_sensors
-from .prediction.annual_risk import annual_risk
 from .prediction.averaging import average_predictions
 from .prediction.few_runs import propagate_few
 from .prediction.fragility import fragility
@@ -116,7 +114,6 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
-    "annual_risk",
     "arias_intensity",
     "average_predictions",
     "check_fit",
@@ -169,5 +166,4 @@ __all__ = [
     "share_within",
     "stiffness_loss",
     "to_si",
-    "value_of_information",
 ]

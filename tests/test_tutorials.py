@@ -698,6 +698,23 @@ def test_damaged_storeys_are_found_and_a_colder_building_causes_no_alarm(tmp_pat
     np.testing.assert_allclose(heights[: len(heights) // 2], summary["probability"])
 
 
+# 14
+
+
+def test_noise_is_worth_nothing_and_the_rates_have_their_closed_form(tmp_path):
+    output = run_tutorial("14_decisions.py", "--out", str(tmp_path))
+    assert "REDUCED SETTING" in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["sum"] == pytest.approx(1.0, abs=1e-5)
+    assert 0.0 < summary["rates"]["replacement"] < summary["rates"]["repair"] < 0.05, "the rate of the weakest motion"
+    values = {name: value for name, (value, _) in summary["values"].items()}
+    assert max(values.values()) == values["everything"] > 0.0
+    assert abs(values["noise"]) <= 4.0 * summary["values"]["noise"][1]
+    fragilities, worth = read_figure(tmp_path, "decisions").axes
+    assert texts(fragilities) == ["repair: 10 cm", "replacement: 25 cm"]
+    np.testing.assert_allclose([bar.get_width() for bar in worth.patches], list(values.values()))
+
+
 # the data, and the form of the scripts
 
 
