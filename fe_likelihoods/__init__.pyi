@@ -24,7 +24,7 @@ from .models.linear_structure_parts import BridgeDeck, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
-from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.steel_coupon import SteelCoupon
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
@@ -69,7 +69,6 @@ from .units import from_si, to_si
 
 __all__ = [
     "AutoregressiveNoise",
-    "BarBuckling",
     "Bars",
     "BridgeDeck",
     "Channel",

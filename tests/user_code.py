@@ -29,7 +29,7 @@ models = [
     fe.ExecutableModel(["solver", "in.txt"], {"in.txt": "$k"}, "out.txt", ["k"], [top], 0.01, 100, time_limit=60.0),
 ]
 columns = [
-    fe.RCColumn.lhpost(record, parameters=("Ec", "fy"), buckling=fe.BarBuckling()),
+    fe.RCColumn.lhpost(record, parameters=("Ec", "fy"), fatigue=fe.LowCycleFatigue()),
     fe.IsolatedBridge(record),
     fe.LinearOscillator(record, period=0.8),
     fe.LinearStructure(fe.ShearFrame({"top": 2}, [1.0, 1.0], [400.0, 400.0]), record),

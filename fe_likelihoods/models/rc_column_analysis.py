@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
+from ..kernels import bar_fatigue, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import Column, recorder
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
@@ -20,7 +20,7 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel, History, remark_on_range
 from .circular_section import Confinement
-from .rc_column_parts import BarBuckling, Concrete, LowCycleFatigue, Steel, hardening_fault
+from .rc_column_parts import Concrete, LowCycleFatigue, Steel, hardening_fault
 from .validation import check_values, invalid
 
 __all__ = [
@@ -321,7 +321,6 @@ def set_materials(
     steel: Steel,
     confinement: Confinement,
     fatigue: LowCycleFatigue | None = None,
-    buckling: BarBuckling | None = None,
 ) -> None:
     """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `sections`."""
     fc, ec, ft = values["fc"], values["Ec"], values["ft"]
@@ -342,10 +341,8 @@ def set_materials(
         steel.ultimate_strain,
         sections.steel,
     )
-    if fatigue is not None or buckling is not None:
-        coefficients = (values["Cf"], fatigue.alpha, values["Cd"]) if fatigue is not None else (0.0, 1.0, 1.0)
-        support = (values["slenderness"], buckling.alpha) if buckling is not None else (0.0, 1.0)
-        bar_fatigue_buckling.constants(sections.steel, values["fy"], *coefficients, *support, sections.failure)
+    if fatigue is not None:
+        bar_fatigue.constants(values["Cf"], fatigue.alpha, values["Cd"], sections.failure)
 
 
 def _by_section(sections: np.ndarray) -> np.ndarray:
@@ -359,7 +356,7 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     reason = f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"
     if sections.failure.shape[0] == 0:
         return reason
-    broken = sections.steel_memory[:, :, bar_fatigue_buckling.FRACTURED]
+    broken = sections.steel_memory[:, :, bar_fatigue.FRACTURED]
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_fatigue_buckling
+from ..kernels import bar_fatigue
 from ..kernels.frame import allocate
 from ..kernels.newmark import Dynamics
 from ..kernels.static import Iteration
@@ -95,10 +95,10 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> Colum
         weights=prepared.weights,
         **prepared.fibers,
         penetration=values["penetration"],
-        bars_fail=model.fatigue is not None or model.buckling is not None,
+        bars_fail=model.fatigue is not None,
     )
     confinement = prepared.section.confinement(values["fc"])
-    set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue, model.buckling)
+    set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue)
     iteration = Iteration(float(model.tolerance), int(model.max_iterations), int(model.halvings))
     fibers = tuple(dict.fromkeys(output.fiber for output in prepared.outputs if output.fiber is not None))
     recorded = ToRecord(
@@ -128,6 +128,6 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> Colum
     outputs = {output.name: output.evaluate(seen) for output in prepared.outputs}
     damage = None
     if model.fatigue is not None:
-        damage = column.sections.steel_memory[:, :, bar_fatigue_buckling.DAMAGE].max(axis=0)
+        damage = column.sections.steel_memory[:, :, bar_fatigue.DAMAGE].max(axis=0)
     history = checked_history(model, model.steel, model.bar_circle_radius, analysis, theta, damage)
     return ColumnRun(history, outputs)
