@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider, coulomb, elastic_plastic, regularised
+from .bearings import BOUC_WEN, COULOMB, RubberLaw, Slider, coulomb, regularised
 from .jit import kernel
 
 __all__ = ["N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
@@ -71,7 +71,7 @@ class Isolators(NamedTuple):
     c : float
         sqrt(gamma - beta) of the Bouc-Wen law.
     form : int
-        `BOUC_WEN`, `ELASTIC_PLASTIC` or `COULOMB`.
+        `BOUC_WEN` or `COULOMB`.
     """
 
     sliders: tuple[Slider, Slider]
@@ -198,9 +198,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
                 if form == BOUC_WEN:
                     p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, slider0, c, law)
                     p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, slider1, c, law)
-                elif form == ELASTIC_PLASTIC:
-                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, slider0, c, law)
-                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, slider1, c, law)
                 else:
                     stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, slider0, law)
                     stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, slider1, law)

@@ -57,7 +57,7 @@ _NOMINAL_UNITS = {
     for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
 }
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
-_LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.25e-3}  # of the default [s]
+_LONGEST_STEP = 0.25e-3  # of the default [s]
 _STATE_ROWS = (
     *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
@@ -108,11 +108,11 @@ class IsolatedBridge(ThreadedModel):
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
     friction : str
-        "bouc-wen" (regularised, the default), "elastic-plastic" (the slider law in other codes), or "coulomb" (exact
-        stick and slip, whose instants are located within a step).
+        "bouc-wen" (regularised, the default), or "coulomb" (exact stick and slip, whose instants are located within a
+        step).
     step : float, optional
-        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms, or up to
-        0.05 ms for "elastic-plastic" (accuracy: ``docs/theory/time_integration.rst``).
+        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms (accuracy:
+        ``docs/theory/time_integration.rst``).
     every : int
         The response has one sample per `every` samples of the record.
     p_delta : bool
@@ -141,15 +141,12 @@ class IsolatedBridge(ThreadedModel):
     friction             displacements   forces              accelerations    peaks
     ===================  ==============  ==================  ===============  ========
     ``bouc-wen``         0.004 %         0.02 %              0.02 % (0.12 %)  0.04 %
-    ``elastic-plastic``  0.008 %         0.05 %              0.1 % (0.14 %)   0.008 %
     ``coulomb``          0.05 %          0.02 %              0.01 % (0.08 %)  0.03 %
     ===================  ==============  ==================  ===============  ========
 
     Values in parentheses are for the pier accelerations under the record of 0.04 g, in which the bearings slide by 1
     mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick; steps are halved there
-    until the instant is known within h/64. With "elastic-plastic", many simulations fail (6 of 60 at -1.1 g, 48 of 60
-    at -2 g) where a `vertical` acceleration below -g removes the load of a bearing; their log-likelihood is -inf. Use
-    "bouc-wen" or "coulomb" for such records.
+    until the instant is known within h/64.
 
     The channels of the two piers and of the deck are:
 
@@ -237,13 +234,12 @@ class IsolatedBridge(ThreadedModel):
 
     @property
     def integration_step(self) -> float:
-        """Integration step [s]: `step`, or the default of the friction law."""
+        """Integration step [s]: `step`, or the default."""
         if self.step is not None:
             return self.step
-        longest = _LONGEST_STEP[self.friction]
-        ratio = self.record.dt / longest
+        ratio = self.record.dt / _LONGEST_STEP
         divisions = max(1, math.ceil(ratio * (1.0 - 1e-6)))
-        return longest if abs(ratio - divisions) <= 1e-6 * ratio else self.record.dt / divisions
+        return _LONGEST_STEP if abs(ratio - divisions) <= 1e-6 * ratio else self.record.dt / divisions
 
     @property
     def matrices(self) -> BridgeMatrices:

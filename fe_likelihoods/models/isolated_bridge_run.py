@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider
+from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
 from ..kernels.isolated_bridge import N_OUT, Isolators, step_isolated
 from ..simulation.model import SimulationFailed
 from .isolated_bridge_channels import channel_matrix
@@ -18,7 +18,7 @@ from .validation import check_values
 
 __all__ = ["FORMS", "BridgeRun", "PreparedBridge", "prepare_bridge", "run_bridge"]
 
-FORMS = {"bouc-wen": BOUC_WEN, "elastic-plastic": ELASTIC_PLASTIC, "coulomb": COULOMB}
+FORMS = {"bouc-wen": BOUC_WEN, "coulomb": COULOMB}
 COULOMB_HALVINGS = 6
 """How often a step with Coulomb's law is halved to find the instant at which a bearing begins or ceases to stick."""
 
@@ -100,7 +100,6 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> Bridg
             df=float(v[f"df_{i}"]),
             a=float(v[f"a_{i}"]),
             yield_displacement=float(bearing.yield_displacement),
-            stiffness=float(v[f"fmin_{i}"] * bearing.load / bearing.yield_displacement),
         )
         for i, bearing in enumerate(model.bearings, 1)
     )
