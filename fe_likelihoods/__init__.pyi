@@ -25,7 +25,6 @@ from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
 from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
-from .models.steel_coupon import SteelCoupon
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
@@ -106,7 +105,6 @@ __all__ = [
     "SimulationCache",
     "SimulationFailed",
     "Steel",
-    "SteelCoupon",
     "StoredPosterior",
     "TruncatedNormal",
     "UMBridgeModel",

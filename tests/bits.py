@@ -28,7 +28,6 @@ from fe_likelihoods import (
     Prior,
     ShearFrame,
     SimulationCache,
-    SteelCoupon,
     TruncatedNormal,
     exceedance,
     peak,
@@ -99,14 +98,12 @@ def responses() -> Results:
     """Responses and misfits of every built-in model at draws of a prior around the nominal values."""
     record = problems.bridge_column_data().record
     short = record.resample(4 * record.dt).trim(0.0, 15.0)
-    strain = np.concatenate([np.linspace(0, 0.02, 60), np.linspace(0.02, -0.015, 90), np.linspace(-0.015, 0.04, 120)])
     column = problems.bridge_column(every=4, duration=20.0)
     bridges = {data: problems.isolated_bridge(data=data) for data in ("twin", "means")}
     models = {
         "column": column.likelihood.model,
         **{f"isolated bridge, {data}": posterior.likelihood.model for data, posterior in bridges.items()},
         "oscillator": noises()["white"].likelihood.model,
-        "steel coupon": SteelCoupon(strain, column.likelihood.model.steel),
         "deck": LinearStructure(BridgeDeck("middle"), [short, short.scale(0.9), short.scale(1.1)]),
         "frame": LinearStructure(ShearFrame({"floor 1": 1, "roof": 3}, (3e3, 3e3, 2e3), (2e6, 2e6, 2e6)), short),
     }

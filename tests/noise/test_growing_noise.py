@@ -16,11 +16,11 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Steel,
-    SteelCoupon,
     TruncatedNormal,
     propagate,
 )
 from fe_likelihoods.noise.response_level import imposed_deformation
+from tutorials.steel_coupon import SteelCoupon
 
 FORCE = (Channel("force", "lateral force", "kN"),)
 HEIGHT, WINDOW, SENSOR, GROWTH = 2.0, 12.0, 50.0, 0.5
