@@ -60,7 +60,7 @@ _IN_MODULES = {
     "prediction.scores": "Share crps_normal crps_samples log_score_normal",
     "priors.distributions": "Distribution",
     "priors.mixture_prior": "MixtureDistribution",
-    "priors.multivariate": "MultivariateDistribution TruncatedMultivariateNormal",
+    "priors.multivariate": "MultivariateDistribution",
     "problems": "table_motion",
     "signals.alignment": "Alignment",
     "signals.datasets": "Dataset read_dataset write_dataset",
