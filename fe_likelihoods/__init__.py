@@ -28,7 +28,7 @@ _REPLACED = {
     "score_left_out": "leave_one_out(hierarchy).scores(posteriors, quantity=...)",
 }
 _IN_MODULES = {
-    "adapters": "nautilus_prior serve to_bilby to_pints to_pymc",
+    "adapters": "serve to_bilby to_pymc",
     "cache.verification": "StaleCache",
     "column_damage.damage": "Damage LimitState",
     "column_damage.measures": "DamageMeasures",

@@ -16,7 +16,6 @@ from fe_likelihoods import (
     Uniform,
     fit_mixture,
 )
-from fe_likelihoods.adapters import nautilus_prior
 from samplers import SMCSampler
 from tests.likelihood.linear_gaussian import exact_log_evidence, likelihood_of
 
@@ -185,8 +184,6 @@ def test_posterior_with_a_correlated_prior(rng):
     assert posterior.fingerprint != other.fingerprint and len(posterior.fingerprint) == 32
     marginal = posterior.marginal()
     assert marginal.parameter_names == ["a", "c"] and np.isfinite(marginal(point[:2]))
-    with pytest.raises(ValueError, match="needs independent parameters; c, a have a MultivariateNormal"):
-        nautilus_prior(posterior)
     together = {("a", "c", "sigma_top"): MultivariateNormal([1.0, 1.0, 1.0], np.diag([0.5, 0.5, 0.5]))}
     with pytest.raises(ValueError, match="sigma_top have a joint prior distribution"):
         Posterior(likelihood, together).marginal()
