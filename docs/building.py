@@ -51,14 +51,6 @@ def write_api_pages(app) -> None:
             path.write_text(text)
 
 
-def forget_moved_names() -> None:
-    """Let packages raise AttributeError for moved names, since sphinx-gallery looks for names of modules in them."""
-    for package in PACKAGES:
-        module = importlib.import_module(package)
-        module._REPLACED.clear()
-        module._IN_MODULES.clear()
-
-
 def show_kernels_as_functions(app, env, docnames) -> None:
     """Replace compiled kernels by the Python functions that they are written as, which autodoc can read.
 

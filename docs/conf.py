@@ -60,7 +60,6 @@ sphinx_gallery_conf = {
 def setup(app):
     import building
 
-    building.forget_moved_names()
     app.connect("builder-inited", building.write_api_pages)
     app.connect("env-before-read-docs", building.show_kernels_as_functions)
     app.connect("autodoc-skip-member", building.skip_fields)

@@ -11,7 +11,6 @@ from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
 from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
-from .information.value import value_of_information
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -25,8 +24,7 @@ from .models.linear_structure_parts import BridgeDeck, ShearFrame
 from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
-from .models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
-from .models.steel_coupon import SteelCoupon
+from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
@@ -40,7 +38,6 @@ from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
 from .plots.sensors import plot_ranking
 from .plots.structures import plot_hysteresis, plot_section, plot_sensors
-from .prediction.annual_risk import annual_risk
 from .prediction.averaging import average_predictions
 from .prediction.few_runs import propagate_few
 from .prediction.fragility import fragility
@@ -72,7 +69,6 @@ from .units import from_si, to_si
 
 __all__ = [
     "AutoregressiveNoise",
-    "BarBuckling",
     "Bars",
     "BridgeDeck",
     "Channel",
@@ -110,14 +106,12 @@ __all__ = [
     "SimulationCache",
     "SimulationFailed",
     "Steel",
-    "SteelCoupon",
     "StoredPosterior",
     "TruncatedNormal",
     "UMBridgeModel",
     "Uniform",
     "Varying",
     "align",
-    "annual_risk",
     "arias_intensity",
     "average_predictions",
     "check_fit",
@@ -176,5 +170,4 @@ __all__ = [
     "share_within",
     "stiffness_loss",
     "to_si",
-    "value_of_information",
 ]

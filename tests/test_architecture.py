@@ -20,7 +20,7 @@ from tests.architecture import (
 
 PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy", "umbridge"}
-ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
+ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
 WORKERS = {"faults", "interrupts", "by_value", "user_code", "worker", "local_pool", "sandbox"} | {
     "program_supervisor",

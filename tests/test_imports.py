@@ -1,11 +1,9 @@
 """An import brings no more along than it needs, and every name is there as if it did."""
 
 import ast
-import importlib
 import inspect
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -73,37 +71,6 @@ def test_unknown_name_is_an_attribute_error(package):
     assert not hasattr(package, "absent")
     with pytest.raises(AttributeError, match=f"No {package.__name__} attribute .*absent"):
         package.absent  # noqa: B018
-
-
-@pytest.mark.parametrize("package", [fe_likelihoods, samplers])
-def test_names_that_have_moved_say_where_they_are(package):
-    for name, now in package._REPLACED.items():
-        with pytest.raises(ImportError, match=re.escape(f"{package.__name__}.{name} is now {now}")):
-            getattr(package, name)
-    for module, names in package._IN_MODULES.items():
-        for name in names.split():
-            with pytest.raises(ImportError, match=f"from {package.__name__}.{module} import {name}"):
-                getattr(package, name)
-            assert hasattr(importlib.import_module(f"{package.__name__}.{module}"), name)
-    other = samplers if package is fe_likelihoods else fe_likelihoods
-    for name in other.__all__:
-        with pytest.raises(ImportError, match=f"from {other.__name__} import {name}$"):
-            getattr(package, name)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameter"),
-    [("BandNoise", "share_top_band1"), ("ModulatedNoise", "share_top"), ("RelativeNoise", "share_top")],
-)
-def test_shares_are_replaced_by_shares(name, parameter):
-    """The call in the advice for a former noise, with values in the place of the dots."""
-    given = {"edges": "[1.0, 5.0]", "window=...": "window=1.0", "sensor=...": "sensor=[1e-4]"}
-    call = re.match(r"GaussianNoise\(.*?\)", fe_likelihoods._REPLACED[name])[0]
-    for before, now in given.items():
-        call = call.replace(before, now)
-    known = {"GaussianNoise": fe_likelihoods.GaussianNoise}
-    noise = eval(call, known | {"channels": (fe_likelihoods.Channel("top", "displacement", "mm"),)})
-    assert noise.parameter_names[0] == parameter
 
 
 @pytest.mark.parametrize("name", ["SMCSampler", "TMCMCSampler"])

@@ -288,8 +288,8 @@ def test_real_column_is_calibrated_and_predicts(shared, tmp_path):
     after_peak = {name: found["rrmse"] for name, found in summary["failure"].items()}
     assert set(after_peak) == {"Lehman 415", "Hose SRPH1", "Lehman 407", "Lehman 1015"}
     assert all(errors["literature"] < errors["no failure"] for errors in after_peak.values())
-    assert after_peak["Lehman 415"]["0.15 and 8"] < 0.4 * after_peak["Lehman 415"]["no failure"]
-    assert after_peak["Hose SRPH1"]["0.15 and 8"] > 2.0 * after_peak["Hose SRPH1"]["no failure"]
+    assert after_peak["Lehman 415"]["0.15"] < 0.4 * after_peak["Lehman 415"]["no failure"]
+    assert after_peak["Hose SRPH1"]["0.15"] > 2.0 * after_peak["Hose SRPH1"]["no failure"]
 
 
 @pytest.mark.slow
@@ -398,6 +398,20 @@ def test_damaged_storeys_are_found_and_a_colder_building_causes_no_alarm(tmp_pat
     assert np.delete(summary["probability"], 2).max() < 0.1
     assert summary["median"][2] == pytest.approx(summary["truth"][2], abs=0.04)
     assert summary["common"] == pytest.approx(0.97, abs=0.02) and summary["error"] > 1.0
+
+
+# 14
+
+
+def test_noise_is_worth_nothing_and_the_rates_have_their_closed_form(tmp_path):
+    output = run_tutorial("14_decisions.py", "--out", str(tmp_path))
+    assert "REDUCED SETTING" in output
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["sum"] == pytest.approx(1.0, abs=1e-5)
+    assert 0.0 < summary["rates"]["replacement"] < summary["rates"]["repair"] < 0.05, "the rate of the weakest motion"
+    values = {name: value for name, (value, _) in summary["values"].items()}
+    assert max(values.values()) == values["everything"] > 0.0
+    assert abs(values["noise"]) <= 4.0 * summary["values"]["noise"][1]
 
 
 # the data, and the form of the scripts

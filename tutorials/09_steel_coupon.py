@@ -34,8 +34,9 @@ from cyclic_tests import (
     table,
 )
 from real_data import FAST, add_common_options
+from steel_coupon import SteelCoupon
 
-from fe_likelihoods import Measurements, Steel, SteelCoupon, TruncatedNormal
+from fe_likelihoods import Measurements, Steel, TruncatedNormal
 
 SOURCE = "https://github.com/NHERI-SimCenter/quoFEM (an example of quoFEM)"
 FILES = ("stress.1.coords", "calDataField.csv")

@@ -147,13 +147,12 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
     values = dict(job.model)
     if job.kind == "column":
         from ..models.rc_column import PARAMETERS, RCColumn
-        from ..models.rc_column_parts import BarBuckling, LowCycleFatigue
+        from ..models.rc_column_parts import LowCycleFatigue
 
-        off = {"fatigue": LowCycleFatigue(), "buckling": BarBuckling()}  # a section switches them on
         usual = RCColumn.lhpost(record)
-        for part in part_keys("column"):
+        for part in part_keys("column"):  # a section of fatigue switches it on
             if part in values:
-                values[part] = _changed(job, part, getattr(usual, part) or off[part], values[part])
+                values[part] = _changed(job, part, getattr(usual, part) or LowCycleFatigue(), values[part])
         if "units" in values:
             values["units"] = tuple((dict(usual.units) | values["units"]).items())
         _check_names(job, "parameters", values.get("parameters", ()), tuple(PARAMETERS))

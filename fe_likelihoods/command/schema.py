@@ -145,9 +145,7 @@ _OWN = {
         *(key._replace(required=True) if key.name == "time_limit" else key for key in USER),
     ),
 }
-_COLUMN_PARTS = dict(
-    concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue", buckling="BarBuckling"
-)
+_COLUMN_PARTS = dict(concrete="Concrete", steel="Steel", bars="Bars", hoops="Hoops", fatigue="LowCycleFatigue")
 _BRIDGE_PARTS = {f"{name.lower()}_{i}": name for name in ("Pier", "Bearing", "Damper") for i in (1, 2)}
 _BUILT_IN: dict[str, tuple[str, dict[str, str]]] = {
     "column": (

@@ -15,7 +15,6 @@ import numpy as np
 
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
-from ..noise.tabulated import tabulated
 from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch
 
@@ -73,7 +72,7 @@ class _StackedNoise:
     """The noises of all data sets."""
 
     def __init__(self, parts: Sequence[_Part]) -> None:
-        self._parts, self._functions = parts, [tabulated(part.likelihood.noise) for part in parts]
+        self._parts = parts
         # white noise keeps its fast way: zeros add nothing to a sum of squares
         white = all(part.statistic is sums_of_squares for part in parts)
         self.statistic = sums_of_squares if white else self._statistic
@@ -85,8 +84,8 @@ class _StackedNoise:
     def log_likelihood(self, statistics: np.ndarray, n_samples: Sequence[Any], parameters: np.ndarray) -> np.ndarray:
         """Sum (n,) of the log-likelihoods for statistics (n, n_numbers) at noise parameters (n, n_noise)."""
         return sum(
-            function(statistics[:, part.numbers], samples, parameters[:, part.noise])
-            for part, samples, function in zip(self._parts, n_samples, self._functions, strict=True)
+            part.likelihood.noise.log_likelihood(statistics[:, part.numbers], samples, parameters[:, part.noise])
+            for part, samples in zip(self._parts, n_samples, strict=True)
         )
 
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
-from ..noise.tabulated import tabulated
 from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.model import derivatives_batch, most_responses
@@ -168,7 +167,6 @@ class ResponseTarget:
         self._likelihood: _Likelihood = stack(posterior.likelihood)
         self._prior = posterior.prior
         self.model, self.noise = self._likelihood.model, self._likelihood.noise
-        self._log_likelihood = tabulated(self.noise)
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
         self.comparison = self._likelihood.measured
@@ -468,7 +466,7 @@ class ResponseTarget:
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
         parameters = self._noise_parameters(coords) if self.n_noise else coords
-        return self._log_likelihood(statistics, self.n_samples, parameters)
+        return self.noise.log_likelihood(statistics, self.n_samples, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""

@@ -94,8 +94,8 @@ class SensorRanking(NamedTuple):
     draws, failed, simulations : int
         Draws that were used and draws that were left out because a simulation failed; simulations made.
     precisions : dict of str to (d, d) float
-        What each candidate tells of the standard normal coordinates of the prior: J^T W J, averaged over the draws, for
-        `fe_likelihoods.information.value.simulate_summary`. Precisions of several sensors add.
+        What each candidate tells of the standard normal coordinates of the prior: J^T W J, averaged over the draws.
+        Precisions of several sensors add.
     """
 
     candidates: tuple[str, ...]

@@ -4,13 +4,12 @@ Friction. The slider resists the motion with mu(v) W Z, where the friction coeff
 
     mu(v) = f_min + df (1 - exp(-a |v|))
 
-and Z in [-1, 1] replaces the sign of v. There are three laws for Z.
+and Z in [-1, 1] replaces the sign of v. There are two laws for Z.
 
 * Regularised (Bouc-Wen with exponent 2 and A = beta + gamma = 1): Z follows the displacement U over the yield
   displacement Y, ``Y Z' = v [1 - Z^2 (gamma sgn(v Z) + beta)]``. This equation is rate-independent, so that a monotone
   increment of U integrates exactly: tanh while Z grows, tan while it returns.
 * Exact (Coulomb): Z is the sign of v, or any value in [-1, 1] at rest.
-* Elastic-plastic: the slider is a spring with stiffness f_min W / Y that slides at mu(v) W.
 
 Rubber. With s = U / s_u, an odd polynomial F(s) is the skeleton, and an even polynomial D(s) is half the distance
 between the loading and unloading branches::
@@ -41,20 +40,17 @@ from .jit import kernel
 __all__ = [
     "BOUC_WEN",
     "COULOMB",
-    "ELASTIC_PLASTIC",
     "RubberLaw",
     "Slider",
     "bouc_wen",
     "coulomb",
-    "elastic_plastic",
     "friction",
     "regularised",
     "rubber",
 ]
 
 BOUC_WEN = 0
-ELASTIC_PLASTIC = 1
-COULOMB = 2
+COULOMB = 1
 
 
 class Slider(NamedTuple):
@@ -68,15 +64,12 @@ class Slider(NamedTuple):
         Rate of this increase [s/m].
     yield_displacement : float
         Y [m].
-    stiffness : float
-        Stiffness of the elastic-plastic law, f_min W / Y [N/m].
     """
 
     f_min: float
     df: float
     a: float
     yield_displacement: float
-    stiffness: float
 
 
 class RubberLaw(NamedTuple):
@@ -181,30 +174,6 @@ def regularised(increment, displacement, velocity, z, weight, slider, c, law):
     force, stiffness, half_loop, slope = rubber(displacement, law)
     bound = mu * weight + half_loop
     return bound * z + force, bound * dz + stiffness + slope * z, dmu * weight * z, z
-
-
-@kernel(inline=True)
-def elastic_plastic(increment, displacement, velocity, z, weight, slider, c, law):
-    """Return force [N], dF/dU [N/m], dF/dv [N s/m] and the slider force [N], for an elastic-plastic slider.
-
-    Arguments as for `regularised`, but `z` is the slider force before the increment [N].
-    """
-    mu, dmu = friction(velocity, slider)
-    force, stiffness, half_loop, slope = rubber(displacement, law)
-    capacity, dcapacity = mu * weight, dmu * weight
-    own, own_du, own_dv = z + slider.stiffness * increment, slider.stiffness, 0.0  # force of the slider, derivatives
-    share, dshare, share_dv = 0.0, 0.0, 0.0  # of the capacity, and its derivatives with respect to U and v
-    if abs(own) >= capacity:  # also without a normal load
-        share = 1.0 if own > 0.0 else -1.0
-        own, own_du, own_dv = share * capacity, 0.0, share * dcapacity
-    else:
-        share, dshare, share_dv = own / capacity, own_du / capacity, -own / capacity**2 * dcapacity
-    return (
-        own + half_loop * share + force,
-        own_du + half_loop * dshare + slope * share + stiffness,
-        own_dv + half_loop * share_dv,
-        own,
-    )
 
 
 @kernel(inline=True)

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import bar_fatigue_buckling, concrete04
+from . import bar_fatigue, concrete04
 from .concrete04 import envelope, unloading
 from .jit import SUM_REORDERING, kernel
 from .reinforcing_steel import E0 as STEEL_E0
@@ -66,15 +66,15 @@ class Sections(NamedTuple):
         Constants of core and cover.
     steel : ndarray (reinforcing_steel.N_CONSTANTS,)
         Constants of the bars.
-    failure : ndarray (bar_fatigue_buckling.N_FAILURE,) or (0,)
-        Constants of bar fatigue and buckling; empty for bars that do not fail.
+    failure : ndarray (bar_fatigue.N_FAILURE,) or (0,)
+        Constants of bar fatigue; empty for bars that do not fail.
     concrete_memory : ndarray (n_sections, 5, n_concrete)
         eps_min, eps_max, eps_end, slope and tension slope of each fiber.
-    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE or bar_fatigue_buckling.N_STATE)
+    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE or bar_fatigue.N_STATE)
     virgin : ndarray (n_sections,)
         1 while no bar of the section has been committed beyond yield, else 0. The bar memory of a virgin section is not
         kept up to date.
-    trial : ndarray (reinforcing_steel.N_STATE or bar_fatigue_buckling.N_STATE,)
+    trial : ndarray (reinforcing_steel.N_STATE or bar_fatigue.N_STATE,)
         Scratch.
     """
 
@@ -132,7 +132,7 @@ def _sum_envelope(e0, kappa, j, core_count, y, area, concrete, concrete_memory):
 def _bar(strain, memory, steel, failure, virgin, trial):
     """Return stress and tangent of one bar at a trial strain."""
     if failure.shape[0] > 0:
-        return bar_fatigue_buckling.stress_tangent(strain, memory, steel, failure, trial)
+        return bar_fatigue.stress_tangent(strain, memory, steel, failure, trial)
     if virgin == 1.0:
         return monotonic_stress_tangent(strain, steel)
     return stress_tangent(strain, memory, steel, trial)
@@ -281,7 +281,7 @@ def _commit_bars(e0, kappa, j, bar_y, steel, failure, steel_memory, virgin):
         steel_memory[j] = 0.0
     for i in range(steel_memory.shape[1]):
         if failure.shape[0] > 0:
-            bar_fatigue_buckling.update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel, failure)
+            bar_fatigue.update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel, failure)
         else:
             update(e0 - bar_y[i] * kappa, steel_memory[j, i], steel)
 
@@ -317,7 +317,7 @@ def cross_jumps(e0, kappa, j, sections):
     The laws have jumps. Concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
     different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). If the jump
     drives the fiber back, there is equilibrium neither before nor after the jump, however small the step is. A bar that
-    fractures (`bar_fatigue_buckling`) loses its stress over a small strain, which acts like a jump if the column
+    fractures (`bar_fatigue`) loses its stress over a small strain, which acts like a jump if the column
     springs back by more than this strain. None of the four jumps can be undone, so a fiber next to a jump is taken
     across it.
 
@@ -350,8 +350,8 @@ def cross_jumps(e0, kappa, j, sections):
             bar = sections.steel_memory[j, i]
             count += switch_backbone(bar, sections.steel)
             if sections.failure.shape[0] > 0:
-                if bar[bar_fatigue_buckling.DAMAGE] >= NEAR_JUMP and bar[bar_fatigue_buckling.FRACTURED] == 0.0:
-                    bar[bar_fatigue_buckling.FRACTURED] = 1.0
+                if bar[bar_fatigue.DAMAGE] >= NEAR_JUMP and bar[bar_fatigue.FRACTURED] == 0.0:
+                    bar[bar_fatigue.FRACTURED] = 1.0
                     count += 1
     return count
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import bar_fatigue_buckling, concrete04, fiber_section, reinforcing_steel
+from . import bar_fatigue, concrete04, fiber_section, reinforcing_steel
 from .beam_column import HEAD, PER_SECTION, Elements, advance, initialise
 from .corotational import BasicForces, add_to_stiffness, deformations
 from .fiber_section import Sections
@@ -133,9 +133,9 @@ def allocate(
         Length below the base over which the deformations of the base section continue (bar strains in the foundation)
         [m].
     bars_fail : bool
-        Whether the bars have fatigue or buckling (`bar_fatigue_buckling`), whose constants are also still to be set.
+        Whether the bars have fatigue (`bar_fatigue`), whose constants are also still to be set.
     """
-    n_bar_state = bar_fatigue_buckling.N_STATE if bars_fail else reinforcing_steel.N_STATE
+    n_bar_state = bar_fatigue.N_STATE if bars_fail else reinforcing_steel.N_STATE
     concrete = _append_empty_fibers(np.concatenate([core, cover]), 16)
     padded_bars = _append_empty_fibers(bars, 8)
     n_sections = n_elements * len(points)
@@ -154,7 +154,7 @@ def allocate(
             bar_area=np.ascontiguousarray(padded_bars[:, 1], dtype=float),
             concrete=np.zeros((2, concrete04.N_CONSTANTS)),
             steel=np.zeros(reinforcing_steel.N_CONSTANTS),
-            failure=np.zeros(bar_fatigue_buckling.N_FAILURE if bars_fail else 0),
+            failure=np.zeros(bar_fatigue.N_FAILURE if bars_fail else 0),
             concrete_memory=np.zeros((n_sections, 5, len(concrete))),
             steel_memory=np.zeros((n_sections, len(bars), n_bar_state)),
             virgin=np.zeros(n_sections),
@@ -310,6 +310,6 @@ def bars_have_fractured(column):
         return False
     for j in range(memory.shape[0]):
         for i in range(memory.shape[1]):
-            if memory[j, i, bar_fatigue_buckling.FRACTURED] == 1.0:
+            if memory[j, i, bar_fatigue.FRACTURED] == 1.0:
                 return True
     return False

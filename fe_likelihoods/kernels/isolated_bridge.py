@@ -27,17 +27,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider, coulomb, elastic_plastic, regularised
+from .bearings import BOUC_WEN, COULOMB, RubberLaw, Slider, coulomb, regularised
 from .jit import kernel
 
-__all__ = ["N_MEMORY", "N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
+__all__ = ["N_OUT", "N_STATES", "Isolators", "StepMatrices", "step_isolated"]
 
 N_STATES = 12
 """Displacements (5), velocities (5), damper forces (2)."""
 N_OUT = 16
 """Columns of the output: the state, the isolator forces F (2), Z (2)."""
-N_MEMORY = 20
-"""Size of the state between two steps: r (12), F at the last two instants (2 + 2), Z (2), displacements (2)."""
 
 
 class StepMatrices(NamedTuple):
@@ -73,7 +71,7 @@ class Isolators(NamedTuple):
     c : float
         sqrt(gamma - beta) of the Bouc-Wen law.
     form : int
-        `BOUC_WEN`, `ELASTIC_PLASTIC` or `COULOMB`.
+        `BOUC_WEN` or `COULOMB`.
     """
 
     sliders: tuple[Slider, Slider]
@@ -111,8 +109,8 @@ def _change_kind(r, f0, f1, end, other):
 
 
 @kernel
-def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out, first, memory):
-    """Integrate from rest, or continue from a sample of an earlier integration.
+def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_iterations, work, out):
+    """Integrate from rest.
 
     Parameters
     ----------
@@ -132,11 +130,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
         Scratch.
     out : ndarray (n_steps, 16)
         Written: state, F and Z at the samples of the record.
-    first : int
-        0 for an integration from rest. Otherwise `memory` holds the state at this sample, and only later samples are
-        computed and written.
-    memory : ndarray (20,)
-        Written: the state from which the integration can continue after the last sample. Read if `first` is not 0.
 
     Returns
     -------
@@ -151,17 +144,14 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
     slider0, slider1 = isolators.sliders
     c, law, form = isolators.c, isolators.rubber, isolators.form
     u, r = work[0], work[1]
-    if first == 0:
-        memory[:] = 0.0
-        out[0, :] = 0.0
-    for i in range(12):
-        u[i] = memory[i]
-    f0, f1, before0, before1 = memory[12], memory[13], memory[14], memory[15]  # F at the last two instants
-    z0, z1 = memory[16], memory[17]
-    d0, d1 = memory[18], memory[19]  # bearing displacements
+    out[0, :] = 0.0
+    u[:] = 0.0
+    f0 = f1 = before0 = before1 = 0.0  # F at the last two instants
+    z0 = z1 = 0.0
+    d0 = d1 = 0.0  # bearing displacements
     iterations = 0
     total = n_sub << n_halvings
-    for k in range(first, ground.size - 1):
+    for k in range(ground.size - 1):
         position, halvings = 0, 0  # in the sample interval, in steps of the smallest size; of the present step
         last_size = 1 << n_halvings
         while position < total:
@@ -208,9 +198,6 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
                 if form == BOUC_WEN:
                     p0, k0, m0, g0 = regularised(y0 - d0, y0, v0, z0, w0, slider0, c, law)
                     p1, k1, m1, g1 = regularised(y1 - d1, y1, v1, z1, w1, slider1, c, law)
-                elif form == ELASTIC_PLASTIC:
-                    p0, k0, m0, g0 = elastic_plastic(y0 - d0, y0, v0, z0, w0, slider0, c, law)
-                    p1, k1, m1, g1 = elastic_plastic(y1 - d1, y1, v1, z1, w1, slider1, c, law)
                 else:
                     stick0, p0, k0, m0, g0 = coulomb(n0, y0, v0, pull0, w0, slider0, law)
                     stick1, p1, k1, m1, g1 = coulomb(n1, y1, v1, pull1, w1, slider1, law)
@@ -255,8 +242,4 @@ def step_isolated(matrices, isolators, ground, weights, n_sub, tolerance, max_it
             out[k + 1, i] = u[i] + ends[0, i, 0] * f0 + ends[0, i, 1] * f1
         out[k + 1, 12], out[k + 1, 13] = f0, f1
         out[k + 1, 14], out[k + 1, 15] = z0, z1
-    for i in range(12):
-        memory[i] = u[i]
-    memory[12], memory[13], memory[14], memory[15] = f0, f1, before0, before1
-    memory[16], memory[17], memory[18], memory[19] = z0, z1, d0, d1
     return 0, iterations

@@ -2,8 +2,8 @@
 
 numba identifies cached machine code by the file that defines a function. It does not notice an edit of a kernel that
 this function calls in another file, and would keep using the old machine code. Here the cache folder is named after a
-hash over all kernel sources: any edit opens a new folder, and an unchanged library starts without compiling. The same
-hash is part of every model fingerprint, so that results of other kernels are never mistaken for current results.
+hash over all kernel sources: any edit opens a new folder, and an unchanged library starts without compiling. Caches of
+simulations use the hash as the code of built-in models (`fe_likelihoods.simulation.label`).
 """
 
 from __future__ import annotations

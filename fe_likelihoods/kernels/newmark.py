@@ -33,12 +33,12 @@ from typing import NamedTuple
 import numpy as np
 
 from .beam_column import HEAD
-from .frame import Column, assemble, commit_sections, cross_jumps, record
+from .frame import assemble, commit_sections, cross_jumps, record
 from .jit import kernel
 from .linear_solve import copy_matrix, solve_banded
 from .static import LOOSENING, MAX_CROSSINGS, Position, apply_gravity
 
-__all__ = ["HISTORY_ROWS", "Dynamics", "committed_state", "newmark"]
+__all__ = ["HISTORY_ROWS", "Dynamics", "newmark"]
 
 HISTORY_ROWS = (
     "relative displacement",
@@ -102,8 +102,8 @@ def _record_forces(column, force, out):
 
 
 @kernel
-def newmark(column, dynamics, ground, dt, every, iteration, history, out, first, energies):
-    """Apply gravity, then the base acceleration `ground` along x; or continue from a step of an earlier analysis.
+def newmark(column, dynamics, ground, dt, every, iteration, history, out):
+    """Apply gravity, then the base acceleration `ground` along x.
 
     Parameters
     ----------
@@ -120,11 +120,6 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, out, first,
         Written; rows as in `HISTORY_ROWS`.
     out : frame.Recorder
         Written at the same samples.
-    first : int
-        0 for an analysis from the beginning. Otherwise `column` and `energies` hold the state of this step
-        (`committed_state`), and only later steps are computed and recorded.
-    energies : ndarray (4,)
-        Kinetic, damped, absorbed and input energy [J]: written at the end, read if `first` is not 0.
 
     Returns
     -------
@@ -142,36 +137,33 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, out, first,
     # the static steps of gravity use matrices[1] and vectors[:4]
     matrix, stiffness, committed, base = column.matrices[0], column.matrices[2], column.matrices[3], column.matrices[4]
     top = n - 3
-    retries = 0
-    if first == 0:
-        retries = apply_gravity(column, Position(u, force, stiffness), gravity, iteration)
-        if retries < 0:
-            return -1, 0, 0
-        for i in range(n):
-            v[i] = 0.0
-            a[i] = 0.0
-        v[top] = initial_velocity
-        copy_matrix(stiffness, committed)  # Kc
-        for i in range(n):  # C V at the last committed instant
-            damping[i] = a0 * mass[i] * v[i]
-            for k in range(n):
-                damping[i] += a1 * committed[i, k] * v[k]
-        energies[:] = 0.0
-        energies[0] = energies[3] = 0.5 * mass[top] * initial_velocity * initial_velocity
-        history[0, 0] = u[top]
-        history[1, 0] = a[top] + ground[0]
-        history[2, 0] = u[top + 1]
-        history[3, 0] = energies[0]
-        history[4, 0] = 0.0
-        history[5, 0] = 0.0
-        history[6, 0] = energies[3]
-        _record_forces(column, force, history[7:, 0])
-        record(column, u, v, a, 0, out)
+    retries = apply_gravity(column, Position(u, force, stiffness), gravity, iteration)
+    if retries < 0:
+        return -1, 0, 0
+    for i in range(n):
+        v[i] = 0.0
+        a[i] = 0.0
+    v[top] = initial_velocity
+    copy_matrix(stiffness, committed)  # Kc
+    for i in range(n):  # C V at the last committed instant
+        damping[i] = a0 * mass[i] * v[i]
+        for k in range(n):
+            damping[i] += a1 * committed[i, k] * v[k]
+    kinetic = supplied = 0.5 * mass[top] * initial_velocity * initial_velocity
+    damped = absorbed = 0.0
+    history[0, 0] = u[top]
+    history[1, 0] = a[top] + ground[0]
+    history[2, 0] = u[top + 1]
+    history[3, 0] = kinetic
+    history[4, 0] = damped
+    history[5, 0] = absorbed
+    history[6, 0] = supplied
+    _record_forces(column, force, history[7:, 0])
+    record(column, u, v, a, 0, out)
     smallest = 0.5**halvings
     total_iterations = 0
-    kinetic, damped, absorbed, supplied = energies[0], energies[1], energies[2], energies[3]
 
-    for step in range(first + 1, ground.shape[0]):
+    for step in range(1, ground.shape[0]):
         done, part, loose, crossings = 0.0, 1.0, False, 0
         while done < 1.0:
             h = part * dt
@@ -268,15 +260,4 @@ def newmark(column, dynamics, ground, dt, every, iteration, history, out, first,
             history[6, m] = supplied
             _record_forces(column, force, history[7:, m])
             record(column, u, v, a, m, out)
-    energies[0], energies[1], energies[2], energies[3] = kinetic, damped, absorbed, supplied
     return 0, retries, total_iterations
-
-
-def committed_state(column: Column) -> tuple[np.ndarray, ...]:
-    """Return the arrays of `column` that hold its state between two steps of `newmark`.
-
-    All other arrays are constants, or scratch that is written before it is read.
-    """
-    sections = column.sections
-    memory = (sections.concrete_memory, sections.steel_memory, sections.virgin, column.elements.state)
-    return (*memory, column.vectors[4:9], column.matrices[2:4])  # u, v, a, force, damping; stiffness, committed

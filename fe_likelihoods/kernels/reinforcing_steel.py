@@ -19,7 +19,7 @@ in the slot of level (b+1)//2. Only the rules of the odd branches are written ou
 same rules with the signs of all strains and stresses changed.
 
 OpenSees has the same law as its material ReinforcingSteel with default options: no buckling, no fatigue, no isotropic
-hardening. `bar_fatigue_buckling` adds buckling and fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
+hardening. `bar_fatigue` adds fatigue. ``docs/theory/reinforcing_steel.rst`` lists all rules.
 
 References
 ----------

@@ -29,7 +29,6 @@ from ..kernels.isolated_bridge import N_STATES
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples, same_sampling, sample_window
-from ..simulation.model import ContinuedResponse
 from .base import History, remark_on_range
 from .isolated_bridge_channels import ALL_CHANNELS, CHANNEL_SETS, CHANNELS, channel_matrix
 from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
@@ -54,7 +53,7 @@ _NOMINAL_UNITS = {
     for name, unit in zip(("a", "Kd", "C0"), ("s/m", "N/m", "N s/m"), strict=True)
 }
 _EXCHANGED = [3, 4, 5, 0, 1, 2, 8, 9, 6, 7]  # PARAMETERS with the devices of the two piers exchanged
-_LONGEST_STEP = {"bouc-wen": 0.25e-3, "elastic-plastic": 0.05e-3, "coulomb": 0.25e-3}  # of the default [s]
+_LONGEST_STEP = 0.25e-3  # of the default [s]
 _STATE_ROWS = (
     *("deck", "pier_1", "rotation_1", "pier_2", "rotation_2"),
     *("deck velocity", "pier_1 velocity", "rotation_1 velocity", "pier_2 velocity", "rotation_2 velocity"),
@@ -105,11 +104,11 @@ class IsolatedBridge(ThreadedModel):
     parameters : tuple of str
         Names of the parameters that make up theta, in this order (`IsolatedBridge` lists them).
     friction : str
-        "bouc-wen" (regularised, the default), "elastic-plastic" (the slider law in other codes), or "coulomb" (exact
-        stick and slip, whose instants are located within a step).
+        "bouc-wen" (regularised, the default), or "coulomb" (exact stick and slip, whose instants are located within a
+        step).
     step : float, optional
-        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms, or up to
-        0.05 ms for "elastic-plastic" (accuracy: ``docs/theory/time_integration.rst``).
+        Integration step [s]; it divides the step of the record. Default: the longest such step up to 0.25 ms (accuracy:
+        ``docs/theory/time_integration.rst``).
     every : int
         The response has one sample per `every` samples of the record.
     p_delta : bool
@@ -138,15 +137,12 @@ class IsolatedBridge(ThreadedModel):
     friction             displacements   forces              accelerations    peaks
     ===================  ==============  ==================  ===============  ========
     ``bouc-wen``         0.004 %         0.02 %              0.02 % (0.12 %)  0.04 %
-    ``elastic-plastic``  0.008 %         0.05 %              0.1 % (0.14 %)   0.008 %
     ``coulomb``          0.05 %          0.02 %              0.01 % (0.08 %)  0.03 %
     ===================  ==============  ==================  ===============  ========
 
     Values in parentheses are for the pier accelerations under the record of 0.04 g, in which the bearings slide by 1
     mm. With "coulomb" forces and accelerations jump when a bearing begins or ceases to stick; steps are halved there
-    until the instant is known within h/64. With "elastic-plastic", many simulations fail (6 of 60 at -1.1 g, 48 of 60
-    at -2 g) where a `vertical` acceleration below -g removes the load of a bearing; their log-likelihood is -inf. Use
-    "bouc-wen" or "coulomb" for such records.
+    until the instant is known within h/64.
 
     The channels of the two piers and of the deck are:
 
@@ -234,13 +230,12 @@ class IsolatedBridge(ThreadedModel):
 
     @property
     def integration_step(self) -> float:
-        """Integration step [s]: `step`, or the default of the friction law."""
+        """Integration step [s]: `step`, or the default."""
         if self.step is not None:
             return self.step
-        longest = _LONGEST_STEP[self.friction]
-        ratio = self.record.dt / longest
+        ratio = self.record.dt / _LONGEST_STEP
         divisions = max(1, math.ceil(ratio * (1.0 - 1e-6)))
-        return longest if abs(ratio - divisions) <= 1e-6 * ratio else self.record.dt / divisions
+        return _LONGEST_STEP if abs(ratio - divisions) <= 1e-6 * ratio else self.record.dt / divisions
 
     @property
     def matrices(self) -> BridgeMatrices:
@@ -323,40 +318,12 @@ class IsolatedBridge(ThreadedModel):
         Parameters and errors as for `simulate`.
         """
         prepared = self._prepared
-        run = run_bridge(self, prepared, check_theta(theta, self.parameters), None)
+        run = run_bridge(self, prepared, check_theta(theta, self.parameters))
         beyond = np.abs(prepared.linear.kinematics @ run.values[:5]).max(axis=1) / prepared.rubber_range
         rows = csr_array(channel_matrix(self.matrices, self.piers, ALL_CHANNELS)) @ run.drivers
         names = (*_STATE_ROWS, "Z_1", "Z_2", *ALL_CHANNELS)
         kept = np.concatenate([run.values[:N_STATES], run.values[14:16], rows])[:, :: self.every]
         return BridgeHistory(names, kept, beyond, run.iterations)
-
-    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
-        """Simulate from the state at a sample of the response, and return the state at the last sample.
-
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            As for `simulate`.
-        state : ndarray, optional
-            State that this method returned for the same theta and the same bridge, under the first part of its
-            excitation. Default: the bridge at rest.
-
-        Returns
-        -------
-        ContinuedResponse
-            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
-            state at the last sample (168 bytes).
-
-        Raises
-        ------
-        SimulationFailed
-            As for `simulate`.
-        ValueError
-            If `state` is not a state of this bridge.
-        """
-        theta = check_theta(theta, self.parameters)
-        run = run_bridge(self, self._prepared, theta, state)
-        return ContinuedResponse(self._outputs_of(run, theta), run.state)
 
     def exchange_piers(self, thetas: np.ndarray) -> np.ndarray:
         """Exchange the devices of the two piers: multiples (..., 10) with the same physical values at the other pier.
@@ -371,7 +338,7 @@ class IsolatedBridge(ThreadedModel):
         return physical[..., _EXCHANGED] / nominal
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return self._outputs_of(run_bridge(self, self._prepared, theta, None), theta)
+        return self._outputs_of(run_bridge(self, self._prepared, theta), theta)
 
     def _outputs_of(self, run: BridgeRun, theta: np.ndarray) -> np.ndarray:
         """Channels (n_channels, n_steps) of a simulation; warns once per model beyond the range of the rubber law."""

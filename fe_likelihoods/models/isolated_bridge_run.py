@@ -1,8 +1,4 @@
-"""One simulation of the isolated bridge, from rest or from the state at the end of an earlier one.
-
-The state at a sample of the response is one array: the number of the sample, and the kernel's memory between two steps
-(`fe_likelihoods.kernels.isolated_bridge.N_MEMORY` numbers).
-"""
+"""One simulation of the isolated bridge."""
 
 from __future__ import annotations
 
@@ -12,17 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..kernels.bearings import BOUC_WEN, COULOMB, ELASTIC_PLASTIC, RubberLaw, Slider
-from ..kernels.isolated_bridge import N_MEMORY, N_OUT, Isolators, step_isolated
+from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
+from ..kernels.isolated_bridge import N_OUT, Isolators, step_isolated
 from ..simulation.model import SimulationFailed
 from .isolated_bridge_channels import channel_matrix
 from .isolated_bridge_parts import Damper
 from .isolated_bridge_system import BridgeStateSpace
-from .validation import check_state, check_values
+from .validation import check_values
 
 __all__ = ["FORMS", "BridgeRun", "PreparedBridge", "prepare_bridge", "run_bridge"]
 
-FORMS = {"bouc-wen": BOUC_WEN, "elastic-plastic": ELASTIC_PLASTIC, "coulomb": COULOMB}
+FORMS = {"bouc-wen": BOUC_WEN, "coulomb": COULOMB}
 COULOMB_HALVINGS = 6
 """How often a step with Coulomb's law is halved to find the instant at which a bearing begins or ceases to stick."""
 
@@ -51,14 +47,11 @@ class BridgeRun(NamedTuple):
         State, isolator forces F and table acceleration; the channels are linear combinations of these rows.
     iterations : float
         Newton iterations per step.
-    state : ndarray
-        State at the last sample of the response.
     """
 
     values: np.ndarray
     drivers: np.ndarray
     iterations: float
-    state: np.ndarray
 
 
 def prepare_bridge(model: Any) -> PreparedBridge:
@@ -77,7 +70,7 @@ def prepare_bridge(model: Any) -> PreparedBridge:
     )
 
 
-def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: np.ndarray | None) -> BridgeRun:
+def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> BridgeRun:
     """Simulate for multiples `theta` of the nominal parameters.
 
     Parameters
@@ -85,9 +78,6 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     model : IsolatedBridge
     prepared : PreparedBridge
     theta : ndarray[n_parameters]
-    state : ndarray or None
-        State at a response sample, from which the simulation continues; the results begin with the next response
-        sample. None: from rest.
 
     Returns
     -------
@@ -97,8 +87,6 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
     ------
     SimulationFailed
         If the parameters describe no structure, or the solution does not converge.
-    ValueError
-        If `state` is not a state of this bridge at a sample before the last one.
     """
     v = model.physical_values(theta)
     check_values(v, _MAY_BE_ZERO)
@@ -112,17 +100,12 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
             df=float(v[f"df_{i}"]),
             a=float(v[f"a_{i}"]),
             yield_displacement=float(bearing.yield_displacement),
-            stiffness=float(v[f"fmin_{i}"] * bearing.load / bearing.yield_displacement),
         )
         for i, bearing in enumerate(model.bearings, 1)
     )
     c = math.sqrt(2.0 * model.bearings[0].gamma - 1.0)
     ground = model.record.acceleration[: (model.n_steps - 1) * model.every + 1]  # up to the last sample of the response
     out = np.zeros((ground.size, N_OUT))
-    memory, first = np.zeros(N_MEMORY), 0
-    if state is not None:
-        state = check_state(state, 1 + N_MEMORY, model.n_steps)
-        memory[:], first = state[1:], int(state[0]) * model.every
     n_sub = round(model.record.dt / step)
     status, iterations = step_isolated(
         matrices,
@@ -134,19 +117,10 @@ def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray, state: n
         model.max_iterations,
         np.zeros((2, 16)),
         out,
-        first,
-        memory,
     )
     if status:
         n_steps = n_sub * (ground.size - 1)
         raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
     if coulomb:
         prepared.linear.hold_stuck_bearings(dampers, ground, out)
-    start = 0 if state is None else first + model.every
-    values = out[start:].T
-    return BridgeRun(
-        values,
-        np.vstack([values[:14], ground[start:]]),
-        iterations / max(1, n_sub * (ground.size - 1 - first)),
-        np.concatenate([[model.n_steps - 1], memory]),
-    )
+    return BridgeRun(out.T, np.vstack([out.T[:14], ground]), iterations / max(1, n_sub * (ground.size - 1)))

@@ -38,11 +38,10 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
-from ..simulation.model import ContinuedResponse
 from .circular_section import Confinement, gauss_lobatto
 from .rc_column_analysis import ColumnHistory, check_loading
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
-from .rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
+from .rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
 from .rc_column_presets import lhpost_arguments
 from .rc_column_run import PreparedColumn, prepare_column, run_column
 from .rc_column_section import ReinforcedSection
@@ -74,9 +73,8 @@ PARAMETERS = {
     "penetration": "length of strain penetration into the foundation [m]",
     "Cf": "coefficient of the fatigue of bars [-]",
     "Cd": "coefficient of the loss of strength of bars [-]",
-    "slenderness": "unsupported length of bars by their diameter [-]",
 }
-_OF_FATIGUE, _OF_BUCKLING = ("Cf", "Cd"), ("slenderness",)
+_OF_FATIGUE = ("Cf", "Cd")
 _NOMINAL_UNITS = dict(
     zip(PARAMETERS, ("GPa", "GPa", "1/s", "s", "MPa", "MPa", "MPa", "MPa", "GPa", "kg", "m"), strict=False)
 )
@@ -128,8 +126,6 @@ class RCColumn(ThreadedModel):
         height/12.
     fatigue : LowCycleFatigue or None
         Low-cycle fatigue of the bars. None: bars neither lose strength nor fracture.
-    buckling : BarBuckling or None
-        Buckling of the bars. None: bars in compression stay straight.
     collapse_drift : float
         Displacement of the top by the height at which a column under a `Record` has collapsed, and the simulation ends
         with the reason "collapse". Tested columns have lost their strength at 0.05 to 0.15. Without a limit, columns
@@ -212,7 +208,6 @@ class RCColumn(ThreadedModel):
     ``penetration``   length of strain penetration into the foundation [m]
     ``Cf``            coefficient of Coffin and Manson, with `fatigue`
     ``Cd``            coefficient of strength loss, with `fatigue`
-    ``slenderness``   unsupported length of the bars by their diameter, with `buckling`
     ================  ============================================================
     """
 
@@ -233,7 +228,6 @@ class RCColumn(ThreadedModel):
     a1: float = 0.0
     penetration: float = 0.0
     fatigue: LowCycleFatigue | None = None
-    buckling: BarBuckling | None = None
     collapse_drift: float = 0.2
     parameters: tuple[str, ...] = ("Ec", "Es", "a0", "a1", "ft")
     n_elements: int = 2
@@ -305,9 +299,6 @@ class RCColumn(ThreadedModel):
         found = dict(zip(PARAMETERS, values, strict=False))
         if self.fatigue is not None:
             found |= dict(zip(_OF_FATIGUE, (self.fatigue.cf, self.fatigue.cd), strict=True))
-        if self.buckling is not None:
-            slenderness = self.buckling.slenderness or self.hoops.spacing / self.bars.diameter
-            found |= dict(zip(_OF_BUCKLING, (slenderness,), strict=True))
         return found
 
     @property
@@ -411,44 +402,13 @@ class RCColumn(ThreadedModel):
         where the column bends towards positive displacements: ``history["base_moment"]`` is
         ``-history["base moment"]``.
         """
-        history, outputs, _ = run_column(self, self._prepared, check_theta(theta, self.parameters), None)
+        history, outputs = run_column(self, self._prepared, check_theta(theta, self.parameters))
         sensors = {name: values for name, values in outputs.items() if name not in history.names}
         values = np.vstack([history.values, *sensors.values()])
         return replace(history, names=(*history.names, *sensors), values=values)
 
-    def simulate_from(self, theta: np.ndarray, state: np.ndarray | None = None) -> ContinuedResponse:
-        """Simulate from the state at a sample of the response, and return the state at the last sample.
-
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            As for `simulate`.
-        state : ndarray, optional
-            State that this method returned for the same theta and the same column, under the first part of this
-            excitation. Default: the beginning, before the gravity load.
-
-        Returns
-        -------
-        ContinuedResponse
-            The response after the sample of `state`, with the bits of the last part of ``simulate(theta)``, and the
-            state at the last sample (64 kB for the default mesh and two elements).
-
-        Raises
-        ------
-        SimulationFailed
-            As for `simulate`.
-        ValueError
-            For a column under imposed displacement, or a `state` that is not a state of this column.
-        """
-        if not isinstance(self.loading, Record):
-            raise invalid(
-                "a column under a Record", type(self.loading).__name__, "use simulate for imposed displacements"
-            )
-        run = run_column(self, self._prepared, check_theta(theta, self.parameters), state)
-        return ContinuedResponse(np.stack(list(run.outputs.values())), run.state)
-
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return np.stack(list(run_column(self, self._prepared, theta, None).outputs.values()))
+        return np.stack(list(run_column(self, self._prepared, theta).outputs.values()))
 
     def _prepare(self) -> PreparedColumn:
         return prepare_column(self, self._parsed_outputs)
@@ -478,8 +438,7 @@ class RCColumn(ThreadedModel):
     def _check_arguments(self) -> None:
         """Raise ValueError for arguments from which no column can be built."""
         parts = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
-        failure = {"fatigue": LowCycleFatigue, "buckling": BarBuckling}
-        for name, kind in (parts | failure).items():
+        for name, kind in (parts | {"fatigue": LowCycleFatigue}).items():
             part = getattr(self, name)
             if not isinstance(part, kind) and (part is not None or name in parts):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
@@ -509,11 +468,9 @@ class RCColumn(ThreadedModel):
         idle = [name for name in self.parameters if name in ("a0", "a1")]
         if idle and not isinstance(self.loading, Record):
             raise invalid("parameters that act under imposed displacement", idle, "leave damping out of parameters")
-        for option, names in (("fatigue", _OF_FATIGUE), ("buckling", _OF_BUCKLING)):
-            idle = [name for name in self.parameters if name in names]
-            if idle and getattr(self, option) is None:
-                kind = {"fatigue": "LowCycleFatigue()", "buckling": "BarBuckling()"}[option]
-                raise invalid(f"parameters that act without {option}", idle, f"add {option}={kind} to the column")
+        idle = [name for name in self.parameters if name in _OF_FATIGUE]
+        if idle and self.fatigue is None:
+            raise invalid("parameters that act without fatigue", idle, "add fatigue=LowCycleFatigue() to the column")
         check_nominal(self.parameters, self.nominal)
         _ = self._parsed_outputs  # checks the names
         check_units(dict(self.units))

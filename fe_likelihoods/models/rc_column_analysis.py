@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
+from ..kernels import bar_fatigue, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import Column, recorder
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
@@ -20,7 +20,7 @@ from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
 from .base import BuiltInModel, History, remark_on_range
 from .circular_section import Confinement
-from .rc_column_parts import BarBuckling, Concrete, LowCycleFatigue, Steel, hardening_fault
+from .rc_column_parts import Concrete, LowCycleFatigue, Steel, hardening_fault
 from .validation import check_values, invalid
 
 __all__ = [
@@ -166,28 +166,8 @@ class BaseMotion(NamedTuple):
         acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
-    def run(
-        self,
-        column: Column,
-        dynamics: Dynamics,
-        iteration: Iteration,
-        recorded: ToRecord,
-        first: int,
-        energies: np.ndarray,
-    ) -> Analysis:
+    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, recorded: ToRecord) -> Analysis:
         """Integrate the equations of motion; SimulationFailed at collapse, or if a step does not converge.
-
-        Parameters
-        ----------
-        column : Column
-        dynamics : Dynamics
-        iteration : Iteration
-        recorded : ToRecord
-        first : int
-            0 for an analysis from the beginning. Otherwise the response sample whose state `column` and `energies`
-            hold; the histories begin after this sample.
-        energies : ndarray[4]
-            Written, as by `newmark`.
 
         Returns
         -------
@@ -199,9 +179,7 @@ class BaseMotion(NamedTuple):
             column, self.n_steps, sections=recorded.sections, motion=3 * recorded.motion, fibers=recorded.fibers
         )
         loading = self.acceleration, self.dt, self.substeps
-        status, retries, _ = newmark(
-            column, dynamics, *loading, iteration, history, out, first * self.substeps, energies
-        )
+        status, retries, _ = newmark(column, dynamics, *loading, iteration, history, out)
         if status < -1:
             raise SimulationFailed(
                 f"collapse: at t = {-(status + 1) * self.dt:.4g} s, the displacement of the top exceeded the limit of "
@@ -210,11 +188,8 @@ class BaseMotion(NamedTuple):
         if status:
             at = f" (t = {status * self.dt:.4g} s)"
             raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
-        start = first + 1 if first else 0
-        motion, stresses, ground = out.motion[start:], out.stresses[start:], self.acceleration[:: self.substeps][start:]
-        return Analysis(
-            HISTORY_ROWS, history[:, start:], retries, _by_section(out.sections[start:]), motion, stresses, ground
-        )
+        ground = self.acceleration[:: self.substeps]
+        return Analysis(HISTORY_ROWS, history, retries, _by_section(out.sections), out.motion, out.stresses, ground)
 
 
 class ImposedMotion(NamedTuple):
@@ -346,7 +321,6 @@ def set_materials(
     steel: Steel,
     confinement: Confinement,
     fatigue: LowCycleFatigue | None = None,
-    buckling: BarBuckling | None = None,
 ) -> None:
     """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `sections`."""
     fc, ec, ft = values["fc"], values["Ec"], values["ft"]
@@ -367,10 +341,8 @@ def set_materials(
         steel.ultimate_strain,
         sections.steel,
     )
-    if fatigue is not None or buckling is not None:
-        coefficients = (values["Cf"], fatigue.alpha, values["Cd"]) if fatigue is not None else (0.0, 1.0, 1.0)
-        support = (values["slenderness"], buckling.alpha) if buckling is not None else (0.0, 1.0)
-        bar_fatigue_buckling.constants(sections.steel, values["fy"], *coefficients, *support, sections.failure)
+    if fatigue is not None:
+        bar_fatigue.constants(values["Cf"], fatigue.alpha, values["Cd"], sections.failure)
 
 
 def _by_section(sections: np.ndarray) -> np.ndarray:
@@ -384,7 +356,7 @@ def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Section
     reason = f"step {status} of {n_steps}{at} did not converge, halved {halvings} times"
     if sections.failure.shape[0] == 0:
         return reason
-    broken = sections.steel_memory[:, :, bar_fatigue_buckling.FRACTURED]
+    broken = sections.steel_memory[:, :, bar_fatigue.FRACTURED]
     lost = float((broken @ sections.bar_area[: broken.shape[1]]).max()) / float(sections.bar_area.sum())
     if lost == 0.0:
         return reason

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ..kernels import bar_fatigue_buckling, concrete04, reinforcing_steel
+from ..kernels import bar_fatigue, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
 from ..kernels.frame import allocate
 from ..simulation.model import SimulationFailed
@@ -255,17 +255,17 @@ def _sections(column: RCColumn, theta: np.ndarray) -> tuple[Sections, dict[str, 
         core=core,
         cover=cover,
         bars=bars,
-        bars_fail=column.fatigue is not None or column.buckling is not None,
+        bars_fail=column.fatigue is not None,
     ).sections
     confinement = column.section.confinement(values["fc"])
-    set_materials(sections, values, column.concrete, column.steel, confinement, column.fatigue, column.buckling)
+    set_materials(sections, values, column.concrete, column.steel, confinement, column.fatigue)
     return sections, values
 
 
 def _bar_stress(strain: np.ndarray, memory: np.ndarray, sections: Sections, stress: np.ndarray) -> None:
     """Take one bar through `strain`, write its `stress`, and advance its `memory`."""
     if sections.failure.size:
-        bar_fatigue_buckling.stress_history(strain, memory, sections.steel, sections.failure, stress)
+        bar_fatigue.stress_history(strain, memory, sections.steel, sections.failure, stress)
     else:
         reinforcing_steel.stress_history(strain, memory, sections.steel, stress)
 

@@ -16,7 +16,7 @@ from ..kernels import reinforcing_steel
 from ..priors.distributions import LogNormal
 from .validation import check_fields, check_integer, invalid
 
-__all__ = ["BarBuckling", "Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel", "hardening_fault"]
+__all__ = ["Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel", "hardening_fault"]
 
 _MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by study `failing_columns` of docs/results.rst
 
@@ -185,30 +185,6 @@ class LowCycleFatigue:
         Engineering 131(7), 1060-1070, doi:10.1061/(ASCE)0733-9445(2005)131:7(1060), for the prior of the scatter.
         """
         return {"Cf": LogNormal(_MEDIAN_CF / self.cf, _LOG_SD_CF)}
-
-
-@dataclass(frozen=True)
-class BarBuckling:
-    """Buckling of bars in compression (Dhakal & Maekawa 2002); not validated.
-
-    The law has been compared with OpenSees, from which it differs by 1 to 44 % under cycles, but with no test of a bar
-    that buckled (``docs/theory/reinforcing_steel.rst``). Results after buckling are indications.
-
-    Attributes
-    ----------
-    slenderness : float, optional
-        Unsupported length of the bars divided by their diameter. Default: the hoop spacing divided by the bar diameter.
-        Where hoops yield or are weak, bars buckle over several spacings, and the ratio is larger.
-    alpha : float
-        1 for steel that hardens linearly (the default), 0.75 for steel that does not
-        (``docs/theory/reinforcing_steel.rst`` has a formula for steels between them).
-    """
-
-    slenderness: float | None = None
-    alpha: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_fields(self, positive=("slenderness", "alpha"), optional=("slenderness",), of="of buckling")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,4 @@
-"""One simulation of the reinforced-concrete column, from the beginning or from the state at the end of an earlier one.
-
-The state at a sample of the response is one array: the number of the sample, the energies, and the kernel's memory
-between two steps (`fe_likelihoods.kernels.newmark.committed_state`).
-"""
+"""One simulation of the reinforced-concrete column."""
 
 from __future__ import annotations
 
@@ -10,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels import bar_fatigue_buckling
-from ..kernels.frame import Column, allocate
-from ..kernels.newmark import Dynamics, committed_state
+from ..kernels import bar_fatigue
+from ..kernels.frame import allocate
+from ..kernels.newmark import Dynamics
 from ..kernels.static import Iteration
 from ..signals.records import Record
 from ..units import G0
@@ -28,11 +24,8 @@ from .rc_column_analysis import (
 )
 from .rc_column_outputs import Output, Recording
 from .rc_column_section import ReinforcedSection
-from .validation import check_state
 
 __all__ = ["ColumnRun", "PreparedColumn", "prepare_column", "run_column"]
-
-_N_ENERGIES = 4
 
 
 class PreparedColumn(NamedTuple):
@@ -55,13 +48,10 @@ class ColumnRun(NamedTuple):
         Histories of the kernels.
     outputs : dict of str to ndarray, shape (n_steps,)
         Outputs of the column by their names.
-    state : ndarray or None
-        State at the last sample; None under imposed displacement.
     """
 
     history: ColumnHistory
     outputs: dict[str, np.ndarray]
-    state: np.ndarray | None
 
 
 def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
@@ -76,7 +66,7 @@ def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
     return PreparedColumn(section, fibers, *gauss_lobatto(model.n_points), motion, outputs)
 
 
-def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: np.ndarray | None) -> ColumnRun:
+def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> ColumnRun:
     """Simulate for multiples `theta` of the nominal parameters.
 
     Parameters
@@ -84,9 +74,6 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     model : RCColumn
     prepared : PreparedColumn
     theta : ndarray[n_parameters]
-    state : ndarray or None
-        State at a response sample, from which the simulation continues; the results begin after this sample. None: from
-        the beginning.
 
     Returns
     -------
@@ -96,8 +83,6 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     ------
     SimulationFailed
         If the parameters describe no structure, the column collapses, or the solution does not converge.
-    ValueError
-        If `state` is not a state of this column at a sample before the last one.
     """
     values = model.physical_values(theta)
     check_physical_values(values, model.steel)
@@ -110,10 +95,10 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
         weights=prepared.weights,
         **prepared.fibers,
         penetration=values["penetration"],
-        bars_fail=model.fatigue is not None or model.buckling is not None,
+        bars_fail=model.fatigue is not None,
     )
     confinement = prepared.section.confinement(values["fc"])
-    set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue, model.buckling)
+    set_materials(column.sections, values, model.concrete, model.steel, confinement, model.fatigue)
     iteration = Iteration(float(model.tolerance), int(model.max_iterations), int(model.halvings))
     fibers = tuple(dict.fromkeys(output.fiber for output in prepared.outputs if output.fiber is not None))
     recorded = ToRecord(
@@ -127,7 +112,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     gravity[1::3] = -own * G0
     gravity[-2] -= model.axial_load if model.axial_load is not None else values["mass"] * G0
     if isinstance(prepared.motion, ImposedMotion):
-        analysis, end = prepared.motion.run(column, gravity, iteration, recorded), None
+        analysis = prepared.motion.run(column, gravity, iteration, recorded)
     else:
         own[-1] += values["mass"]
         mass = np.zeros((model.n_elements, 3))
@@ -135,11 +120,7 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
         dynamics = Dynamics(
             gravity, mass.ravel(), float(values["a0"]), float(values["a1"]), 0.0, model.collapse_drift * model.height
         )
-        energies = np.zeros(_N_ENERGIES)
-        first = 0 if state is None else _restore(column, energies, state, model.n_steps)
-        analysis = prepared.motion.run(column, dynamics, iteration, recorded, first, energies)
-        parts = (part.ravel() for part in committed_state(column))
-        end = np.concatenate([[model.n_steps - 1], energies, *parts])
+        analysis = prepared.motion.run(column, dynamics, iteration, recorded)
     rows = dict(zip(analysis.names, analysis.values, strict=True))
     stresses = dict(zip(fibers, analysis.stresses.T, strict=True))
     length = column.length if column.corotational else np.inf
@@ -147,18 +128,6 @@ def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray, state: n
     outputs = {output.name: output.evaluate(seen) for output in prepared.outputs}
     damage = None
     if model.fatigue is not None:
-        damage = column.sections.steel_memory[:, :, bar_fatigue_buckling.DAMAGE].max(axis=0)
+        damage = column.sections.steel_memory[:, :, bar_fatigue.DAMAGE].max(axis=0)
     history = checked_history(model, model.steel, model.bar_circle_radius, analysis, theta, damage)
-    return ColumnRun(history, outputs, end)
-
-
-def _restore(column: Column, energies: np.ndarray, state: np.ndarray, n_steps: int) -> int:
-    """Write a state into the memory of the column and the energies; return its response sample."""
-    parts = committed_state(column)
-    state = check_state(state, 1 + energies.size + sum(part.size for part in parts), n_steps)
-    energies[:] = state[1 : 1 + energies.size]
-    start = 1 + energies.size
-    for part in parts:
-        part[...] = state[start : start + part.size].reshape(part.shape)
-        start += part.size
-    return int(state[0])
+    return ColumnRun(history, outputs)

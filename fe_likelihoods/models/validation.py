@@ -164,15 +164,3 @@ def check_measured(measured: np.ndarray, channels: Sequence[Channel], n_steps: i
             "the same step and length"
         )
     return measured
-
-
-def check_state(state: np.ndarray, size: int, n_steps: int) -> np.ndarray:
-    """Return a state as floats (size,); ValueError unless it belongs to a sample before the last of `n_steps`."""
-    state = np.asarray(state, dtype=float)
-    if state.shape != (size,) or not 0 < state[0] < n_steps - 1:
-        raise invalid(
-            f"a state of {size} numbers, at a sample before the last one of this response of {n_steps} samples",
-            f"shape {state.shape}" + (f", sample {state[0]:g}" if state.shape == (size,) else ""),
-            "give one that simulate_from returned for the same model under the beginning of this excitation",
-        )
-    return state

@@ -38,7 +38,7 @@ from .options import (
     shown,
     weighted,
 )
-from .response_level import Excited, excited_parts, local_level, squared_levels
+from .response_level import events_of_parts, local_level, squared_levels
 from .sample_counts import SampleCounts, samples_per_channel
 
 __all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
@@ -46,7 +46,7 @@ __all__ = ["HALF_LOG_TWO_PI", "GaussianNoise"]
 HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
-_LOCAL, _GROWTH = 0.25, 0.25  # see docs/theory/noise.rst
+_LOCAL = 0.25  # see docs/theory/noise.rst
 _LARGEST_GAP = 0.05  # largest share of missing samples in a channel without a warning
 _RESPONSE = 'level="response" without bands'
 _SHARES = 'level="measured" or "response", without bands'
@@ -74,12 +74,6 @@ class GaussianNoise:
     local : float, optional
         For ``level="response"``: weight of the response envelope in the variance, from 0 to 1 (0.25). The rest is the
         weight of the mean square over the whole response.
-    deformation : float, optional
-        For ``level="response"`` in a test with an imposed deformation: the deformation [m; - for a strain] at which the
-        standard deviation is the share times the level, such as 1 % of the column height. The standard deviation is
-        then proportional to a power of the largest deformation reached. Choose it for each specimen.
-    growth : float, optional
-        Exponent of this power, 0.25 by default. Only with `deformation`.
     sensor : mapping of channel names to float, or sequence of float, optional
         Known standard deviations of the sensor noise [SI unit of the channel], one per channel; zero for names that are
         left out. The parameters are then levels of the model error, and may be zero. ``level="response"`` needs
@@ -90,9 +84,9 @@ class GaussianNoise:
     scales : mapping of channel names to float, or sequence of float, optional
         Positive scales [SI unit of the channel]: the level of ``groups="all"`` and the shares of ``level="measured"``
         are multiples of them. Default: root mean squares of the measured channels.
-    layout, events, measured, excited
-        Sample times; events; the measured (event, channel) pairs; excitation. Set by the likelihood
-        (`with_measurements`, `under`) and by predictions.
+    layout, events, measured, of_parts
+        Sample times; events; the measured (event, channel) pairs; the events of parts of the time. Set by the
+        likelihood (`with_measurements`, `under`) and by predictions.
 
     Raises
     ------
@@ -132,12 +126,12 @@ class GaussianNoise:
     **Shares of the response.** The window consists of three equal parts of the time, and moves by one part. In its
     middle part::
 
-        l^2 = ((1 - local) R^2 + local e^2) (d / deformation)^(2 growth)
+        l^2 = (1 - local) R^2 + local e^2
 
-    where e^2 is the mean square of the response in the window, R^2 its mean square in the whole motion (computed
-    separately for each event and each pause), and d the largest deformation up to the middle of the part. Without
-    `deformation` the last factor is one. A share that was calibrated on a part of a motion, with a gap, or with a long
-    quiet end refers to a different R^2 from the whole motion: calibrate and predict whole motions, or use ``local=1``.
+    where e^2 is the mean square of the response in the window, and R^2 its mean square in the whole motion (computed
+    separately for each event and each pause). A share that was calibrated on a part of a motion, with a gap, or with a
+    long quiet end refers to a different R^2 from the whole motion: calibrate and predict whole motions, or use
+    ``local=1``.
     Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may
     prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
     ``level="si"`` (`fit_measures`). The statistics are not quadratic in the residuals, so samplers cannot use a guide.
@@ -167,15 +161,13 @@ class GaussianNoise:
     level: Literal["si", "measured", "response"] = "si"
     window: float | None = None
     local: float | None = None
-    deformation: float | None = None
-    growth: float | None = None
     sensor: PerChannel = None
     effective_samples: PerChannel = None
     scales: PerChannel = None
     layout: Layout | None = None
     events: tuple[EventWindow, ...] = ()
     measured: tuple[tuple[int, int], ...] = ()
-    excited: Excited = Excited()
+    of_parts: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", checked_channels(self, self.channels))
@@ -214,15 +206,6 @@ class GaussianNoise:
         for name, means, default, where, meaning, possible in (
             ("window", self._in_parts or self.level == "measured", None, _SHARES, "a positive length [s]", positive),
             ("local", self._in_parts, _LOCAL, _RESPONSE, local, lambda x: 0.0 <= x <= 1.0),
-            ("deformation", self._in_parts, None, _RESPONSE, "positive, such as 1 % of a column height", positive),
-            (
-                "growth",
-                self.deformation is not None,
-                _GROWTH,
-                "deformation=",
-                "zero or more",
-                lambda x: 0 <= x < math.inf,
-            ),
         ):
             if (value := self._option(name, means, where, default)) is not None:
                 object.__setattr__(self, name, as_number(self, name, value, meaning, possible))
@@ -297,12 +280,12 @@ class GaussianNoise:
     @property
     def title(self) -> str:
         """Class and options, without channels and numbers per channel, for reports."""
-        options = shown((), self._options(("groups", "level", "window", "local", "deformation")))
+        options = shown((), self._options(("groups", "level", "window", "local")))
         return type(self).__name__ + (f"({options})" if options else "")
 
     def __repr__(self) -> str:
         # measurements and model determine the fields left out, so fingerprints need not contain them
-        bound = ("channels", "layout", "events", "measured", "excited")
+        bound = ("channels", "layout", "events", "measured", "of_parts")
         names = [field.name for field in fields(self) if field.name not in bound]
         return f"{type(self).__name__}({shown(self.channels, self._options(names))})"
 
@@ -381,9 +364,8 @@ class GaussianNoise:
         Raises
         ------
         ValueError
-            If the noise has levels per event and the excitation is not `fe_likelihoods.Events`; if the noise grows with
-            a deformation and none is imposed on the model; if the window is shorter than three time steps of the model
-            or longer than an event.
+            If the noise has levels per event and the excitation is not `fe_likelihoods.Events`; if the window is
+            shorter than three time steps of the model or longer than an event.
         """
         if self._kind == "event" and not self.events:
             return replace(self, events=events_of(model).windows)
@@ -397,14 +379,7 @@ class GaussianNoise:
                     f"GaussianNoise: the window of {self.window:g} s must not be longer than an event; {each.name!r} "
                     f"has {each.end - each.start:g} s: give a shorter window, or leave out this event"
                 )
-        excited = excited_parts(model, self.window / _PARTS, first)
-        if self.deformation is not None and not excited.reached:
-            raise ValueError(
-                "GaussianNoise: deformation= is for a model under an imposed deformation, with a DisplacementHistory "
-                "in its attribute loading or record, or an array (n_steps,) in its attribute deformation or strain; "
-                f"this {type(model).__name__} has none: leave deformation out"
-            )
-        return replace(self, excited=excited)
+        return replace(self, of_parts=events_of_parts(model, self.window / _PARTS, first))
 
     def with_measurements(self, measurements: Measurements) -> "GaussianNoise":
         """The same noise with the sample times of these measurements, and their scales if none are set.
@@ -495,7 +470,7 @@ class GaussianNoise:
         """
         if not self._in_parts or self.layout is None or self.local == 1.0:
             return ""
-        named, counts, events = [], np.array(self.layout.counts), self.excited.events
+        named, counts, events = [], np.array(self.layout.counts), self.of_parts
         for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
             known = np.flatnonzero(row)
             inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # without the first and last part
@@ -610,10 +585,8 @@ class GaussianNoise:
                 power = np.repeat(samples, self.n_bands, axis=0)[None]
             levels = np.sqrt(power / np.maximum(counts, 1))
         elif self._in_parts:
-            if self.deformation is not None:
-                self._bound(self.excited.reached)
             with np.errstate(invalid="ignore"):
-                levels = np.sqrt(squared_levels(power, counts, self.local, self.excited, self.deformation, self.growth))
+                levels = np.sqrt(squared_levels(power, counts, self.local, self.of_parts))
         return self._with_sensor(values, levels)
 
     def _with_sensor(self, values: np.ndarray, levels: np.ndarray) -> np.ndarray:

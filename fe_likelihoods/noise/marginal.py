@@ -14,7 +14,7 @@ page ``docs/theory/likelihood.rst``.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -100,13 +100,7 @@ class MarginalNoise:
         """No parameters."""
         return ()
 
-    def log_likelihood(
-        self,
-        misfit: np.ndarray,
-        n_samples: int | SampleCounts,
-        parameters: Any = None,
-        integral: Callable[[np.ndarray, float, Any], np.ndarray] | None = None,
-    ) -> np.ndarray:
+    def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, parameters: Any = None) -> np.ndarray:
         """Log-likelihood of the measurements.
 
         Parameters
@@ -118,8 +112,6 @@ class MarginalNoise:
             Samples per channel; `SampleCounts` where samples are missing.
         parameters : optional
             Ignored; the noise has no parameters.
-        integral : callable, optional
-            A faster `log_integral`.
 
         Returns
         -------
@@ -132,7 +124,7 @@ class MarginalNoise:
         usable = np.isfinite(misfit).all(axis=1)
         if usable.any():
             squares, counts, constant = self._sums(misfit[usable], n_samples)
-            terms = [(integral or log_integral)(*one) for one in zip(squares.T, counts, self.priors, strict=True)]
+            terms = [log_integral(*one) for one in zip(squares.T, counts, self.priors, strict=True)]
             total[usable] = constant + np.sum(terms, axis=0)
         return total
 

@@ -3,8 +3,7 @@
 A model with memory, such as reinforced concrete after cracking, responds to an earthquake according to what happened
 before. A prediction under another record therefore starts from one of two states: "virgin", the state of the model at
 the beginning of its own excitation, or "end", the state at the end of that excitation. For the second, the model runs
-its own excitation, a pause, and the new record, and only the response to the new record is used. The states at the end
-of both are kept (`fe_likelihoods.prediction.kept_states`).
+its own excitation, a pause, and the new record, and only the response to the new record is used.
 """
 
 import warnings
@@ -15,7 +14,6 @@ import numpy as np
 from ..cache.stored_responses import StoredResponses
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationBatch, simulate_batch
-from .kept_states import simulate_last_part
 
 __all__ = ["STATES", "Excitation", "chosen_state", "excite", "under_record"]
 
@@ -45,15 +43,10 @@ class Excitation(NamedTuple):
     def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
 
-        With `stored`, responses to the whole excitation are looked up and stored there. New responses are then
-        simulated from the beginning, because a simulation from a kept state has only the last part of the response.
+        With `stored`, responses to the whole excitation are looked up and stored there.
         """
-        if stored is not None:
-            responses, reasons = stored.simulate(thetas)
-            return SimulationBatch(np.ascontiguousarray(responses[:, :, self.first :]), reasons)
-        if self.first:
-            return simulate_last_part(self.model, self.first, thetas, pool)
-        return simulate_batch(self.model, thetas, pool)
+        batch = simulate_batch(self.model, thetas, pool) if stored is None else stored.simulate(thetas)
+        return SimulationBatch(np.ascontiguousarray(batch.response[:, :, self.first :]), batch.reasons)
 
 
 def chosen_state(model: Model, record: Any, from_state: str | None, stacklevel: int = 3) -> str:

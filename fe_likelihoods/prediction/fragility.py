@@ -80,8 +80,6 @@ class Fragility(NamedTuple):
         SI unit of the threshold; "SI" where its dimension is not known.
     intensity_unit : str
         Unit of the intensities: m/s2 for `peak_ground_acceleration`, empty for another function.
-    of_samples : ndarray, shape (n_samples, n_records), or None
-        Probability that each sample exceeds; NaN where its simulation failed and is left out.
     """
 
     names: tuple[str, ...]
@@ -99,7 +97,6 @@ class Fragility(NamedTuple):
     uncertainty: str = ""
     unit: str = "SI"
     intensity_unit: str = ""
-    of_samples: np.ndarray | None = None
 
     def __str__(self) -> str:
         intensity = f"intensity [{self.intensity_unit}]" if self.intensity_unit else "intensity"
@@ -340,7 +337,6 @@ def fragility(
         contents(bool(noise), spread),
         unit_of_threshold(unit, known.channels),
         intensity_unit,
-        np.where(found.counted > 0.0, found.single, np.nan).T,
     )
 
 

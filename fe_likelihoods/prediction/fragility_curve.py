@@ -40,11 +40,6 @@ class FragilityCurve(NamedTuple):
         records. They are inf if more than a tenth of the resamplings do not determine a curve.
     unit : str
         Unit of the intensities; empty where it is not known.
-    resampled : ndarray, shape (100, 2), or None
-        Median and dispersion of the curves of resampled samples, whose scatter is the Monte Carlo error; NaN where the
-        points determine no curve. Curves of several thresholds have the same resamplings if they have the same seed.
-    drawn : ndarray, shape (up to 100, 2), or None
-        The same for draws of ratios and event population; None without them.
     """
 
     median: float
@@ -52,8 +47,6 @@ class FragilityCurve(NamedTuple):
     median_error: float = np.inf
     dispersion_error: float = np.inf
     unit: str = ""
-    resampled: np.ndarray | None = None
-    drawn: np.ndarray | None = None
 
     def __str__(self) -> str:
         median, dispersion = number(self.median), number(self.dispersion)
@@ -165,14 +158,13 @@ def curve_with_errors(
     """
     n = exceeds.shape[1]
     curve = fit_fragility(intensity, exceeds.sum(axis=1), counted.sum(axis=1))
-    chosen = rng.multinomial(max(int(round(effective)), 1), np.full(n, 1.0 / n), size=_REPLICATES)
-    found = resampled = _fits(intensity, [(exceeds @ weights, counted @ weights) for weights in chosen])
-    drawn = None
-    if draws is not None:
+    if draws is None:
+        chosen = rng.multinomial(max(int(round(effective)), 1), np.full(n, 1.0 / n), size=_REPLICATES)
+        found = _fits(intensity, [(exceeds @ weights, counted @ weights) for weights in chosen])
+    else:
         whole = draws[np.isfinite(draws).all(axis=1)]
         rows = np.linspace(0, len(whole) - 1, min(len(whole), _REPLICATES)).astype(int)
-        found = drawn = _fits(intensity, [(n * whole[row], np.full(len(intensity), float(n))) for row in rows])
-    curve = curve._replace(resampled=resampled, drawn=drawn)
+        found = _fits(intensity, [(n * whole[row], np.full(len(intensity), float(n))) for row in rows])
     determined = found[np.isfinite(found).all(axis=1)]
     if not len(found) or len(determined) < 0.9 * len(found):  # those with a curve would be a biased selection
         return curve

@@ -1,8 +1,4 @@
-"""Inputs of a prediction: the model and the noise to predict with, and the parameters in the samples.
-
-This is the only module of predictions that asks foreign objects (posteriors, likelihoods, models, noises) for their
-optional members.
-"""
+"""Inputs of a prediction: the model and the noise to predict with, and the parameters in the samples."""
 
 import math
 from collections.abc import Mapping

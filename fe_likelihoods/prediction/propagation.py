@@ -48,7 +48,6 @@ from .inputs import (
     simulates_in_batches,
     split_samples,
 )
-from .kept_states import KEPT_STATES
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
@@ -88,7 +87,6 @@ class _Options(TypedDict, total=False):
     effective_sample_size: float | None
     batch: int | None
     memory_bytes: int | None
-    state_bytes: int | None
     pool: Any
     cache: SimulationCache | str | os.PathLike | None
     calibrated: Sequence[Measurements] | None
@@ -124,7 +122,6 @@ def propagate(
     effective_sample_size: float | None = None,
     batch: int | None = None,
     memory_bytes: int | None = 512 * 2**20,
-    state_bytes: int | None = 256 * 2**20,
     pool: Any = None,
     cache: SimulationCache | str | os.PathLike | None = None,
     calibrated: Sequence[Measurements] | None = None,
@@ -185,18 +182,12 @@ def propagate(
         retained in single precision (seven digits) if they do not fit in double precision. If they do not fit in
         single precision either, a random subsample is retained, and `Prediction.n_quantile` is its size. None: no
         limit. Single numbers are always retained.
-    state_bytes : int or None
-        Largest size [bytes] of the states that this process keeps for "end". A later prediction with samples at the
-        same parameters then does not run the earlier excitations again; its results have the same bits. 0: no states.
-        None: no limit. Models without a method ``simulate_from``, and predictions with `cache`, run the whole
-        excitation.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
     cache : SimulationCache or path, optional
         Where responses are looked up, and stored as soon as they are simulated. A prediction that was interrupted, or
-        is made again, repeats only one or two of them, to compare. Responses to the whole excitation are stored, also
-        for "end", so that new ones are simulated from the beginning; without `cache`, kept states avoid this
-        (`state_bytes`). Default: responses are not stored.
+        is made again, repeats only one or two of them, to compare. For "end", responses to the whole excitation are
+        stored. Default: responses are not stored.
     calibrated : sequence of Measurements, optional
         Measurements of the calibration events, with whose amplitudes a prediction under another record is compared.
         Default: the likelihood's measurements. An empty sequence for no comparison.
@@ -258,7 +249,6 @@ def propagate(
     if batch is not None and not (isinstance(batch, (int, np.integer)) and batch >= 1):
         raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
     _check_bytes("memory_bytes", memory_bytes)
-    _check_bytes("state_bytes", state_bytes)
     if record is not None:
         under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
@@ -277,7 +267,6 @@ def propagate(
         entropy = np.random.SeedSequence(seed).entropy
     except (TypeError, ValueError) as error:
         raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
-    KEPT_STATES.limit(state_bytes)
     accumulators = {
         name: Accumulator(
             members=samples_of_rows(row_of_sample, len(distinct)),

@@ -1,4 +1,4 @@
-"""Distributions of several correlated parameters, for `Prior`: normal, truncated normal, and scipy's distributions.
+"""Distributions of several correlated parameters, for `Prior`: the normal one, and scipy's distributions.
 
 A distribution has a normalised density and draws. Nested samplers and guides also need a map between the parameters and
 independent standard normal variables. `MultivariateNormal` and `MixtureDistribution` have one; a distribution without
@@ -20,17 +20,13 @@ __all__ = [
     "FrozenMultivariate",
     "MultivariateDistribution",
     "MultivariateNormal",
-    "TruncatedMultivariateNormal",
     "as_distribution",
     "as_generator",
     "as_multivariate",
 ]
 
 _LOG_TWO_PI = math.log(2.0 * math.pi)
-_FEWEST_INSIDE = 1e-3  # probability of a box below which draws by rejection take too long
 _LARGEST_ASYMMETRY = 1e-8  # of a covariance, in standard deviations of the two parameters
-_LATTICE_POINTS = 2**14
-_SHIFTS = 8
 
 
 class MultivariateDistribution(ABC):
@@ -153,123 +149,6 @@ class MultivariateNormal(MultivariateDistribution):
     def to_normal(self, x: np.ndarray) -> np.ndarray:
         """Map to independent standard normal variables (..., dim)."""
         return (np.asarray(x) - self.mean) @ self._inverse.T
-
-
-class TruncatedMultivariateNormal(MultivariateNormal):
-    """Multivariate normal distribution restricted to a box and normalised there.
-
-    It has no map from the unit cube. Draws are made by rejection, so the box must contain at least 0.1 % of the normal
-    distribution.
-
-    Parameters
-    ----------
-    mean : (dim,) array_like
-        Mean before truncation.
-    covariance : (dim, dim) array_like
-        Covariance before truncation.
-    lower, upper : float or (dim,) array_like
-        Bounds; infinite where there is none. By default the parameters are positive.
-
-    Attributes
-    ----------
-    log_probability : float
-        Log probability of the box before truncation, which normalises the density.
-    log_probability_error : float
-        Its standard error, by which the logarithm of every density and every evidence may be shifted. Zero for
-        independent parameters.
-
-    Raises
-    ------
-    ValueError
-        As `MultivariateNormal`, if a lower bound is not below the upper one, or if the box contains too little
-        probability.
-
-    Notes
-    -----
-    The probability of the box is a quasi-Monte Carlo integral over a lattice of 2^14 points with 8 fixed random shifts,
-    after the transformation of Genz (1992), "Numerical computation of multivariate normal probabilities", Journal of
-    Computational and Graphical Statistics 1, 141-149. It is the same in every process.
-    """
-
-    def __init__(
-        self, mean: ArrayLike, covariance: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf
-    ) -> None:
-        super().__init__(mean, covariance)
-        try:
-            self.lower = np.broadcast_to(np.asarray(lower, dtype=float), self.mean.shape).copy()
-            self.upper = np.broadcast_to(np.asarray(upper, dtype=float), self.mean.shape).copy()
-        except ValueError:
-            raise ValueError(
-                f"TruncatedMultivariateNormal expects one bound or {self.dim}; got {lower!r} and {upper!r}"
-            ) from None
-        if not (self.lower < self.upper).all():
-            raise ValueError(
-                f"TruncatedMultivariateNormal expects lower < upper; got {self.lower.tolist()} and "
-                f"{self.upper.tolist()}"
-            )
-        probability, error = _box_probability(self._factor, self.lower - self.mean, self.upper - self.mean)
-        if not probability >= _FEWEST_INSIDE:
-            raise ValueError(
-                f"the box of a TruncatedMultivariateNormal must contain {_FEWEST_INSIDE:g} of the normal distribution "
-                f"or more; it contains {probability:.2g}: choose a mean and a covariance that describe the box"
-            )
-        self.log_probability, self.log_probability_error = math.log(probability), error / probability
-
-    def __repr__(self) -> str:
-        return f"{super().__repr__()[:-1]}, {self.lower!r}, {self.upper!r})"
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Lower and upper bound of every parameter, shape (dim, 2)."""
-        return np.stack([self.lower, self.upper], axis=1)
-
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Logarithm of the density (...) at x (..., dim); -inf outside the box."""
-        x = np.asarray(x)
-        inside = ((x >= self.lower) & (x <= self.upper)).all(axis=-1)
-        return np.where(inside, super().logpdf(x) - self.log_probability, -np.inf)
-
-    def from_normal(self, z: np.ndarray) -> np.ndarray:
-        """ValueError: there is no map."""
-        return MultivariateDistribution.from_normal(self, z)
-
-    def to_normal(self, x: np.ndarray) -> np.ndarray:
-        """ValueError: there is no map."""
-        return MultivariateDistribution.from_normal(self, x)
-
-    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws, shape (size, dim), by rejection."""
-        rng, found = as_generator(random_state), np.empty((0, self.dim))
-        while len(found) < size:
-            n = int(1.2 * (size - len(found)) / math.exp(self.log_probability)) + 10
-            draws = self.mean + rng.standard_normal((n, self.dim)) @ self._factor.T
-            inside = ((draws >= self.lower) & (draws <= self.upper)).all(axis=1)
-            found = np.concatenate([found, draws[inside]])
-        return found[:size]
-
-
-def _box_probability(factor: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
-    """Probability that ``factor @ z`` is between `low` and `high` for standard normal z, and its standard error."""
-    from scipy.special import ndtr, ndtri  # slow to import, and not needed for densities
-
-    dim = len(factor)
-    if not np.any(np.tril(factor, -1)):
-        scale = np.diag(factor)
-        return float(np.prod(ndtr(high / scale) - ndtr(low / scale))), 0.0
-    # a Richtmyer lattice; the roots of primes are irrational and independent
-    primes = [p for p in range(2, 8 * dim + 20) if all(p % q for q in range(2, int(p**0.5) + 1))][:dim]
-    lattice = np.arange(1, _LATTICE_POINTS + 1)[:, None] * np.sqrt(primes)
-    estimates = []
-    for shift in np.random.default_rng(1992).random((_SHIFTS, dim)):
-        u = np.abs(2.0 * ((lattice + shift) % 1.0) - 1.0)  # periodic, which speeds up the convergence
-        z, weight = np.zeros((_LATTICE_POINTS, dim)), np.ones(_LATTICE_POINTS)
-        for i in range(dim):
-            known = z[:, :i] @ factor[i, :i]
-            below, above = ndtr((low[i] - known) / factor[i, i]), ndtr((high[i] - known) / factor[i, i])
-            weight *= above - below
-            z[:, i] = ndtri(np.clip(below + u[:, i] * (above - below), 1e-300, 1.0 - 1e-16))
-        estimates.append(weight.mean())
-    return float(np.mean(estimates)), float(np.std(estimates, ddof=1) / math.sqrt(_SHIFTS))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

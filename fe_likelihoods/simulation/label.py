@@ -38,8 +38,6 @@ __all__ = [
     "ModelLabel",
     "cpu_name",
     "items_of",
-    "note_own_changes",
-    "steady_digest",
     "value_digest",
 ]
 
@@ -140,7 +138,8 @@ class ModelLabel:
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
         """Record that simulations change some items; later labels of this process keep their first digests."""
-        note_own_changes(self.items, dict.fromkeys(names, ""))
+        for name in self.items.keys() & set(names) - _PARTS:
+            _first.setdefault(name, self.items[name])
 
     @property
     def changing(self) -> set[str]:
@@ -201,19 +200,6 @@ def value_digest(value: Any) -> str:
 def items_of(parts: Mapping[str, Any]) -> dict[str, str]:
     """Digests of values, and of all functions, values, files, packages and variables that their code names."""
     return _Walk().items(parts)
-
-
-def steady_digest(parts: Mapping[str, Any]) -> str:
-    """Digest of `items_of`, with the original digests of values that simulations of this process have changed."""
-    items = items_of(parts)
-    return _joined(items | {name: digest for name, digest in _first.items() if name in items})
-
-
-def note_own_changes(before: Mapping[str, str], after: Mapping[str, str]) -> None:
-    """Record that simulations have changed the items that differ between two results of `items_of`."""
-    for name in before.keys() & after.keys() - _PARTS:
-        if before[name] != after[name]:
-            _first.setdefault(name, before[name])
 
 
 def _joined(items: Mapping[str, str]) -> str:

@@ -31,7 +31,6 @@ from .interrupts import raise_if_it_ends_the_run
 from .opened import Observed, note, unpack
 
 __all__ = [
-    "ContinuedResponse",
     "MisfitBatch",
     "Model",
     "SimulationBatch",
@@ -94,21 +93,6 @@ class SimulationBatch(NamedTuple):
     reasons: list[str]
 
 
-class ContinuedResponse(NamedTuple):
-    """Response of one simulation from a given state, and the state at its end.
-
-    Attributes
-    ----------
-    response : (n_channels, n) float
-        [SI] at the samples after the given state; at all samples if no state was given.
-    state : ndarray
-        All numbers that the model needs to continue after the last sample, in one array; copies of it are kept.
-    """
-
-    response: np.ndarray
-    state: np.ndarray
-
-
 class MisfitBatch(NamedTuple):
     """Misfits for several parameter sets.
 
@@ -136,9 +120,6 @@ class Model(Protocol):
     excitation. They need a `Record` in the attribute ``record``, with one response sample per sample of the record, or
     a method ``followed_by(record, rest)``. It returns the same model under its excitation, a pause of ``rest`` seconds
     and the new record, whose samples must be the last samples of the response.
-
-    With ``simulate_from(theta, state) -> ContinuedResponse`` such predictions do not run the earlier excitation again
-    if theta is the same (`fe_likelihoods.prediction.kept_states`).
 
     With ``first(seconds)`` a model can be shortened, for searches that start with a short part of the record. It
     returns the same model under the first part of its excitation, with a different fingerprint. The response of the

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fe_likelihoods import Posterior
-from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
+from fe_likelihoods.adapters import to_bilby, to_pymc
 
 from .scoring import Found, chains, replicates, weighted
 
@@ -58,9 +58,10 @@ def _dynesty(posterior: Posterior, seed: int) -> Found:
 def _nautilus(posterior: Posterior, seed: int) -> Found:
     import nautilus
 
-    sampler = nautilus.Sampler(
-        nautilus_prior(posterior), posterior.log_likelihood, vectorized=True, n_live=250, n_networks=1, seed=seed
-    )
+    prior = nautilus.Prior()
+    for name, distribution in posterior.prior.distributions.items():
+        prior.add_parameter(name, distribution)
+    sampler = nautilus.Sampler(prior, posterior.log_likelihood, vectorized=True, n_live=250, n_networks=1, seed=seed)
     sampler.run(n_eff=1000)
     samples, log_weights, _ = sampler.posterior()
     return weighted(samples, np.exp(log_weights), sampler.log_z, 1.0 / np.sqrt(sampler.n_eff))
@@ -69,9 +70,16 @@ def _nautilus(posterior: Posterior, seed: int) -> Found:
 def _pints(posterior: Posterior, seed: int) -> Found:
     import pints
 
+    class LogPosterior(pints.LogPDF):
+        def n_parameters(self) -> int:
+            return posterior.ndim
+
+        def __call__(self, x: np.ndarray) -> float:
+            return posterior(x)
+
     np.random.seed(seed)  # noqa: NPY002 - pints draws from the global stream
     starts = list(posterior.sample_start(8))
-    controller = pints.MCMCController(to_pints(posterior), 8, starts, method=pints.DifferentialEvolutionMCMC)
+    controller = pints.MCMCController(LogPosterior(), 8, starts, method=pints.DifferentialEvolutionMCMC)
     controller.set_max_iterations(1200)
     controller.set_log_to_screen(False)
     return chains(controller.run()[:, 400:])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import HalfNormal, LogNormal, TruncatedNormal, Uniform
-from fe_likelihoods.adapters import nautilus_prior, to_bilby, to_pints, to_pymc
+from fe_likelihoods.adapters import to_bilby, to_pymc
 
 from .problem import PRIOR, make_posterior
 
@@ -109,33 +109,6 @@ def test_pymc_op_pickles(client_named):
     posterior = make_posterior()
     op = to_pymc(posterior).potentials[0].owner.op
     assert pickle.loads(pickle.dumps(op)).posterior.fingerprint == posterior.fingerprint
-
-
-def test_pints_has_our_prior_and_likelihood(client_named, posterior, points):
-    client_named("pints")
-    log_posterior = to_pints(posterior)
-    log_prior, log_likelihood = log_posterior.log_prior(), log_posterior.log_likelihood()
-    assert log_posterior.n_parameters() == log_prior.n_parameters() == log_likelihood.n_parameters() == 4
-    for thing in (log_posterior, pickle.loads(pickle.dumps(log_posterior))):
-        np.testing.assert_array_equal([thing(point) for point in points], posterior(points))
-    for part in (log_prior, log_likelihood):
-        np.testing.assert_array_equal(pickle.loads(pickle.dumps(part))(points[4]), part(points[4]))
-    u = np.random.default_rng(6).random((3, 4))
-    np.testing.assert_array_equal(log_prior.convert_from_unit_cube(u), posterior.prior_transform(u))
-    assert log_prior.sample(5).shape == (5, 4)
-    assert log_prior.mean()[3] == posterior.prior.distributions["sigma_displacement"].moments[0]
-
-
-def test_nautilus_has_our_prior_and_passes_names(client_named, posterior):
-    client_named("nautilus")
-    prior = nautilus_prior(posterior)
-    assert prior.keys == NAMES and prior.dimensionality() == 4
-    u = np.random.default_rng(6).random((50, 4))
-    np.testing.assert_allclose(prior.unit_to_physical(u), posterior.prior_transform(u), rtol=1e-9)
-    named = prior.unit_to_dictionary(u)
-    np.testing.assert_array_equal(
-        posterior.log_likelihood(named), posterior.log_likelihood(np.stack([named[n] for n in NAMES], axis=1))
-    )
 
 
 @pytest.mark.parametrize(("name", "adapter"), [("bilby", to_bilby), ("pymc-smc", to_pymc)])

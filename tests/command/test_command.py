@@ -23,7 +23,7 @@ from fe_likelihoods.command.schema import _KINDS, MODEL_KINDS, model_keys, part_
 from fe_likelihoods.command.starting import TEMPLATES
 from fe_likelihoods.models.isolated_bridge_parts import Bearing, Damper, Pier
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.rc_column_parts import BarBuckling, Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from fe_likelihoods.models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from fe_likelihoods.units import DIMENSIONS
 from samplers import SamplingWarning
 from tests.command.key_tables import PAGE, key_tables
@@ -125,12 +125,9 @@ def test_keys_are_those_of_the_models():
     """Every key of a model is an argument of its class, and the other way round."""
     others = {"loading", "outputs", "concrete", "steel", "bars", "hoops", "max_increment"}  # the last: imposed tests
     column = {field.name for field in dataclasses.fields(RCColumn)} - others
-    assert {key.name for key in model_keys("column")} == column - {
-        "fatigue",
-        "buckling",
-    }  # parts that are off by default
+    assert {key.name for key in model_keys("column")} == column - {"fatigue"}  # off by default
     classes = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
-    classes |= {"fatigue": LowCycleFatigue, "buckling": BarBuckling}
+    classes |= {"fatigue": LowCycleFatigue}
     classes |= {"pier_1": Pier, "bearing_1": Bearing, "damper_2": Damper}
     for name, cls in classes.items():
         keys = (part_keys("column") | part_keys("bridge"))[name]
@@ -145,13 +142,13 @@ def test_keys_are_those_of_the_models():
     )
 
 
-def test_sections_switch_fatigue_and_buckling_on():
+def test_a_section_switches_fatigue_on():
     text = (ROOT / "data" / "templates" / "column.toml").read_text()
     file = ROOT / "data" / "templates" / "column.toml"
     assert make_problem(parse_job(text, file, file.parent)).posterior.likelihood.model.fatigue is None
-    failing = text + "\n[model.fatigue]\ncf = 0.15\n[model.buckling]\n"
+    failing = text + "\n[model.fatigue]\ncf = 0.15\n"
     model = make_problem(parse_job(failing, file, file.parent)).posterior.likelihood.model
-    assert model.fatigue == LowCycleFatigue(cf=0.15) and model.buckling == BarBuckling()
+    assert model.fatigue == LowCycleFatigue(cf=0.15)
     wrong = text + "\n[model.fatigue]\ncf = -1.0\n"
     with pytest.raises(ValueError, match=r"column.toml: \[model.fatigue\]"):
         make_problem(parse_job(wrong, file, file.parent))

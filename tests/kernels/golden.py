@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import concrete04, fiber_section, frame, reinforcing_steel
+from fe_likelihoods.kernels import bar_fatigue, concrete04, fiber_section, frame, reinforcing_steel
 from fe_likelihoods.kernels.jit import kernel
 
 BUNDLED = Path(__file__).parent / "data"
@@ -105,7 +105,7 @@ def column(
 ) -> frame.Column:
     """Return a virgin column with its materials set; by default two elements of three points each.
 
-    Bars that fail have neither fatigue nor buckling until their constants are set: they fail where a test says so.
+    Bars that fail have a fatigue that does not matter: they fail where a test says so.
     """
     points, weights = lobatto(n_points)
     out = frame.allocate(
@@ -123,6 +123,8 @@ def column(
     concrete04.constants(*map(float, core), out.sections.concrete[0])
     concrete04.constants(*map(float, cover), out.sections.concrete[1])
     reinforcing_steel.constants(*map(float, steel), out.sections.steel)
+    if bars_fail:
+        bar_fatigue.constants(1e9, 0.5, 1e18, out.sections.failure)
     frame.initialise_column(out)
     return out
 

@@ -184,32 +184,12 @@ def test_uplift_between_samples_against_solve_ivp():
     assert not too_large(by_kind(response, reference), **{kind: 2.0 * bound for kind, bound in SMOOTH.items()})
 
 
-def test_default_step_of_the_elastic_plastic_law_against_solve_ivp():
-    reference = solve(Definition(), GROUND, DT, friction="elastic-plastic").response
-    errors = by_kind(ours(PARAMETERS["nominal"], friction="elastic-plastic"), reference)
-    assert not too_large(errors, Ub=3e-5, Fb=6e-4, drift=1e-4, shear=2e-4, acc_p=1.5e-3, Ud=2e-5, acc_d=5e-4)
-
-
 def test_default_step_of_coulombs_law():
     """Compared with a hundredth of the step, at every sample: no sample is on the wrong side of a jump."""
     fine = ours(PARAMETERS["nominal"], friction="coulomb", step=2.5e-6)
     bounds = dict(Ub=2e-5, Fb=1e-4, drift=5e-5, shear=5e-5, acc_p=3e-4, Ud=2e-5, acc_d=1e-4)
     assert not too_large(by_kind(ours(PARAMETERS["nominal"], friction="coulomb"), fine), **bounds)
     assert too_large(by_kind(ours(PARAMETERS["nominal"], friction="coulomb", step=2.5e-3), fine), **bounds)
-
-
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_elastic_plastic_law_against_opensees(opensees, name):
-    """At equal steps both have nearly the same error of first order, and their difference is of second order."""
-    theta = PARAMETERS[name]
-    difference = {
-        step: by_kind(ours(theta, loop=False, friction="elastic-plastic", step=step), opensees[name, step])
-        for step in (5e-4, 2.5e-4)
-    }
-    bounds = dict(Ub=1e-5, Fb=1.2e-4, drift=3e-5, shear=5e-5, acc_p=4e-4, Ud=4e-6, acc_d=1e-4)
-    assert not too_large(difference[2.5e-4], **bounds)
-    for kind in KINDS:
-        assert SECOND_ORDER[0] < difference[5e-4][kind] / difference[2.5e-4][kind] < SECOND_ORDER[1], kind
 
 
 @pytest.mark.parametrize("place", range(10))

@@ -306,7 +306,7 @@ def short_subset() -> dict[str, np.ndarray]:
     ground = 300.0 * np.sin(np.linspace(0.0, 6.0, 40))
     dynamics = Dynamics(golden.gravity(), golden.mass(), golden.A0, golden.A1, 0.0)
     felt = recorder(shaken, 40, sections=True, motion=3, fibers=fibers)
-    status = newmark(shaken, dynamics, ground, 0.02, 1, iteration, out["run"], felt, 0, np.zeros(4))
+    status = newmark(shaken, dynamics, ground, 0.02, 1, iteration, out["run"], felt)
     out["status"] = np.array(status)
     for name in ("sections", "motion", "stresses"):
         out[name], out[f"shaken {name}"] = getattr(seen, name), getattr(felt, name)

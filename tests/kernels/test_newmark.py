@@ -41,7 +41,7 @@ def run(
     history = np.full((len(HISTORY_ROWS), (len(ground) - 1) // every + 1), np.nan)
     dynamics = Dynamics(golden.gravity(n_elements, weight), golden.mass(n_elements), a0, a1, velocity)
     iteration = Iteration(tolerance, max_iterations, halvings)
-    result = newmark(column, dynamics, ground, dt, every, iteration, history, recorder(column), 0, np.zeros(4))
+    result = newmark(column, dynamics, ground, dt, every, iteration, history, recorder(column))
     return result, history
 
 

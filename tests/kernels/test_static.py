@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.kernels import bar_fatigue_buckling, concrete04
+from fe_likelihoods.kernels import bar_fatigue, concrete04
 from fe_likelihoods.kernels.frame import recorder
 from fe_likelihoods.kernels.static import (
     GRAVITY_STEPS,
@@ -180,7 +180,7 @@ def lowered(factor, fractured=1):
     position = Position(np.zeros(6), np.zeros(6), np.zeros((6, 6)))
     assert apply_gravity(column, position, golden.gravity(), iteration) == 0
     column.sections.virgin[0] = 0.0
-    column.sections.steel_memory[0, :fractured, bar_fatigue_buckling.FRACTURED] = 1.0
+    column.sections.steel_memory[0, :fractured, bar_fatigue.FRACTURED] = 1.0
     load = golden.gravity()
     for _ in range(20):
         assert equilibrate(column, position, load, 3, 0.05, -1, TOLERANCE, 50) < TOLERANCE

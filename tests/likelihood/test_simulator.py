@@ -18,7 +18,6 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -69,7 +68,6 @@ def line(theta):
 
 
 def models():
-    strains = np.concatenate([np.linspace(0.0, 0.01, 20), np.linspace(0.01, -0.005, 20)])
     column = RCColumn.lhpost(RECORD, mesh=10)
     return [
         Line(),
@@ -77,7 +75,6 @@ def models():
         FunctionModel(line, ("a", "b"), [Channel("y", "displacement", "m")], 0.1, 20),
         LinearOscillator(RECORD),
         LinearStructure(ShearFrame({"top": 2}, (1.0, 1.0), (900.0, 900.0)), RECORD),
-        SteelCoupon(strains, column.steel),
         column,
         isolated_bridge().likelihood.model,
     ]

@@ -11,7 +11,6 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
 from fe_likelihoods.models.linear_structure_parts import BridgeDeck, ShearFrame
 from fe_likelihoods.models.rc_column import RCColumn
-from fe_likelihoods.models.steel_coupon import SteelCoupon
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -29,7 +28,6 @@ def cases():
     imposed = DisplacementHistory("cycles", np.array([0.0, 0.05, -0.05, 0.1, -0.1]))
     bridge = isolated_bridge(data="means").likelihood.model
     vertical = bridge.with_record(TABLE)
-    strain = np.concatenate([np.linspace(0.0, 0.02, 60), np.linspace(0.02, -0.01, 60)])
     supports = [RECORD, RECORD.scale(0.9), RECORD.scale(1.1)]
     return {
         "oscillator": (LinearOscillator(RECORD), 5.003),
@@ -41,7 +39,6 @@ def cases():
             type(bridge)(TABLE, vertical=TABLE.scale(0.5), every=3, outputs=bridge.outputs),
             1.2321,
         ),
-        "coupon": (SteelCoupon(strain, column.steel), 70.0),
         "frame": (LinearStructure(ShearFrame({"top": 2}, (1.0, 1.0), (900.0, 900.0)), RECORD), 5.003),
         "deck": (LinearStructure(BridgeDeck("m", "a", "b"), supports), 5.003),
         "deck, lead": (LinearStructure(BridgeDeck("m"), supports, lead=2.0), 5.003),

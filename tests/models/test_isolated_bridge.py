@@ -164,9 +164,9 @@ def test_the_deck_is_in_equilibrium(rng):
 # ------------------------------------------------------------------ convergence and energy
 
 
-@pytest.mark.parametrize(("friction", "order"), [("bouc-wen", 1.7), ("elastic-plastic", 0.8), ("coulomb", 1.7)])
-def test_order_of_convergence(rng, friction, order):
-    """Second order for the smooth law, and for Coulomb's between its instants; corners cost up to one order."""
+@pytest.mark.parametrize("friction", ["bouc-wen", "coulomb"])
+def test_order_of_convergence(rng, friction):
+    """Second order for the smooth law, and for Coulomb's between its instants."""
     record = shaking(rng, duration=2.0)
     model = IsolatedBridge(record, friction=friction, outputs=("Ub_1", "Ub_2", "Ud"), tolerance=1e-8)
     steps = 1e-3 / 2.0 ** np.arange(5)
@@ -174,21 +174,7 @@ def test_order_of_convergence(rng, friction, order):
     errors = [np.sqrt(np.mean((replace(model, step=h).simulate(np.ones(10)) - fine) ** 2)) for h in steps]
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     print(f"{friction}: order {slope:.2f}, errors {errors} m")
-    assert slope > order
-
-
-def test_elastic_plastic_converges_to_coulomb_with_the_yield_displacement(rng):
-    record = shaking(rng, duration=2.0)
-    outputs = ("Ub_1", "Ub_2", "drift_1", "Ud")
-    exact = IsolatedBridge(record, friction="coulomb", outputs=outputs, step=0.05e-3).simulate(np.ones(10))
-    peak = np.abs(exact).max(axis=1)
-    distance = []
-    for y in (0.1e-3, 0.01e-3):
-        bearings = (Bearing(yield_displacement=y), Bearing(f_min=0.05, df=0.07, a=28.0, yield_displacement=y))
-        model = IsolatedBridge(record, friction="elastic-plastic", bearings=bearings, outputs=outputs, step=0.05e-3)
-        distance.append(worst(model.simulate(np.ones(10)), exact, peak))
-    print("largest distance to Coulomb's law, as fractions of the peak:", distance)
-    assert distance[1] < 0.3 * distance[0] < 0.02
+    assert slope > 1.7
 
 
 def test_the_instants_of_stick_and_slip_do_not_depend_on_the_step(rng):
@@ -202,13 +188,6 @@ def test_the_instants_of_stick_and_slip_do_not_depend_on_the_step(rng):
         assert np.abs((replace(model, step=model.record.dt).simulate(np.ones(10)) - fine) / peak).max() > 1e-3
 
 
-def test_a_bridge_with_coulombs_law_continues_with_the_same_bits(rng):
-    model = IsolatedBridge(shaking(rng, duration=2.0), friction="coulomb")
-    whole, start = model.simulate(np.ones(10)), model.first(1.0).simulate_from(np.ones(10))
-    rest = model.simulate_from(np.ones(10), start.state)
-    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
-
-
 def test_bearings_that_stick_have_the_force_that_keeps_them_at_rest(rng):
     """The deck and both piers move together, so that the bearings have no acceleration."""
     model = IsolatedBridge(shaking(rng, duration=1.0).scale(0.01), friction="coulomb", outputs=("Ud", "acc_d", "Ub_1"))
@@ -220,8 +199,7 @@ def test_bearings_that_stick_have_the_force_that_keeps_them_at_rest(rng):
     assert np.corrcoef(acceleration[1:-1], expected)[0, 1] > 0.9
 
 
-@pytest.mark.parametrize("friction", ["bouc-wen", "elastic-plastic"])
-def test_energy_is_balanced(rng, friction):
+def test_energy_is_balanced(rng):
     """Work of the table = kinetic + elastic + damped energy + work on the isolators, with an error of second order."""
     theta = np.array([1.2, 0.8, 1.1, 0.9, 1.2, 0.9, 1.1, 0.8, 0.9, 1.3])
     coarse = shaking(rng, duration=2.0)
@@ -230,7 +208,7 @@ def test_energy_is_balanced(rng, friction):
         dt = coarse.dt / divisions
         n = (coarse.n_steps - 1) * divisions + 1
         record = Record("fine", dt, np.interp(dt * np.arange(n), coarse.time, coarse.acceleration))
-        model = IsolatedBridge(record, step=dt, friction=friction)
+        model = IsolatedBridge(record, step=dt)
         mass, damping, stiffness, kinematics, _ = model.matrices
         h = model.history(theta)
         q, v = h.values[:5], h.values[5:10]
@@ -246,7 +224,7 @@ def test_energy_is_balanced(rng, friction):
         stored = 0.5 * np.einsum("it,ij,jt->t", v, mass, v) + 0.5 * np.einsum("it,ij,jt->t", q, stiffness, q)
         total = np.trapezoid(np.abs(h["Fb_1"] * bearing_velocity[0]), dx=dt)
         defects.append(np.abs(work + stored).max() / total)
-    print(f"{friction}: defect of energy {defects} of what a bearing takes")
+    print(f"defect of energy {defects} of what a bearing takes")
     assert defects[0] < 2e-3
     assert defects[1] < 0.4 * defects[0]
 
@@ -320,9 +298,8 @@ def test_thousand_draws_of_the_prior(rng):
     assert np.isfinite(batch.misfit).all()
 
 
-@pytest.mark.parametrize("friction", ["elastic-plastic", "coulomb"])
-def test_draws_of_the_prior_with_the_other_laws(rng, friction):
-    model = IsolatedBridge(shaking(rng, duration=3.0), friction=friction, outputs=("Ub_1",))
+def test_draws_of_the_prior_with_coulombs_law(rng):
+    model = IsolatedBridge(shaking(rng, duration=3.0), friction="coulomb", outputs=("Ub_1",))
     batch = model.misfit_batch(np.clip(rng.normal(1.0, 0.5, (100, 10)), 0.2, 2.5), np.zeros((1, model.n_steps)))
     assert not any(batch.reasons)
 
@@ -379,15 +356,14 @@ def test_wrong_arguments_are_rejected(rng, changes, message):
         replace(IsolatedBridge(shaking(rng, duration=1.0)), **changes)
 
 
-@pytest.mark.parametrize(("friction", "longest"), [("bouc-wen", 0.25), ("elastic-plastic", 0.05), ("coulomb", 0.25)])
-def test_default_step_divides_any_step_of_a_record(friction, longest):
+def test_default_step_divides_any_step_of_a_record():
     for dt in (1e-5, 1e-3, 1.0 / 256.0, 5e-3, 0.02 / 3.0):
-        model = IsolatedBridge(Record("flat", dt, np.zeros(5)), friction=friction)
+        model = IsolatedBridge(Record("flat", dt, np.zeros(5)))
         divisions = dt / model.integration_step
-        assert divisions == pytest.approx(max(1, math.ceil(1e3 * dt / longest - 1e-6)), rel=1e-9)
+        assert divisions == pytest.approx(max(1, math.ceil(1e3 * dt / 0.25 - 1e-6)), rel=1e-9)
     assert replace(model, step=dt).integration_step == dt
-    law = IsolatedBridge(Record("flat", 5e-3, np.zeros(5)), friction=friction)
-    assert law.integration_step == 1e-3 * longest  # to the bit, where it divides
+    law = IsolatedBridge(Record("flat", 5e-3, np.zeros(5)))
+    assert law.integration_step == 0.25e-3  # to the bit, where it divides
 
 
 def test_vertical_motion_must_have_the_same_samples(rng):

@@ -1,14 +1,12 @@
-"""Columns whose bars buckle, lose strength and fracture: options, parameters, failures, warnings and continued runs."""
+"""Columns whose bars lose strength and fracture: options, parameters, failures and warnings."""
 
 import logging
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fe_likelihoods import (
-    BarBuckling,
     DisplacementHistory,
     EventRatios,
     FELikelihood,
@@ -24,7 +22,8 @@ from fe_likelihoods import (
     moment_curvature,
     propagate,
 )
-from fe_likelihoods.kernels import bar_fatigue_buckling
+from fe_likelihoods.kernels import bar_fatigue
+from fe_likelihoods.models.rc_column_analysis import _reason as reason_of_failure
 from fe_likelihoods.prediction.quantities import displacement_before_failure, find_failure
 from fe_likelihoods.problems import bridge_column_data
 from fe_likelihoods.simulation.model import is_collapse
@@ -33,7 +32,6 @@ from tests.kernels import golden
 from tutorials.tested_columns import read_column
 
 WEAK = LowCycleFatigue(cf=0.09, cd=0.389)
-SLENDER = BarBuckling(slenderness=10.0)
 
 
 def cycles(*drifts, height=7.3152, points=30):
@@ -55,19 +53,15 @@ def peaks(model):
 
 
 def test_bars_that_hardly_fail_give_the_default_response(column):
-    """A large Cf and stocky bars; the response of the default column comes from other kernels."""
-    stocky = replace(column, fatigue=LowCycleFatigue(cf=1e3, cd=1e9), buckling=BarBuckling(slenderness=0.1))
-    np.testing.assert_allclose(stocky.simulate([1.0]), column.simulate([1.0]), rtol=1e-6, atol=1.0)
+    """A large Cf; the response of the default column comes from other kernels."""
+    tough = replace(column, fatigue=LowCycleFatigue(cf=1e3, cd=1e9))
+    np.testing.assert_allclose(tough.simulate([1.0]), column.simulate([1.0]), rtol=1e-6, atol=1.0)
 
 
-def test_fatigue_and_buckling_reduce_the_strength_of_late_cycles(column):
-    plain, tired, both = (
-        peaks(model)
-        for model in (column, replace(column, fatigue=WEAK), replace(column, fatigue=WEAK, buckling=SLENDER))
-    )
+def test_fatigue_reduces_the_strength_of_late_cycles(column):
+    plain, tired = (peaks(model) for model in (column, replace(column, fatigue=WEAK)))
     np.testing.assert_allclose(tired[0], plain[0], rtol=1e-3)
     assert tired[-1] < 0.95 * plain[-1]
-    assert both[-1] < tired[-1]
 
 
 def test_outer_bars_fracture_first(column):
@@ -94,40 +88,6 @@ def test_the_column_goes_on_after_it_has_lost_bars(column, cf):
     np.testing.assert_allclose(-history["base moment"], moment, atol=1e-5 * np.abs(moment).max())
 
 
-def weakened(column, drifts, points=30, **changes):
-    """A column on a rigid anchorage in linear geometry, with buckling, under cycles of other drifts."""
-    loading = cycles(*drifts, points=points)
-    return replace(column, loading=loading, penetration=0.0, geometry="linear", **changes)
-
-
-def test_a_column_that_loses_the_axial_load_comes_down_and_carries_it_again(column):
-    """Without the lowering, the simulation fails: the bars that remain yield in compression over open cracks."""
-    late = dict(fatigue=LowCycleFatigue(cf=0.088, cd=0.389), buckling=BarBuckling(8.5), max_increment=0.04)
-    # in the middle of loads (1.50 to 1.60 MN) that give this, since last bits decide when a bar fractures
-    model = weakened(column, (0.02, 0.05, 0.07), points=24, axial_load=1.55e6, **late)
-    history = model.history([1.0])
-    assert history.lowerings == 1
-    assert (history.bar_damage > 1.0).all()
-    np.testing.assert_allclose(history["displacement"], model.loading.displacement, atol=1e-12)
-    # a cantilever in linear geometry carries its load and the moment of the force at every sample, also afterwards
-    np.testing.assert_allclose(history["base axial force"], -1.55e6, rtol=1e-6)
-    moment = -history["force"] * model.height
-    np.testing.assert_allclose(history["base moment"], moment, atol=1e-6 * np.abs(moment).max())
-    # controls: neither cycles before the loss nor bars that do not fracture need it
-    early = replace(model, loading=cycles(0.02, points=24)).history([1.0])
-    assert early.lowerings == 0
-    assert early.bar_damage.max() < 1.0
-    assert replace(model, fatigue=None).history([1.0]).lowerings == 0
-
-
-def test_a_step_that_fails_while_the_axial_load_is_carried_is_not_a_lowering(column):
-    """A third of the bars has fractured, but the lowered column carries more: the step has another cause."""
-    failing = dict(fatigue=LowCycleFatigue(cf=0.037, cd=0.389), buckling=BarBuckling(10.8), max_increment=0.02)
-    model = weakened(column, (0.01, 0.03, 0.05, 0.07), axial_load=0.53e6, **failing)
-    with pytest.raises(SimulationFailed, match=r"bars with 33% of the area .* had fractured before"):
-        model.simulate([1.0])
-
-
 def test_a_failure_says_how_many_bars_had_fractured(column):
     """Seven times the weight: the core alone does not carry it in bending."""
     model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02, axial_load=16e6)
@@ -137,18 +97,11 @@ def test_a_failure_says_how_many_bars_had_fractured(column):
         model.simulate([1.0])
 
 
-def test_default_slenderness_is_that_between_hoops(column):
-    model = replace(column, buckling=BarBuckling())
-    assert model.nominal["slenderness"] == pytest.approx(column.hoops.spacing / column.bars.diameter)
-    given = replace(column, buckling=BarBuckling(model.nominal["slenderness"]))
-    np.testing.assert_array_equal(model.simulate([1.0]), given.simulate([1.0]))
-
-
 def test_parameters_are_multiples_of_the_arguments(column):
-    free = replace(column, fatigue=WEAK, buckling=SLENDER, parameters=("Cf", "Cd", "slenderness"))
-    fixed = replace(column, fatigue=LowCycleFatigue(1.2 * 0.09, 0.506, 0.9 * 0.389), buckling=BarBuckling(1.1 * 10.0))
-    np.testing.assert_allclose(free.simulate([1.2, 0.9, 1.1]), fixed.simulate([1.0]), rtol=1e-9)
-    assert not np.array_equal(free.simulate([1.2, 0.9, 1.1]), free.simulate([1.0, 1.0, 1.0]))
+    free = replace(column, fatigue=WEAK, parameters=("Cf", "Cd"))
+    fixed = replace(column, fatigue=LowCycleFatigue(1.2 * 0.09, 0.506, 0.9 * 0.389))
+    np.testing.assert_allclose(free.simulate([1.2, 0.9]), fixed.simulate([1.0]), rtol=1e-9)
+    assert not np.array_equal(free.simulate([1.2, 0.9]), free.simulate([1.0, 1.0]))
 
 
 def test_a_loss_of_strength_beyond_all_strength_fails(column):
@@ -224,15 +177,16 @@ def test_a_drift_beyond_the_limit_is_a_collapse():
 
 
 def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_failed(column):
+    """The simulation that fails has lost three quarters of its bars; the reason is that of the larger part."""
     model = replace(column, fatigue=LowCycleFatigue(cf=0.036, cd=0.389), max_increment=0.02)
-    with pytest.raises(SimulationFailed) as error:
+    with pytest.raises(SimulationFailed, match="bars with 78% of the area") as error:
         replace(model, axial_load=16e6).simulate([1.0])
-    lost = float(re.search(r"bars with (\d+)% of the area", error.value.reason)[1])
-    assert is_collapse(error.value.reason) == (lost > 50.0)
-    failing = dict(fatigue=LowCycleFatigue(cf=0.037, cd=0.389), buckling=BarBuckling(10.8), max_increment=0.02)
-    with pytest.raises(SimulationFailed, match="bars with 33% of the area") as error:
-        weakened(column, (0.01, 0.03, 0.05, 0.07), axial_load=0.53e6, **failing).simulate([1.0])
-    assert not is_collapse(error.value.reason)
+    assert is_collapse(error.value.reason)
+    sections = golden.column(golden.circle(), bars_fail=True).sections
+    for fractured, collapsed in ((1, False), (sections.steel_memory.shape[1], True)):
+        sections.steel_memory[0, :fractured, bar_fatigue.FRACTURED] = 1.0
+        reason = reason_of_failure(7, 20, "", 3, sections)
+        assert "had fractured before" in reason and is_collapse(reason) == collapsed
 
 
 @pytest.mark.parametrize(
@@ -240,9 +194,7 @@ def test_a_column_without_its_bars_has_collapsed_and_one_with_most_of_them_has_f
     [
         (dict(collapse_drift=0.0), "positive"),
         (dict(parameters=("Cf",)), "add fatigue=LowCycleFatigue"),
-        (dict(parameters=("slenderness",)), "add buckling=BarBuckling"),
         (dict(fatigue=0.26), r"expected LowCycleFatigue\(...\) as fatigue"),
-        (dict(buckling="yes"), r"expected BarBuckling\(...\) as buckling"),
     ],
 )
 def test_wrong_options(column, changes, message):
@@ -257,8 +209,6 @@ def test_wrong_values():
         LowCycleFatigue(alpha=2.0)
     with pytest.raises(ValueError, match="cd of at least cf"):
         LowCycleFatigue(cf=0.26, cd=0.2)
-    with pytest.raises(ValueError, match="positive slenderness"):
-        BarBuckling(slenderness=-1.0)
 
 
 def test_fingerprint_covers_the_options(column):
@@ -266,9 +216,8 @@ def test_fingerprint_covers_the_options(column):
         column.fingerprint,
         replace(column, fatigue=WEAK).fingerprint,
         replace(column, fatigue=LowCycleFatigue()).fingerprint,
-        replace(column, buckling=SLENDER).fingerprint,
     }
-    assert len(prints) == 4
+    assert len(prints) == 3
 
 
 def test_the_warning_about_fracture_names_the_option(column, caplog):
@@ -287,33 +236,20 @@ def test_the_warning_about_fracture_names_the_option(column, caplog):
 
 
 def test_material_and_section_curves_include_the_failure(column):
-    model = replace(column, fatigue=WEAK, buckling=SLENDER)
+    model = replace(column, fatigue=WEAK)
     strains = [0.03, -0.03] * 6
     curves = [material_curves(m, [1.0], steel=strains)[2].stress for m in (column, model)]
-    stress, state = np.empty_like(curves[1]), np.zeros(bar_fatigue_buckling.N_STATE)
+    stress, state = np.empty_like(curves[1]), np.zeros(bar_fatigue.N_STATE)
     values = model.physical_values(np.ones(1))
     s = column.steel
     moduli = (values[name] for name in ("fy", "fu", "Es", "Esh"))
     c = golden.steel_constants((*moduli, s.hardening_strain, s.ultimate_strain))
-    f = np.zeros(bar_fatigue_buckling.N_FAILURE)
-    bar_fatigue_buckling.constants(c, values["fy"], 0.09, 0.506, 0.389, 10.0, 1.0, f)
-    bar_fatigue_buckling.stress_history(material_curves(model, [1.0], steel=strains)[2].strain, state, c, f, stress)
+    f = np.zeros(bar_fatigue.N_FAILURE)
+    bar_fatigue.constants(0.09, 0.506, 0.389, f)
+    bar_fatigue.stress_history(material_curves(model, [1.0], steel=strains)[2].strain, state, c, f, stress)
     np.testing.assert_array_equal(curves[1], stress)
     assert np.abs(curves[0] - curves[1]).max() > 50e6
 
     there = np.concatenate([np.linspace(0.0, 0.04, 30), np.linspace(0.04, -0.04, 60)])
     moments = [moment_curvature(m, [1.0], there).moment for m in (column, model)]
     assert abs(moments[1][-1]) < 0.97 * abs(moments[0][-1])
-
-
-def test_an_earthquake_continues_from_a_damaged_state():
-    """A run in two parts has the bits of one run, memory of fatigue and buckling included."""
-    record = bridge_column_data().record.scale(4.0).trim(5.0, 11.0)
-    model = RCColumn.lhpost(record, fatigue=WEAK, buckling=SLENDER)
-    theta = np.ones(5)
-    whole = model.simulate(theta)
-    first = model.first(3.0)
-    start = first.simulate_from(theta)
-    rest = model.simulate_from(theta, start.state)
-    np.testing.assert_array_equal(np.concatenate([start.response, rest.response], axis=1), whole)
-    assert 0.0 < model.history(theta).bar_damage.max() < 1.0

@@ -172,7 +172,7 @@ def test_stresses_balance_the_forces_of_the_section(changes):
     fibers = np.concatenate([core, cover, bars])
     numbers = [*range(len(core) + len(cover)), *(-1 - k for k in range(len(bars)))]
     outputs = tuple(Output(str(k), "stress", "Pa", None, fiber=(0, k)) for k in numbers)
-    run = run_column(column, prepare_column(column, outputs), np.ones(1), None)
+    run = run_column(column, prepare_column(column, outputs), np.ones(1))
     forces = np.array([run.outputs[str(k)] for k in numbers]) * fibers[:, 1:]
     force, moment = run.history["base axial force"], run.history["base moment"]
     np.testing.assert_allclose(forces.sum(axis=0), force, rtol=1e-9)

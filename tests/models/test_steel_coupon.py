@@ -12,13 +12,12 @@ from fe_likelihoods import (
     Posterior,
     SimulationFailed,
     Steel,
-    SteelCoupon,
     TruncatedNormal,
     plot_response,
     propagate,
 )
 from fe_likelihoods.kernels import reinforcing_steel
-from fe_likelihoods.models.steel_coupon import PARAMETERS
+from tutorials.steel_coupon import PARAMETERS, SteelCoupon
 
 STEEL = Steel(fy=450e6, fu=650e6, es=200e9, esh=5e9, hardening_strain=0.01, ultimate_strain=0.12)
 FIELDS = dict(zip(PARAMETERS, ("fy", "fu", "es", "esh", "hardening_strain", "ultimate_strain"), strict=True))
@@ -63,12 +62,6 @@ def test_parameters_are_multiples_of_nominal_values(coupon, name):
     assert one.nominal == coupon.nominal
 
 
-def test_fingerprint_depends_on_the_strains(coupon):
-    assert coupon.with_record(CYCLES).fingerprint == coupon.fingerprint
-    assert coupon.with_record(1.0001 * CYCLES).fingerprint != coupon.fingerprint
-    assert replace(coupon, unit="ksi").fingerprint == coupon.fingerprint
-
-
 def test_the_response_is_plotted_per_step(coupon):
     pytest.importorskip("matplotlib").use("agg")
     (axes,) = plot_response(coupon, np.ones(6)).axes
@@ -80,7 +73,7 @@ def test_the_response_is_plotted_per_step(coupon):
     [
         ([-1, 1, 1, 1, 1, 1], "fy = -"),
         ([1, 1, np.nan, 1, 1, 1], "Es = nan"),
-        ([1, 0.5, 1, 1, 1, 1], "no hardening: fu"),
+        ([1, 0.5, 1, 1, 1, 1], "no hardening"),
         ([1, 0.695, 1, 1, 1, 1], "too close to fy"),
         ([1, 1, 1, 0.01, 1, 1], "Esh = 5e"),
         ([1, 1, 0.1, 1, 1, 1], "plateau"),
@@ -90,27 +83,6 @@ def test_the_response_is_plotted_per_step(coupon):
 def test_parameters_that_describe_no_steel_fail(coupon, theta, words):
     with pytest.raises(SimulationFailed, match=words):
         coupon.simulate(theta)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (dict(strain=[[0.0, 0.1]]), "shape"),
-        (dict(strain=[0.0]), "two or more"),
-        (dict(strain=[0.0, np.inf]), "finite"),
-        (dict(strain=[0.0, -2.0]), "per cent"),
-        (dict(strain=[0.0, 3.0, -3.0]), "largest absolute value of 3'; give engineering strains, not per cent"),
-        (dict(strain=[0.0, np.nan]), "finite"),
-        (dict(steel=450e6), "Steel"),
-        (dict(parameters=("fy", "R")), "parameters out of"),
-        (dict(parameters=("fy", "fy")), "once"),
-        (dict(parameters="fy"), "parameters out of"),
-        (dict(unit="kN"), "kN"),
-    ],
-)
-def test_wrong_arguments_are_rejected(coupon, change, words):
-    with pytest.raises(ValueError, match=words):
-        replace(coupon, **change)
 
 
 def test_a_coupon_works_as_a_model(coupon, rng):

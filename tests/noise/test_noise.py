@@ -136,7 +136,6 @@ NUMBER = "must be a number, .*; got .*to_si"
         ({"groups": (1.0,), "level": "measured"}, "possible are levels in SI units with all groups"),
         ({"window": 1.0}, 'window= is for level="measured" or "response", without bands; got window=1.0'),
         ({"local": 0.5, "level": "measured"}, 'local= is for level="response"'),
-        (RESPONSE | {"growth": 2.0}, "growth= is for deformation=.*got growth=2.0 .*leave it out"),
         ({"scales": (1.0, 1.0)}, 'scales= is for groups="all" in SI units'),
         ({"effective_samples": (1.0, 1.0), "groups": (1.0,)}, 'effective_samples= is for groups="channel"'),
         (RESPONSE | {"window": None}, 'level="response" needs window='),
@@ -157,8 +156,6 @@ NUMBER = "must be a number, .*; got .*to_si"
         ),
         *((RESPONSE | {"local": local}, "local must be from 0") for local in (-0.1, 1.1)),
         *(({"level": "measured", "window": window}, "window must be a positive") for window in (0.0, math.inf)),
-        (RESPONSE | {"deformation": 0.0}, "deformation must be positive"),
-        (RESPONSE | {"deformation": 1.0, "growth": -1.0}, "growth must be zero or more"),
         # no numbers
         *(({"sensor": sensor}, f"sensor {NUMBER}") for sensor in ("0.02 g", {"top": "0.02 g"}, {"top": None})),
         ({"effective_samples": "few"}, f"effective_samples {NUMBER}"),
@@ -166,7 +163,7 @@ NUMBER = "must be a number, .*; got .*to_si"
         *(({"groups": groups}, f"groups {NUMBER}") for groups in (("1 Hz",), None)),
         *(
             (RESPONSE | {name: value}, f"{name} {NUMBER}")
-            for name, value in {"window": "1 s", "sensor": "0.02 g", "local": "half", "deformation": "1 %"}.items()
+            for name, value in {"window": "1 s", "sensor": "0.02 g", "local": "half"}.items()
         ),
     ],
 )

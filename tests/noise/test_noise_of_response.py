@@ -432,7 +432,7 @@ def test_events_have_levels_of_their_own_response(kind, rng):
             alone = own.response_deviations(parameters, part)
             # apart from the parts of the window at both ends, which contain samples of the pause
             np.testing.assert_allclose(both[:, window.samples][:, 30:-30], alone[:, 30:-30], rtol=0.02)
-        assert likelihood.noise.under(LinearOscillator(strong)).excited.events == ()
+        assert likelihood.noise.under(LinearOscillator(strong)).of_parts == ()
     if kind == "shares in bands":  # each event is a stretch, and its density that of its own
         expected = 0.0
         for window in events.windows:

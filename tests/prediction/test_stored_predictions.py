@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Record, SimulationCache, peak, propagate
-from fe_likelihoods.prediction.kept_states import KEPT_STATES
-from fe_likelihoods.simulation.model import ContinuedResponse, SimulationFailed
+from fe_likelihoods.simulation.model import SimulationFailed
 from tests.prediction.flexible import Flexible
 
 RECORD = Record("base", 0.1, np.sin(np.arange(40.0)))
@@ -56,37 +55,6 @@ def test_stored_responses_give_the_same_bits_and_no_simulations(model, tmp_path,
             for attribute in ("mean", "variance", "quantiles", "failed"):
                 np.testing.assert_array_equal(getattr(found[name], attribute), getattr(each, attribute))
             assert found[name].failure_reasons == {"too flexible": 10}
-
-
-class Continued(Flexible):
-    """A structure without memory that can go on from a state, and counts the samples that it simulates."""
-
-    steps: list = []  # noqa: RUF012 - of all copies
-    fingerprint = property(lambda self: f"continued {self.record.acceleration.tobytes().hex()}")
-
-    def simulate(self, theta):
-        self.steps.append(self.n_steps)
-        return super().simulate(theta)
-
-    def simulate_from(self, theta, state=None):
-        done = 0 if state is None else int(state[0])
-        self.steps.append(self.n_steps - done)
-        return ContinuedResponse(super().simulate(theta)[:, done:], np.array([float(self.n_steps)]))
-
-
-def test_a_cache_needs_the_whole_excitation_and_kept_states_do_not(tmp_path, monkeypatch):
-    """As the documentation of `state_bytes` and `cache` says; the results have the same bits."""
-    monkeypatch.setattr(Continued, "steps", [])
-    KEPT_STATES.clear()
-    model, counts, means = Continued(RECORD), [], []
-    for cache in (None, None, tmp_path / "cache.sqlite"):
-        model.steps.clear()
-        means.append(predict(model, cache, "end")["histories"].mean)
-        counts.append(sum(model.steps))
-    whole = 61 * (RECORD.n_steps + 10 + OTHER.n_steps)
-    assert counts == [whole, 61 * OTHER.n_steps, whole]
-    np.testing.assert_array_equal(means[1], means[0])
-    np.testing.assert_array_equal(means[2], means[0])
 
 
 def test_an_interrupted_prediction_goes_on_where_it_was(model, tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 
 from fe_likelihoods import (
     HalfNormal,
@@ -16,8 +16,6 @@ from fe_likelihoods import (
     Uniform,
     fit_mixture,
 )
-from fe_likelihoods.adapters import nautilus_prior
-from fe_likelihoods.priors.multivariate import TruncatedMultivariateNormal
 from samplers import SMCSampler
 from tests.likelihood.linear_gaussian import exact_log_evidence, likelihood_of
 
@@ -60,23 +58,6 @@ def test_draws_and_maps_of_correlated_parameters(rng):
     np.testing.assert_allclose(prior.transform(stats.norm.cdf(z)), prior.from_normal(z), atol=1e-9)
     np.testing.assert_array_equal(prior.rvs(3, 7), prior.rvs(3, 7))
     np.testing.assert_array_equal(prior.transform(stats.norm.cdf(z))[4], prior.transform(stats.norm.cdf(z[4])))
-
-
-@pytest.mark.parametrize("upper", [np.inf, [1.5, 0.4]])
-def test_truncated_normal_is_normalised_and_its_draws_fit(upper):
-    prior = TruncatedMultivariateNormal(MEAN, COVARIANCE, [0.0, -1.0], upper)
-    high = np.minimum(prior.upper, [6.0, 6.0])
-    total = integrate.dblquad(
-        lambda y, x: float(np.exp(prior.logpdf(np.array([x, y])))), 0.0, high[0], -1.0, high[1], epsabs=1e-7
-    )[0]
-    assert total == pytest.approx(1.0, abs=1e-5) and prior.log_probability_error < 1e-4
-    assert prior.logpdf(np.array([[-0.1, 0.0], [0.5, 0.0]])).tolist()[0] == -np.inf
-    draws = Prior({("a", "b"): prior}).rvs(20_000, 3)
-    assert (draws >= prior.lower).all() and (draws <= prior.upper).all()
-    grid = np.stack(np.meshgrid(np.linspace(0, high[0], 200), np.linspace(-1, high[1], 200), indexing="ij"), -1)
-    weights = np.exp(prior.logpdf(grid))
-    expected = (grid * weights[..., None]).sum((0, 1)) / weights.sum()
-    np.testing.assert_allclose(draws.mean(axis=0), expected, atol=0.02)
 
 
 def test_scipy_distributions_are_accepted():
@@ -203,9 +184,7 @@ def test_posterior_with_a_correlated_prior(rng):
     assert posterior.fingerprint != other.fingerprint and len(posterior.fingerprint) == 32
     marginal = posterior.marginal()
     assert marginal.parameter_names == ["a", "c"] and np.isfinite(marginal(point[:2]))
-    with pytest.raises(ValueError, match="needs independent parameters; c, a have a MultivariateNormal"):
-        nautilus_prior(posterior)
-    together = {("a", "c", "sigma_top"): TruncatedMultivariateNormal([1.0, 1.0, 1.0], np.diag([0.5, 0.5, 0.5]))}
+    together = {("a", "c", "sigma_top"): MultivariateNormal([1.0, 1.0, 1.0], np.diag([0.5, 0.5, 0.5]))}
     with pytest.raises(ValueError, match="sigma_top have a joint prior distribution"):
         Posterior(likelihood, together).marginal()
 
@@ -232,10 +211,6 @@ def test_bad_input_is_refused():
     }.items():
         with pytest.raises(ValueError, match=message):
             MultivariateNormal(*arguments)
-    with pytest.raises(ValueError, match="lower < upper"):
-        TruncatedMultivariateNormal(MEAN, COVARIANCE, 1.0, 0.0)
-    with pytest.raises(ValueError, match="must contain 0.001 of the normal distribution or more"):
-        TruncatedMultivariateNormal(MEAN, COVARIANCE, 20.0)
     with pytest.raises(ValueError, match="a, b have a joint distribution and cannot be separated"):
         Prior({("a", "b"): normal}).subset(["a"])
     prior = Prior({"k": HalfNormal(1.0), "c": HalfNormal(1.0)})

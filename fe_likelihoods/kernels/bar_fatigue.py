@@ -1,10 +1,10 @@
-"""Failure of reinforcing bars: low-cycle fatigue with fracture, and buckling in compression.
+"""Failure of reinforcing bars: low-cycle fatigue with fracture.
 
-Both multiply the natural stress s of `reinforcing_steel` by a factor and do not change its rules::
+It multiplies the natural stress s of `reinforcing_steel` by a factor and does not change its rules::
 
-    s_bar = phi_f(D) phi_b(x) s
+    s_bar = phi_f(D) s
 
-**Fatigue.** Every half cycle adds to Miner's sum D according to Coffin and Manson. The plastic strain of a half cycle
+Every half cycle adds to Miner's sum D according to Coffin and Manson. The plastic strain of a half cycle
 that started at (x0, s0) is what remains of its strain after elastic unloading::
 
     D = sum (ep/Cf)^(1/alpha),   ep = |x-x0| - |s-s0|/E0
@@ -14,17 +14,6 @@ The bar loses strength gradually and fractures at D = 1; its stress goes to zero
 law give the half cycles of rainflow counting: a nested reversal starts a new half cycle one level deeper; a curve that
 ends at an earlier reversal closes a loop, after which the interrupted half cycle continues.
 
-**Buckling.** A bar in compression follows the average stress of Dhakal and Maekawa. With the strain z = xr - x from the
-unloaded point xr of the largest tensile strain xs, and L/d the ratio of unsupported length to diameter::
-
-    lp = L/d sqrt(fy/100 MPa),   z* = max(55 - 2.3 lp, 7) yp,   phi* = min(alpha_b (1.1 - 0.016 lp), 1)
-    up to yp   phi_b = 1
-    up to z*   phi_b = 1 - (1-phi*) (z-yp)/(z*-yp)
-    beyond     phi_b = (phi* s_b(z*) - 0.02 E0 (z-z*)) / s_b(z)
-
-but phi_b s_b >= 0.2 fy. In tension a buckled bar becomes straight again at the strain xs; until then the factor grows
-linearly from its value at the lowest strain. The rules for cycles have not been validated by tests of bars.
-
 ``docs/theory/reinforcing_steel.rst`` has the equations and compares them with OpenSees.
 
 References
@@ -33,9 +22,6 @@ S. S. Manson, Fatigue: a complex subject - some simple approximations, Experimen
 doi:10.1007/BF02321056.
 
 J. Brown, S. K. Kunnath, Low-cycle fatigue failure of reinforcing steel bars, ACI Materials Journal 101(6), 2004.
-
-R. P. Dhakal, K. Maekawa, Modeling for postyield buckling of reinforcement, Journal of Structural Engineering 128(9),
-2002, doi:10.1061/(ASCE)0733-9445(2002)128:9(1139).
 
 S. K. Kunnath, Y. Heo, J. F. Mohle, Nonlinear uniaxial material model for reinforcing steel bars, Journal of Structural
 Engineering 135(4), 2009, doi:10.1061/(ASCE)0733-9445(2009)135:4(335).
@@ -48,60 +34,38 @@ import math
 from . import reinforcing_steel
 from .jit import kernel
 from .menegotto_pinto import SB, XB
-from .reinforcing_steel import BRANCH, E0, FYP, MAX_TRANSITIONS, SC, XC, YP, backbone, curve_slot, transition
+from .reinforcing_steel import BRANCH, E0, MAX_TRANSITIONS, SC, XC, curve_slot, transition
 
 __all__ = ["N_FAILURE", "N_STATE", "constants", "stress_history", "stress_tangent", "update"]
 
-# Layout of the failure constants of one steel. CF is 0 without fatigue, END 0 without buckling.
-CF, POWER, LOSS, END, END_FACTOR, END_STRESS, RESIDUAL = range(7)
-N_FAILURE = 7
+# Layout of the failure constants of one steel.
+CF, POWER, LOSS = range(3)
+N_FAILURE = 3
 
-# Layout of one bar's memory, after the memory of `reinforcing_steel`: five scalars, and for each level of branches the
+# Layout of one bar's memory, after the memory of `reinforcing_steel`: two scalars, and for each level of branches the
 # start of its half cycle, the damage before it, and the damage that it had done when the path reversed.
-DAMAGE, FRACTURED, UNLOADED, STRAIGHT, LOWEST, HALF_CYCLES = range(
-    reinforcing_steel.N_STATE, reinforcing_steel.N_STATE + 6
-)
+DAMAGE, FRACTURED, HALF_CYCLES = range(reinforcing_steel.N_STATE, reinforcing_steel.N_STATE + 3)
 START_X, START_S, BEFORE, REVERSED = range(4)
 N_LEVELS = 10
 N_STATE = HALF_CYCLES + 4 * N_LEVELS
 
 FRACTURE_RANGE = 0.04  # of Miner's sum, over which the stress goes to zero
-MPA_100 = 100e6  # unit of the yield strength in the formulas of Dhakal and Maekawa [Pa]
 
 
 @kernel
-def constants(steel, fy, cf, alpha, cd, slenderness, alpha_b, out):
+def constants(cf, alpha, cd, out):
     """Fill `out` with the failure constants of one steel.
 
     Parameters
     ----------
-    steel : ndarray (reinforcing_steel.N_CONSTANTS,)
-        Constants of the law, in SI units.
-    fy : float
-        Yield strength [Pa].
     cf, alpha, cd : float
-        Coefficient and exponent of Coffin and Manson, and coefficient of strength loss; no fatigue if `cf` is 0.
-    slenderness : float
-        Unsupported length of the bar divided by its diameter; no buckling if it is 0.
-    alpha_b : float
-        Factor of the stress at the end of the first branch after buckling: 1 for steel that hardens, 0.75 for steel
-        that does not.
+        Coefficient and exponent of Coffin and Manson, and coefficient of strength loss.
     out : ndarray (N_FAILURE,)
         Overwritten.
     """
-    for i in range(N_FAILURE):
-        out[i] = 0.0
-    if cf > 0.0:
-        out[CF] = cf
-        out[POWER] = 1.0 / alpha
-        out[LOSS] = (cf / cd) ** (1.0 / alpha)
-    if slenderness > 0.0:
-        lp = slenderness * math.sqrt(fy / MPA_100)
-        out[END] = max(55.0 - 2.3 * lp, 7.0) * steel[YP]
-        out[RESIDUAL] = 0.2 * steel[FYP]
-        s, _ = backbone(out[END], steel)
-        out[END_FACTOR] = max(min(alpha_b * (1.1 - 0.016 * lp), 1.0), out[RESIDUAL] / s)
-        out[END_STRESS] = out[END_FACTOR] * s
+    out[CF] = cf
+    out[POWER] = 1.0 / alpha
+    out[LOSS] = (cf / cd) ** (1.0 / alpha)
 
 
 @kernel
@@ -119,22 +83,6 @@ def half_cycle_damage(dx, ds, c, f):
         return 0.0, 0.0
     d = (plastic / f[CF]) ** f[POWER]
     return d, f[POWER] * d / plastic
-
-
-@kernel
-def buckling_factor(z, c, f):
-    """Return the factor of a bar at the compressive strain `z` from its unloaded point, and the factor's derivative."""
-    if z <= c[YP]:
-        return 1.0, 0.0
-    if z <= f[END]:
-        slope = -(1.0 - f[END_FACTOR]) / (f[END] - c[YP])
-        return 1.0 + slope * (z - c[YP]), slope
-    s, modulus = backbone(z, c)
-    stress = f[END_STRESS] - 0.02 * c[E0] * (z - f[END])
-    slope = -0.02 * c[E0]
-    if stress < f[RESIDUAL]:
-        stress, slope = f[RESIDUAL], 0.0
-    return stress / s, (slope - stress * modulus / s) / s
 
 
 @kernel
@@ -203,42 +151,23 @@ def update(eps, state, c, f):
         done, s, modulus = transition(x, state, c)
         if done:
             break
-        if f[CF] > 0.0:
-            _count(old, int(state[BRANCH]), state[XC], state[SC], state, c, f)
+        _count(old, int(state[BRANCH]), state[XC], state[SC], state, c, f)
     state[XC] = x
     state[SC] = s
-    factor, slope = 1.0, 0.0
-    if f[CF] > 0.0:
-        k = _half_cycle((int(state[BRANCH]) + 1) // 2)
-        dx, ds = x - state[k + START_X], s - state[k + START_S]
-        d, d_slope = half_cycle_damage(dx, ds, c, f)
-        total = state[k + BEFORE] + d
-        state[DAMAGE] = total
-        loss = f[LOSS]
-        factor = 1.0 - loss * total
-        if total > 1.0:
-            factor -= (total - 1.0) / FRACTURE_RANGE
-            loss += 1.0 / FRACTURE_RANGE
-        if factor <= 0.0:
-            state[FRACTURED] = 1.0
-            return 0.0, 0.0
-        slope = -loss * d_slope * (math.copysign(1.0, dx) - math.copysign(1.0, ds) * modulus / c[E0])
-    if f[END] > 0.0:
-        buckled, by_x = 1.0, 0.0
-        if s < 0.0:
-            buckled, by_z = buckling_factor(state[UNLOADED] - x, c, f)
-            by_x = -by_z
-            state[LOWEST] = min(state[LOWEST], x)
-        elif x >= state[STRAIGHT]:
-            state[STRAIGHT] = x
-            state[LOWEST] = x
-            state[UNLOADED] = x - s / c[E0]
-        else:
-            lowest, _ = buckling_factor(state[UNLOADED] - state[LOWEST], c, f)
-            by_x = (1.0 - lowest) / (state[STRAIGHT] - state[LOWEST]) if lowest < 1.0 else 0.0
-            buckled = 1.0 - by_x * (state[STRAIGHT] - x)
-        slope = slope * buckled + factor * by_x
-        factor *= buckled
+    k = _half_cycle((int(state[BRANCH]) + 1) // 2)
+    dx, ds = x - state[k + START_X], s - state[k + START_S]
+    d, d_slope = half_cycle_damage(dx, ds, c, f)
+    total = state[k + BEFORE] + d
+    state[DAMAGE] = total
+    loss = f[LOSS]
+    factor = 1.0 - loss * total
+    if total > 1.0:
+        factor -= (total - 1.0) / FRACTURE_RANGE
+        loss += 1.0 / FRACTURE_RANGE
+    if factor <= 0.0:
+        state[FRACTURED] = 1.0
+        return 0.0, 0.0
+    slope = -loss * d_slope * (math.copysign(1.0, dx) - math.copysign(1.0, ds) * modulus / c[E0])
     modulus = factor * modulus + slope * s
     s *= factor
     return s / (1.0 + eps), (modulus - s) / ((1.0 + eps) * (1.0 + eps))
