@@ -186,7 +186,7 @@ def from_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArr
 
 
 def _lookup(name: str) -> Unit | None:
-    text = re.sub(r"\s+", "", name)
+    text = re.sub(r"\s+", "", name).removesuffix(".")  # an abbreviation, or the end of a sentence
     if text in UNITS:
         return UNITS[text]
     if text.lower() in _MICROSTRAIN:

@@ -43,10 +43,10 @@ _FORMATS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
     "knet": (read_knet, ()),
     "esm": (read_esm, ()),
     "obspy": (read_obspy, ("units", "column")),
-    "csv": (read_csv, ("units", "dt", "column", "time_unit", "skip", "resample")),
+    "csv": (read_csv, ("units", "dt", "column", "time", "time_unit", "skip", "resample")),
     "dataset": (read_dataset, ()),
 }
-_TABLE_KEYS = ("dt", "time_unit", "skip")
+_TABLE_KEYS = ("dt", "time", "time_unit", "skip")
 _HDF5 = (".h5", ".hdf5")
 
 
@@ -101,11 +101,9 @@ def read_base_motion(job: Job) -> Record | None:
 def _read_record(job: Job, path: Path) -> Record:
     given = job.record
     name = given.get("format", "dataset" if path.suffix.lower() in _HDF5 else None)
-    if name is None and any(key in given for key in _TABLE_KEYS):
-        name = "csv"
     if name is None:
-        channel = given.get("channel", given.get("column"))
-        return read_record(path, channel, given.get("units"), resample=given.get("resample"))
+        keys = ("channel", "column", "units", "resample", *_TABLE_KEYS)
+        return read_record(path, **{key: given[key] for key in keys if key in given})
     if name not in _FORMATS:
         raise ValueError(f"format: unknown format {name!r}; {did_you_mean(name, tuple(_FORMATS))}")
     reader, names = _FORMATS[name]
@@ -168,7 +166,9 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
             f"{', '.join(missing)}"
         )
-    options = {key: given[key] for key in ("dt", "time_unit", "skip", "zero", "missing", "resample") if key in given}
+    options = {
+        key: given[key] for key in ("dt", "time", "time_unit", "skip", "zero", "missing", "resample") if key in given
+    }
     return read_columns(
         path,
         [by_name[name] for name in chosen],

@@ -14,8 +14,8 @@ from ..signals.readers import read_record, recognise_reader
 from ..signals.records import Record
 from ..signals.smc_geonet_knet_esm_formats import parse_geonet
 from ..signals.table_columns import column_values
-from ..signals.table_times import nominal_step, row_times, table_step, time_column
-from ..signals.tables import Table, read_table, stated_unit
+from ..signals.table_times import row_times, table_step, time_column
+from ..signals.tables import Table, column_names, read_table, stated_unit
 from ..signals.text_files import read_text
 from ..signals.uneven_times import uniform_times
 from ..text_tables import number, text_table
@@ -96,8 +96,9 @@ def _inline(pairs: list[tuple[str, str | int]]) -> str:
 
 def _v2(path: Path) -> _Lines:
     channels = find_v2_channels(path)
-    numbers = [channel.channel for channel in channels]
+    numbers, files = [channel.channel for channel in channels], [channel.file for channel in channels]
     rows, columns, refused = [("channel", *_HEAD, "label", "file")], [], []
+    taken: set[str] = set()
     for channel in channels:
         file = channel.file.removeprefix(f"{path}/") if channel.file != str(path) else path.name
         alone = channel.channel is not None and numbers.count(channel.channel) == 1
@@ -105,14 +106,17 @@ def _v2(path: Path) -> _Lines:
         try:
             series = parse_v2(channel)
             values = to_si(series.values, series.unit, "acceleration")
+            step = series.dt if series.times is None else uniform_times(series.times, None, channel.file).step
         except ValueError as error:
             refused.append(f"not read: {error}")
             continue
-        step = series.dt if series.times is None else float(np.median(np.diff(series.times)))
         rows.append((str(channel.channel or "-"), *_cells(values, step), channel.label, file))
         if series.times is not None:
-            refused.append(f"uneven times in channel {column}: give resample = {nominal_step(step):.4g}")
-        columns.append((f"ch{channel.channel}" if alone else _name_of_channel(file, set()), column))
+            refused.append(f"uneven times in channel {column}: give resample = {step:.6g}")
+        if not alone and files.count(channel.file) > 1:
+            refused.append(f"{file} has channel {channel.channel or '-'} and others, which it does not number apart")
+            continue
+        columns.append((_name_of_channel(f"ch{channel.channel}" if alone else file, taken), column))
     text = [f"{len(columns)} channels of acceleration", text_table(rows), *refused]
     if len({row[1:3] for row in rows[1:]}) > 1:
         text.append(
@@ -131,10 +135,17 @@ def _geonet(path: Path) -> _Lines:
     rows = [("component", *_HEAD)]
     for each in components:
         rows.append((each.component, *_cells(to_si(each.series.values, each.series.unit), each.series.dt)))
-    names = [(_name_of_channel(each.component, set()), each.component) for each in components]
+    given, taken = [each.component for each in components], set[str]()
+    names = [(_name_of_channel(name, taken), name) for name in given if given.count(name) == 1]
+    text = [f"{len(components)} components of acceleration", text_table(rows)]
+    text += [f"the component {name!r} is there {given.count(name)} times" for name in given if given.count(name) > 1][
+        :1
+    ]
+    if not names:
+        return _Lines(text)
     return _Lines(
-        [f"{len(components)} components of acceleration", text_table(rows)],
-        [f"column = {_quoted(components[0].component)}"],
+        text,
+        [f"column = {_quoted(names[0][1])}"],
         [f"columns = {_inline(names)}    # channel of the model = component"],
     )
 
@@ -171,14 +182,12 @@ def _dataset(path: Path) -> _Lines:
 
 def _table(path: Path) -> _Lines:
     table = read_table(path)
-    if not table.names:
-        raise ValueError(f"{path}: the table has {table.values.shape[1]} columns without names; write a header line")
     place = time_column(table)
     options, remarks = _sampling(table, place)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks = [], [], set()
     taken: set[str] = set()
-    for k, name in enumerate(table.names):
+    for k, name in enumerate(column_names(table)):
         if k in table.dates or k in table.clocks or k == place:
             continue
         values = table.values[:, k]
@@ -194,7 +203,7 @@ def _table(path: Path) -> _Lines:
         if table.names.count(name) > 1:
             remarks.append(f"the name {name!r} is that of several columns: rename them")
             continue
-        channel = _name_of_channel(name, taken)
+        channel = _name_of_channel(name if table.names else f"column {name}", taken)
         columns.append((channel, name))
         if unit is None or not _is_unit(unit):
             unstated.append((channel, "?"))
@@ -239,16 +248,15 @@ def _sampling(table: Table, place: int | None) -> tuple[list[str], list[str]]:
             return ['dt = "? s"    # write it: the file has no times'], ["no column of times"]
         try:
             times = row_times(table)
-            usual = np.diff(times)
-            nominal = nominal_step(float(np.median(usual)))
-            even = uniform_times(times, nominal, table.file)
+            even = uniform_times(times, None, table.file)
         except ValueError:
             return [], [f"times: {error}"]
-        return [f"resample = {nominal:.6g}"], [
-            f"times: uneven, steps of {usual.min():.4g} to {usual.max():.4g} s"
+        steps = np.diff(times)
+        return [f"resample = {even.step:.6g}"], [
+            f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
             + (f", {even.gaps.size} gap(s) of up to {even.gaps.max():.4g} s" if even.gaps.size else "")
         ]
-    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {table.names[place]!r}"
+    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {column_names(table)[place]!r}"
     if table.clock is not None:
         start += f", first clock time {_clock_text(table)}"
     return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"]

@@ -189,7 +189,7 @@ def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
     return {part: documented_keys(_in_models(f"{module}.{name}")) for part, name in names.items()}
 
 
-_TABLE = documented_keys(read_csv, "time_unit dt skip resample", skip="whole number >= 0")
+_TABLE = documented_keys(read_csv, "time time_unit dt skip resample", time="text", skip="whole number >= 0")
 SECTIONS: dict[str, tuple[Key, ...]] = {
     "record": (
         Key(

@@ -36,27 +36,31 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .header_statements import check_peaks, read_statements
 from .text_files import (
     NUMBER,
     Series,
     check_count,
     check_peak,
     decimals_of,
+    decode_text,
     fixed_width_samples,
     is_number,
+    number_cells,
     parse_count,
     parse_number,
     read_bytes,
 )
+from .uneven_times import without_repeated_times
 
 __all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
 
 # Expressions are searched from one place in a line, and their parts never match the same text: their time is linear.
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
-_AT2_STEP = re.compile(rf"DT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
+_AT2_STEP = re.compile(rf"\bDT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
 _AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
 _SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
-_UNITS_OF = re.compile(r"UNITS\s+OF\s+([^\s,;]+?)[.]?(?=[\s,;]|$)", re.IGNORECASE)
+_UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
 _CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
 _CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
 _CSMIP_END = re.compile(r"^\s*/&")
@@ -72,6 +76,7 @@ _V1_UNITS = re.compile(r"units\s+of\s+uncor\s+\w+\s+are\s+sec\s+and\s+(g/10|g)\b
 _V1_TEXT, _V1_INTEGERS, _V1_REALS = 13, (100, 16, 5), (50, 8, 10)  # lines; numbers, per line, columns
 _V1_COUNT, _V1_LENGTH, _V1_PEAK, _V1_PAIRS = 28, 3, 7, (10, 7)  # positions in the headers, from 1
 _V1_HEADER = _V1_TEXT + math.ceil(100 / 16) + math.ceil(50 / 8)
+_V2_TEXT = 25
 _CSMIP_FORMAT = (8, 10)  # numbers per line, columns per number
 _CSMIP_REALS, _CSMIP_DT = (
     100,
@@ -133,7 +138,11 @@ def parse_at2(text: str, file: str) -> Series:
             f"{len(lines)} lines; read plain columns of numbers with read_csv"
         )
     units = _UNITS_OF.search("\n".join(lines[:index]))
-    fields = [(index + offset, field) for offset, row in enumerate(lines[index + 1 :], 2) for field in row.split()]
+    rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
+    while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
+        rows.pop()  # a closing remark in any words: the number of samples is stated
+    cells = number_cells([row for _, row in rows])
+    fields = [(number, field) for (number, _), row in zip(rows, cells, strict=True) for field in row]
     values = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
     where = f"{file}: NPTS in line {index + 1}"
     check_count(values.size, parse_count(stated[0], where), where)
@@ -148,7 +157,7 @@ def parse_at2(text: str, file: str) -> Series:
 
 def _at2_header(line: str) -> tuple[str, str, str] | None:
     """Number of samples, step and unit of the step, as stated in a line of an AT2 header; None for other lines."""
-    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line, count.end())):
+    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line)):
         return count[1], step[1], step[2]
     old = _AT2_OLD.match(line)
     return (old[1], old[2], "") if old else None
@@ -158,15 +167,17 @@ def find_v2_channels(path: str | Path, member: str | None = None) -> list[V2Chan
     """Return the channels with acceleration in a V1 or V2 file, or in the V2, else V1 files of an archive."""
     content = read_bytes(path)
     files = list(_unzip(content, str(path))) if zipfile.is_zipfile(io.BytesIO(content)) else [(str(path), content)]
+    files = list(dict.fromkeys(files))  # an archive may hold the same file twice
     if member is not None:
-        files = [(name, data) for name, data in files if name.lower().endswith(member.lower())]
+        exact = [(name, data) for name, data in files if name == f"{path}/{member}"]
+        files = exact or [(name, data) for name, data in files if name.lower().endswith(member.lower())]
     elif len(files) > 1:  # corrected acceleration, if there is any
         for ends in ((".v2", ".v2c"), (".v1", ".v1c")):
             found = [(name, data) for name, data in files if name.lower().endswith(ends)]
             if found:
                 break
         files = found
-    channels = [channel for name, data in files for channel in _split_v2(data.decode("latin-1"), name)]
+    channels = [channel for name, data in files for channel in _split_v2(decode_text(data), name)]
     if not channels:
         raise ValueError(
             f"{path}: expected a CSMIP or COSMOS V1 or V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT "
@@ -219,6 +230,9 @@ def parse_v2(channel: V2Channel) -> Series:
         )
     count = parse_count(match[1], f"{where}, line {channel.first + index}")
     values = _fixed_width(channel, index + 1, count, (per_line, width))
+    if _CSMIP_DATA.match(line):
+        decimals = decimals_of(lines[index + 1][:width].strip())
+        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, where)
     return Series(channel.label + uncorrected, dt, unit, values)
 
 
@@ -263,7 +277,12 @@ def _parse_v1(channel: V2Channel) -> Series:
     largest = scale * float(np.abs(values).max())
     if unit.lower() in ("g", "g/10"):
         check_peak(largest, abs(float(peak)), rounding, where)
-    return Series(f"{channel.label}, uncorrected", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times)
+    note = ""
+    if times is not None:
+        times, values, note = without_repeated_times(times, values)
+    return Series(
+        f"{channel.label}, uncorrected{note}", dt, "g" if unit.lower() == "g/10" else unit, scale * values, times
+    )
 
 
 class _Allowance:

@@ -1,4 +1,4 @@
-"""Clock times in tables, ``03:19:53.010``, ``2019-07-06T03:19:53.010Z`` or ``06.07.2019 03:19:53``, and dates.
+"""Clock times in tables, ``03:19:53.010``, ``2019-07-06T03:19:53.010Z`` or ``06.07.2019 03:19:53 PM``, and dates.
 
 The year is first, or last after points. Dates with slashes and the year last may begin with the day or the month.
 """
@@ -13,7 +13,8 @@ __all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_mid
 
 _DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\d{1,4})"
 _TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
-_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}(?: ?([AP]M|Z|UTC|[-+]\d{{2}}:?\d{{2}}))?", re.IGNORECASE)
+_AFTER = r"(?:[ \u00a0\u202f]?(?:([AP])\.?M\.?|(Z|UTC|[-+]\d{2}:?\d{2})))?"
+_CLOCK = re.compile(rf"(?:{_DATE}(?:T| +))?{_TIME}{_AFTER}", re.IGNORECASE)
 _DAY_ONLY = re.compile(_DATE)
 _HOUR, _DAY = 3600, 86400
 
@@ -31,12 +32,15 @@ class ClockTime(NamedTuple):
         Digits after the decimal point of the seconds.
     zone : int or None
         Time zone: minutes by which the clock is before UTC, None without one.
+    halves : bool
+        Whether the clock has hours from 1 to 12 with AM and PM.
     """
 
     day: int | None
     seconds: float
     decimals: int
     zone: int | None
+    halves: bool = False
 
 
 def is_clock(cell: str) -> bool:
@@ -56,16 +60,15 @@ def parse_clock(cell: str, where: str) -> ClockTime:
         raise ValueError(
             f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
         )
-    if cell[-1] in "Mm":
-        raise ValueError(
-            f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}: write it without AM and PM"
-        )
-    *_, hour, minute, second, fraction, zone = found.groups()
+    *_, hour, minute, second, fraction, half, zone = found.groups()
+    if half and not 1 <= int(hour) <= 12:
+        raise ValueError(f"{where}: clock times with AM and PM have hours from 1 to 12; got {cell[:100]!r}")
     if int(hour) > 24:
         raise ValueError(f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}")
+    hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
     number = None if found["first"] is None else _day_number(found, where)
-    whole = 3600 * int(hour) + 60 * int(minute) + int(second)
-    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""), _minutes(zone))
+    whole = 3600 * hours + 60 * int(minute) + int(second)
+    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""), _minutes(zone), bool(half))
 
 
 def _day_number(found: re.Match[str], where: str) -> int:
@@ -99,8 +102,8 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
     Raises
     ------
     ValueError
-        If some times have a date and others have none, time zones differ, or 1 o'clock follows 12 o'clock, as on a
-        12-hour clock.
+        If some times have a date, or AM and PM, and others have none, time zones differ, or 1 o'clock follows 12
+        o'clock, as on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
     dates = {time.day is None for time in known}
@@ -108,12 +111,14 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
         raise ValueError(f"{where}: expected a date in all clock times or in none; write them alike")
     if len(zones := {time.zone for time in known}) > 1:
         raise ValueError(f"{where}: expected one time zone in all clock times, got {len(zones)}; write them alike")
+    if len(halves := {time.halves for time in known}) > 1:
+        raise ValueError(f"{where}: expected AM or PM in all clock times or in none; write them alike")
     day, last, found = 0, 0.0, []
     for time in times:
         if time is None:
             found.append(float("nan"))
             continue
-        if 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
+        if True not in halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
             raise ValueError(
                 f"{where}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
                 "to 23"

@@ -15,10 +15,9 @@ from ..units import to_si
 from .channels import Channel, Measurements
 from .readers import read_record, recognise_reader
 from .records import DisplacementHistory
-from .table_columns import column_values, value_column, warn_if_absent
+from .table_columns import column_values, unit_of_column, value_column, warn_if_absent
 from .table_times import row_times, table_start, table_step
-from .tables import Table, read_table, stated_unit
-from .text_files import agree_on_unit
+from .tables import Table, read_table
 from .uneven_times import uniform_times
 
 __all__ = ["ImposedTest", "read_columns", "read_imposed_test"]
@@ -47,6 +46,7 @@ def read_columns(
     dt: float | None = None,
     description: str = "",
     *,
+    time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
     zero: float | str = 0.0,
@@ -67,7 +67,8 @@ def read_columns(
     channels : sequence of Channel
         The measured channels.
     columns : sequence of str or int
-        Names of the columns in the header line, one per channel; for other files as `channel` of `read_record`.
+        Names of the columns in the header line, or without one their numbers, from 1; one per channel. For other files
+        as `channel` of `read_record`.
     units : str or sequence of str, optional
         Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
         unit (``disp_in``). If both are given, they must agree.
@@ -75,6 +76,8 @@ def read_columns(
         Time step [s], needed for a file without times.
     description : str, optional
         Description of the measurements.
+    time : str or int, optional
+        Name or number of the column of times, if it is not found, as in `read_csv`.
     time_unit : str, optional
         Unit of the times, if the column name does not end with it.
     skip : int, optional
@@ -105,12 +108,13 @@ def read_columns(
         or a cell is not a finite number.
     """
     if (reader := recognise_reader(path)) is not None:
-        if not all(option is None for option in (units, dt, time_unit, skip, missing)):
+        if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
             raise ValueError(
-                f"{path}: a file for {reader} states units and times; leave units, dt, time_unit, skip and missing out"
+                f"{path}: a file for {reader} states units and times; leave units, dt, time, time_unit, skip and "
+                "missing out"
             )
         return _recorded(path, channels, columns, description, zero, resample)
-    table = read_table(path, skip, time_unit)
+    table = read_table(path, skip, time_unit, time)
     values = _channel_values(table, channels, columns, units, missing)
     warn_if_absent(table, [value_column(table, column) for column in columns], missing, stacklevel=2)
     if resample is None:
@@ -222,6 +226,6 @@ def _channel_values(
     for channel, column, unit in zip(channels, columns, given, strict=True):
         place = value_column(table, column)
         where = f"{table.file}, column {column!r}"
-        unit = agree_on_unit(stated_unit(table, place, channel.dimension), unit, channel.dimension, where)
-        rows.append(to_si(column_values(table, place, missing), unit))
+        values = column_values(table, place, missing)
+        rows.append(to_si(values, unit_of_column(table, place, values, unit, channel.dimension, where)))
     return np.array(rows)

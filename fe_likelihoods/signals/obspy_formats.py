@@ -23,7 +23,7 @@ def parse_obspy(path: str | Path, channel: str | None) -> Series:
             f"reading {path} needs the package obspy: install it with pip install obspy, or write the record as CSV"
         ) from error
     content = read_bytes(path)
-    form = _FORMATS.get(recognise(content[:8000].decode("latin-1"))[0])
+    form = _FORMATS.get(recognise(content)[0])
     if form is None:
         raise ValueError(f"{path}: expected a file in {', '.join(_FORMATS)}")
     try:

@@ -16,8 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from ..units import to_si
 from . import at2_v2_formats, obspy_formats, smc_geonet_knet_esm_formats
 from .records import Record
@@ -65,9 +63,7 @@ def read_at2(path: str | Path, units: str | None = None) -> Record:
         If the file does not exist, has no header or no unit, contains another quantity than acceleration, has another
         number of samples than NPTS, or has a sample that is not a finite number.
     """
-    with named_format(path, "read_at2"):
-        series = at2_v2_formats.parse_at2(read_text(path), str(path))
-    return _record(series, units, path, Path(path).stem)
+    return _read("read_at2", path, units)
 
 
 def read_smc(path: str | Path, resample: float | None = None) -> Record:
@@ -91,9 +87,7 @@ def read_smc(path: str | Path, resample: float | None = None) -> Record:
         If the file does not exist, is no SMC file of acceleration, or does not have the number of samples and the peaks
         that its header states.
     """
-    with named_format(path, "read_smc"):
-        series = smc_geonet_knet_esm_formats.parse_smc(read_text(path), str(path))
-    return _record(series, None, path, Path(path).stem, resample)
+    return _read("read_smc", path, resample=resample)
 
 
 def read_geonet(path: str | Path, component: str | None = None) -> Record:
@@ -117,15 +111,7 @@ def read_geonet(path: str | Path, component: str | None = None) -> Record:
         If the file does not exist or is no GeoNet file, the component does not exist (the message lists them), or a
         component does not have the number of samples and the peak that its header states.
     """
-    with named_format(path, "read_geonet"):
-        found = smc_geonet_knet_esm_formats.parse_geonet(read_text(path), str(path))
-    chosen = [each for each in found if component is None or each.component.lower() == component.lower()]
-    if len(chosen) != 1:
-        raise ValueError(
-            f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
-            f"{', '.join(each.component for each in found)}"
-        )
-    return _record(chosen[0].series, None, path, chosen[0].series.title)
+    return _read("read_geonet", path, channel=component)
 
 
 def read_knet(path: str | Path) -> Record:
@@ -147,9 +133,7 @@ def read_knet(path: str | Path) -> Record:
         If the file does not exist, is no K-NET file, or does not have the number of samples and the peak that its
         header states.
     """
-    with named_format(path, "read_knet"):
-        series = smc_geonet_knet_esm_formats.parse_knet(read_text(path), str(path))
-    return _record(series, None, path, Path(path).name)
+    return _read("read_knet", path)
 
 
 def read_esm(path: str | Path) -> Record:
@@ -171,9 +155,7 @@ def read_esm(path: str | Path) -> Record:
         If the file does not exist, is no such file of acceleration, or does not have the number of samples and the peak
         that its header states.
     """
-    with named_format(path, "read_esm"):
-        series = smc_geonet_knet_esm_formats.parse_esm(read_text(path), str(path))
-    return _record(series, None, path, Path(path).stem)
+    return _read("read_esm", path)
 
 
 def read_record(
@@ -183,6 +165,12 @@ def read_record(
     missing: Sequence[float] | None = None,
     member: str | None = None,
     resample: float | None = None,
+    *,
+    dt: float | None = None,
+    column: int | str | None = None,
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
 ) -> Record:
     """Read a ground motion from a file in any supported format, which is recognised by the first lines.
 
@@ -194,13 +182,20 @@ def read_record(
         Channel number or name of a file in the archive (V2), component (GeoNet), trace (miniSEED) or column (CSV), if
         the file has more than one.
     units : str, optional
-        Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it.
+        Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it. If the file states it, the two
+        must agree.
     missing : sequence of float, optional
         For a CSV file: numbers that stand for missing samples, as in `read_csv`.
     member : str, optional
         For a zip archive of V2 files: name of the file in the archive, if several have the channel.
     resample : float, optional
         For a CSV, SMC or V1 file with uneven times: their nominal step [s], as in `read_csv`.
+    dt : float, optional
+        Time step [s], for a table without times. If the file states it, the two must agree.
+    column : int or str, optional
+        Another name of `channel`: the column of a table, as in `read_csv`.
+    time, time_unit, skip : optional
+        For a table, as in `read_csv`.
 
     Returns
     -------
@@ -212,31 +207,24 @@ def read_record(
     ValueError
         As the reader of the format; for a known format without a reader, the message has its name.
     """
+    if channel is not None and column is not None:
+        raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
+    channel = column if channel is None else channel
     reader = recognise_reader(path)
-    if reader == "read_smc":
-        return read_smc(path, resample)
-    if reader == "read_v2":
-        return _read_v2(path, channel, member, resample)
     if reader is not None:
-        if resample is not None:
-            raise ValueError(f"{path}: a file of this format has a uniform step; leave resample out")
-        return _READERS[reader](path, channel, units)
+        given = dict(time=time, time_unit=time_unit, skip=skip, missing=missing)
+        if unused := [name for name, value in given.items() if value is not None]:
+            raise ValueError(f"{path}: a file for {reader} states its times and samples; leave {', '.join(unused)} out")
+        return _read(reader, path, units, dt, channel, member, resample)
     try:
-        return _read_csv(path, units, column=channel, missing=missing, resample=resample)
+        return _read_csv(path, units, dt, channel, time_unit, skip, missing, resample, time)
     except ValueError as error:
         if Path(path).suffix.lower() in _TABLES:
             raise
         raise ValueError(f"{error}. The file has no known format of ground motions and was read as a table") from error
 
 
-_TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".xlsx", ".xlsm")
-_READERS: dict[str, Callable[..., Record]] = {
-    "read_at2": lambda path, channel, units: read_at2(path, units),
-    "read_geonet": lambda path, channel, units: read_geonet(path, channel),
-    "read_knet": lambda path, channel, units: read_knet(path),
-    "read_esm": lambda path, channel, units: read_esm(path),
-    "read_obspy": lambda path, channel, units: read_obspy(path, units, channel),
-}
+_TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", ".xlsx", ".xlsm")
 
 
 def recognise_reader(path: str | Path) -> str | None:
@@ -250,17 +238,10 @@ def recognise_reader(path: str | Path) -> str | None:
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)):
         return None if Path(path).suffix.lower() in (".xlsx", ".xlsm") else "read_v2"
-    name, reader = smc_geonet_knet_esm_formats.recognise(content.decode("latin-1"))
+    name, reader = smc_geonet_knet_esm_formats.recognise(content)
     if name and reader is None:
         raise ValueError(f"{path}: {_looks_like(name, None)}")
     return reader
-
-
-def _read_v2(path: str | Path, channel: int | str | None, member: str | None, resample: float | None) -> Record:
-    """`read_v2`, with a channel that may be a text: a number, or the name of a file in the archive."""
-    if isinstance(channel, str):
-        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
-    return read_v2(path, channel, member, resample)
 
 
 def read_v2(
@@ -296,19 +277,7 @@ def read_v2(
         If the file or the channel does not exist, several channels match (the message lists them), or the file is
         damaged.
     """
-    with named_format(path, "read_v2"):
-        candidates = at2_v2_formats.find_v2_channels(path, member)
-    chosen = [each for each in candidates if channel is None or each.channel == channel]
-    if len(chosen) != 1:
-        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
-        raise ValueError(
-            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
-            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
-            f"{listing}"
-        )
-    series = at2_v2_formats.parse_v2(chosen[0])
-    record = _record(series, None, chosen[0].file, series.title, resample)
-    return replace(record, source=chosen[0].file.removeprefix(f"{Path(path).parent}/"))
+    return _read("read_v2", path, channel=channel, member=member, resample=resample)
 
 
 def read_obspy(path: str | Path, units: str | None = None, channel: str | None = None) -> Record:
@@ -334,17 +303,16 @@ def read_obspy(path: str | Path, units: str | None = None, channel: str | None =
         If obspy is missing or cannot read the file, several traces match (the message lists them), the trace has gaps,
         or its samples are counts of a recorder.
     """
-    with named_format(path, "read_obspy"):
-        series = obspy_formats.parse_obspy(path, channel)
-    return _record(series, units, path, series.title)
+    return _read("read_obspy", path, units, channel=channel)
 
 
 def read_csv(
     path: str | Path,
     units: str | None = None,
     dt: float | None = None,
-    column: str | None = None,
+    column: int | str | None = None,
     *,
+    time: int | str | None = None,
     time_unit: str | None = None,
     skip: int | None = None,
     missing: Sequence[float] | None = None,
@@ -353,29 +321,38 @@ def read_csv(
     """Read a ground motion from a CSV file with a header line such as ``time_s,acc_g``, or from an Excel workbook.
 
     Cells are separated by commas, semicolons, tabs or blanks. Decimal commas are read where commas do not separate.
-    The text is UTF-8 or Latin-1. Text above the table is left out. Workbooks need the package openpyxl.
+    The text is UTF-8, UTF-16 with a byte-order mark, or Latin-1. Text above the table is not data. Workbooks need the
+    package openpyxl.
 
     The unit is the suffix of the column name (``acc_g``, ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line
     of units below the header line, the comment ``# units: g``, or `units`. If several are given, they must agree. Times
     must be uniform within the rounding of the printed digits. The first sample of the record is at time zero, even if
-    the times in the file begin later (see `read_columns`). The comments ``# dt = 0.02 s`` and ``# npts = 1559`` are
-    checked if present.
+    the times in the file begin later (see `read_columns`).
+
+    What comments and the text above the table state is used, and must agree with the arguments and the samples: step or
+    rate (``# dt = 0.02 s``, ``Sampling rate: 200 Hz``), number of samples (``npts = 1559``, ``NUMBER OF DATA: 1559``),
+    unit and peak acceleration (``PGA (gal): 312.8``). A step without its unit is compared only. Blocks of samples below
+    a line with their number and step, as of eqsig and RSPMatch, are read; such a file does not state the unit.
 
     Parameters
     ----------
     path : str or path
-        The file. Without a header line it must have a single column, or two columns, times and values, with
-        `time_unit`. Lines that start with ``#`` are comments.
+        The file. Without a header line, its columns are numbered from 1. Lines that start with ``#`` are comments.
     units : str, optional
         Unit of the samples.
     dt : float, optional
         Time step [s], needed for a file without times.
-    column : str, optional
-        Name of the column, needed if there are several columns in addition to the time.
+    column : str or int, optional
+        Name of the column, or its number in a file without a header line; needed if there are several columns in
+        addition to the time. ``"rows"`` takes the numbers of a file without a header line row after row, such as those
+        of the Fortran format ``8F10.5``.
+    time : str or int, optional
+        Name or number of the column of times, if it is not found. Other columns that look like times are then ignored.
     time_unit : str, optional
-        Unit of the times, if the column name does not end with it.
+        Unit of the times, if the column name does not end with it. Without a header line, the first column then has the
+        times, unless `time` is another one.
     skip : int, optional
-        Number of lines above the table, if they are not found.
+        Number of lines above the table, if they are not found. What they state is ignored.
     missing : sequence of float, optional
         Numbers that stand for missing samples; they are read as NaN, which an excitation must not have. A warning names
         the numbers that the column does not have. If not listed, -9999, -999.25, 1e30 and 9.97e36 are refused unless
@@ -396,23 +373,90 @@ def read_csv(
         If the file or the column does not exist, unit or step are missing or contradictory, a cell is not a finite
         number or is empty, or a time step is irregular (the message names the first one).
     """
-    return _read_csv(path, units, dt, column, time_unit, skip, missing, resample)
+    return _read_csv(path, units, dt, column, time_unit, skip, missing, resample, time)
 
 
 def _read_csv(
     path: str | Path,
     units: str | None,
-    dt: float | None = None,
-    column: str | None = None,
-    time_unit: str | None = None,
-    skip: int | None = None,
-    missing: Sequence[float] | None = None,
-    resample: float | None = None,
+    dt: float | None,
+    column: int | str | None,
+    time_unit: str | None,
+    skip: int | None,
+    missing: Sequence[float] | None,
+    resample: float | None,
+    time: int | str | None,
 ) -> Record:
     """`read_csv`, at the call depth below a public reader that its warnings expect."""
     with named_format(path, "read_csv"):
-        series = csv_series(read_table(path, skip, time_unit), column, dt, missing, resample is not None)
+        table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
+        column = None if column == "rows" and "rows" not in table.names else column
+        series = csv_series(table, column, dt, units, missing, resample is not None)
+        if smc_geonet_knet_esm_formats.recognise(read_bytes(path))[1] not in (None, "read_at2"):
+            raise ValueError(f"{path}: expected a table")  # lines such as NPTS=3, DT=0.01 may stand above a table
     return _record(series, units, path, Path(path).stem, resample)
+
+
+def _read(
+    reader: str,
+    path: str | Path,
+    units: str | None = None,
+    dt: float | None = None,
+    channel: int | str | None = None,
+    member: str | None = None,
+    resample: float | None = None,
+) -> Record:
+    """The record in a file of a format, at the call depth below a public reader that its warnings expect."""
+    file, name = str(path), Path(path).name if reader == "read_knet" else Path(path).stem
+    with named_format(path, reader):
+        if reader == "read_v2":
+            found = _v2_channel(path, channel, member)
+            series, file = at2_v2_formats.parse_v2(found), found.file
+        elif reader == "read_geonet":
+            series = _geonet_component(path, channel)
+        elif reader == "read_obspy":
+            series = obspy_formats.parse_obspy(path, channel)
+        else:
+            series = _PARSERS[reader](read_text(path), file)
+    if reader in ("read_v2", "read_geonet", "read_obspy"):
+        name = series.title
+    record = _record(series, units, file, name, resample, dt)
+    return replace(record, source=file.removeprefix(f"{Path(path).parent}/")) if reader == "read_v2" else record
+
+
+_PARSERS: dict[str, Callable[[str, str], Series]] = {
+    "read_at2": at2_v2_formats.parse_at2,
+    "read_smc": smc_geonet_knet_esm_formats.parse_smc,
+    "read_knet": smc_geonet_knet_esm_formats.parse_knet,
+    "read_esm": smc_geonet_knet_esm_formats.parse_esm,
+}
+
+
+def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> at2_v2_formats.V2Channel:
+    """The channel with a number; a text is a number too, or the name of a file in the archive."""
+    if isinstance(channel, str):
+        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
+    candidates = at2_v2_formats.find_v2_channels(path, member)
+    chosen = [each for each in candidates if channel is None or each.channel == channel]
+    if len(chosen) != 1:
+        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
+        raise ValueError(
+            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
+            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
+            f"{listing}"
+        )
+    return chosen[0]
+
+
+def _geonet_component(path: str | Path, component: int | str | None) -> Series:
+    found = smc_geonet_knet_esm_formats.parse_geonet(read_text(path), str(path))
+    chosen = [each for each in found if component is None or each.component.lower() == str(component).lower()]
+    if len(chosen) != 1:
+        raise ValueError(
+            f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
+            f"{', '.join(each.component for each in found)}"
+        )
+    return chosen[0].series
 
 
 @contextlib.contextmanager
@@ -422,7 +466,7 @@ def named_format(path: str | Path, reader: str) -> Iterator[None]:
         yield
     except ValueError as error:
         try:
-            name, other = smc_geonet_knet_esm_formats.recognise(read_text(path))
+            name, other = smc_geonet_knet_esm_formats.recognise(read_bytes(path))
         except ValueError:
             raise error from None
         if not name or other == reader:
@@ -436,16 +480,29 @@ def _looks_like(name: str, reader: str | None) -> str:
     return f"this looks like {article} {name} file{advice}"
 
 
-def _record(series: Series, units: str | None, file: str | Path, name: str, resample: float | None = None) -> Record:
+def _record(
+    series: Series,
+    units: str | None,
+    file: str | Path,
+    name: str,
+    resample: float | None = None,
+    dt: float | None = None,
+) -> Record:
     unit = agree_on_unit(series.unit, units, "acceleration", file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
-    source, dt, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
+    source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
     if series.times is not None:
         if resample is None:
-            step = float(np.median(np.diff(series.times)))
-            raise ValueError(f"{file}: the samples are at uneven times; give their nominal step, resample={step:.3g}")
+            even = uniform_times(series.times, None, str(file))
+            raise ValueError(
+                f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
+            )
         even = uniform_times(series.times, resample, str(file))
-        source, dt, values = f"{source}; {even.note}", resample, even.straight(values, str(file), stacklevel=4)
+        source, step, values = f"{source}; {even.note}", resample, even.straight(values, str(file), stacklevel=4)
     elif resample is not None:
         raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
-    return Record(name, dt, to_si(values, unit, "acceleration"), source)
+    if dt is not None and not abs(dt - step) <= 1e-6 * step:
+        raise ValueError(
+            f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
+        )
+    return Record(name, step, to_si(values, unit, "acceleration"), source)

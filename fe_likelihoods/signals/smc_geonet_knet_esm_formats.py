@@ -30,6 +30,7 @@ import numpy as np
 from ..units import from_si, to_si
 from .clock_times import is_clock
 from .text_files import (
+    LINE_END,
     NUMBER,
     Series,
     agree_on_unit,
@@ -38,9 +39,11 @@ from .text_files import (
     decimals_of,
     fixed_width_samples,
     is_number,
+    opening_text,
     parse_count,
     parse_number,
 )
+from .uneven_times import without_repeated_times
 
 __all__ = ["GeonetComponent", "parse_esm", "parse_geonet", "parse_knet", "parse_smc", "recognise"]
 
@@ -52,7 +55,7 @@ _GEONET_PEAK = re.compile(rf"Acceleration:\s*peak\s*({NUMBER})\s*mm/s/s", re.IGN
 _GEONET_STEP = re.compile(rf"\bat\s+(?:intervals\s+of\s+)?({NUMBER})\s*s", re.IGNORECASE)
 _GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECASE)
 _KNET_TEXT, _KNET_NAME = 17, 18
-_KNET_SCALE = re.compile(rf"({NUMBER})\s*\(gal\)\s*/\s*({NUMBER})$", re.IGNORECASE)
+_KNET_SCALE = re.compile(rf"({NUMBER})?\s*\(gal\)\s*/\s*({NUMBER})$", re.IGNORECASE)
 _ESM_TEXT, _ESM_NAME = 200, re.compile(r"[A-Z][A-Z0-9_/^]*:")  # most lines of the header; 55 to 64 in known versions
 _MOST_COMPONENTS = 100
 _LOOK = 40  # lines in which a format is recognised
@@ -85,13 +88,13 @@ class GeonetComponent(NamedTuple):
     series: Series
 
 
-def recognise(text: str) -> tuple[str, str | None]:
+def recognise(content: bytes) -> tuple[str, str | None]:
     """Return the name of a file's format, and the name of the function that reads it.
 
     Parameters
     ----------
-    text : str
-        The text of the file.
+    content : bytes
+        Content of the file.
 
     Returns
     -------
@@ -100,8 +103,9 @@ def recognise(text: str) -> tuple[str, str | None]:
     reader : str or None
         Name of the function; None for a format that is not read.
     """
-    lines = text[:8000].splitlines()
-    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text[:8000])
+    text = opening_text(content)
+    lines = LINE_END.sub("\n", text).splitlines()
+    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)
     return name, _READERS.get(name)
 
 
@@ -155,7 +159,7 @@ def _name_of(lines: list[str], text: str) -> str:
         ("SAC", _is_sac(text)),
         ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
         ("Taiwan CWB or SMART", first.startswith("#StationCode")),
-        ("binary", "\0" in text and not text.startswith(("PK", "\xff\xfe", "\xfe\xff"))),  # no workbook, no UTF-16
+        ("binary", "\0" in text.rstrip("\0\x1a\r\n ") and not text.startswith("PK")),  # no workbook
     )
     return next((name for name, fits in rules if fits), "")
 
@@ -185,13 +189,19 @@ def parse_smc(text: str, file: str) -> Series:
     if not all(line.startswith("|") for line in lines[start - comments : start]):
         raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
     values, times = fixed_width_samples(lines, start, count, _SMC_DATA, file), None
+    further = next((line for line in lines[start - (-count // _SMC_DATA[0]) :] if line.strip()), "")
+    if is_number(further[: _SMC_DATA[1]].strip()):
+        raise ValueError(f"{file}: the header announces {count} numbers, the file has more; it is damaged")
     if uneven:
         times, values = values[::2], values[1::2]
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
             check_peak(found, stated, 2e-4 * float(np.abs(values).max()), file)
+    note = ""
+    if times is not None:
+        times, values, note = without_repeated_times(times, values)
     station = next((line.strip() for line in lines[2:_SMC_TEXT] if line.startswith("station")), title)
-    return Series(re.sub(r"\s+", " ", station), math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
+    return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 
 
 def parse_geonet(text: str, file: str) -> list[GeonetComponent]:
@@ -234,9 +244,11 @@ def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetCo
     unit = _GEONET_UNIT.search(head)
     scale = float(unit[1]) if unit else 1.0
     values = scale * fixed_width_samples(lines, first, counts[0], _GEONET_DATA, file)
-    # both numbers are rounded to the digits that are printed
-    rounding = scale * 10.0 ** -decimals_of(lines[first][: _GEONET_DATA[1]].strip()) + 10.0 ** -decimals_of(peak[1])
-    check_peak(float(np.abs(values).max()), abs(float(peak[1])), 0.505 * rounding, where)
+    # the peak is rounded to the digits that are printed; the samples are rounded or cut
+    row, column = divmod(int(np.argmax(np.abs(values))), _GEONET_DATA[0])
+    printed = lines[first + row][column * _GEONET_DATA[1] :][: _GEONET_DATA[1]].strip()
+    resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
+    check_peak(float(np.abs(values).max()), abs(float(peak[1])), resolution, where)
     end = first + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
     if end > len(lines):
         raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
@@ -268,7 +280,8 @@ def parse_knet(text: str, file: str) -> Series:
     fields = [(k, field) for k, line in enumerate(lines[_KNET_TEXT:], _KNET_TEXT + 1) for field in line.split()]
     counts = np.array([parse_number(field, f"{file}, line {line}") for line, field in fields])
     check_count(counts.size, _whole(rate * duration, file, "samples"), f"{file}: frequency times duration")
-    values = (counts - counts.mean()) * (float(scale[1]) / float(scale[2]))
+    # "(gal)/1048.2" means 1 gal; the stated peak is compared below
+    values = (counts - counts.mean()) * (float(scale[1] or 1.0) / float(scale[2]))
     stated = header.get("Max. Acc. (gal)", header.get("Max Acc. (gal)", header.get("Max. Acc (gal)")))
     if stated is None:
         raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")

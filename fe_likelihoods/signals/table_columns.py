@@ -1,7 +1,6 @@
 """Columns of values of a table, with NaN for missing samples."""
 
 import math
-import re
 import warnings
 from collections.abc import Sequence
 from numbers import Real
@@ -9,36 +8,54 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
+from ..units import find_unit
+from .header_statements import Statements, check_peaks
 from .table_times import row_times, table_step, time_column
-from .tables import Table, stated_unit
-from .text_files import Series, agree_on_unit, check_count, parse_count
+from .tables import Table, column_names, listed_columns, named_places, stated_unit
+from .text_files import Series, agree_on_unit
 
-__all__ = ["column_values", "csv_series", "value_column", "warn_if_absent"]
+__all__ = ["column_values", "csv_series", "unit_of_column", "value_column", "warn_if_absent"]
 
 _SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
 # also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
 _PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
 
 
-def value_column(table: Table, column: str | None = None) -> int:
+def value_column(table: Table, column: int | str | None = None) -> int:
     """Return the index of the named column, or of the only column that is not the time."""
-    n_other = len({time_column(table)} - {None} | table.clocks | table.dates)
-    if not table.names and table.values.shape[1] - n_other > 1:
+    candidates = _value_columns(table)
+    if column is not None:
+        places = named_places(table, column)
+        candidates = [place for place in candidates if place in places]
+    elif not table.names and len(candidates) > 1:
         raise ValueError(
             f"{table.file} has {table.values.shape[1]} columns and no header line; write one such as 'time_s,acc_g'"
-            ", or give time_unit= if there are two columns, times and values. Numbers with decimal commas need another "
-            "separator between columns, such as ';'"
+            f", or {_proposal(table)}. Numbers with decimal commas need another separator between columns, such as ';'"
         )
-    candidates = [i for i in range(table.values.shape[1]) if i not in {time_column(table)} | table.clocks | table.dates]
-    if column is not None:
-        candidates = [i for i in candidates if table.names and table.names[i] == column]
     if len(candidates) != 1:
         raise ValueError(
             f"{table.file}: expected one column of values"
             + (f" named {column!r}" if column else "; choose it with column=")
-            + f", the columns are {', '.join(table.names) or 'not named'}"
+            + f", {listed_columns(table)}"
         )
     return candidates[0]
+
+
+def _value_columns(table: Table) -> list[int]:
+    return [i for i in range(table.values.shape[1]) if i not in {time_column(table)} | table.clocks | table.dates]
+
+
+def _proposal(table: Table) -> str:
+    """Arguments that read a table without a header line."""
+    width, plain = table.values.shape[1], "column=1 and the step dt= in seconds"
+    if not table.clocks and not table.dates:
+        plain += "; or column='rows' and dt= if the samples follow each other along the rows"
+    try:
+        table_step(table._replace(time=0, time_unit="s", stated=Statements()))
+    except ValueError:
+        return f"give the number of the column of values, from 1 to {width}, such as {plain}"
+    choice = "column=2 and " if width > 2 else ""
+    return f"give {choice}time_unit='s' if the first column has the times, in seconds; else {plain}"
 
 
 def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
@@ -91,24 +108,60 @@ def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
     return np.array(given, dtype=float)
 
 
+def _text_unit(table: Table, place: int, dimension: str, others: bool) -> str | None:
+    """Return the unit that comments or the text above a table state for a column of a dimension, or None.
+
+    With other units known (`others`), text that is no unit is ignored, except for counts.
+    """
+    columns = _value_columns(table)
+    for _, name in table.stated.units:
+        known, alone = _dimension(name), len(columns) == 1
+        if known == dimension or (alone and known != "time" and (known or not others or "count" in name.lower())):
+            return name
+    if dimension != "acceleration" or others or place not in columns:
+        return None
+    names, index = [column_names(table)[k] for k in columns], columns.index(place)
+    return next((peak.unit for peak in table.stated.peaks if peak.unit and peak.printed_of(names, index)), None)
+
+
+def _dimension(unit: str) -> str | None:
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
+        return None
+
+
+def unit_of_column(
+    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
+) -> str:
+    """Return the unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
+    named = stated_unit(table, place, dimension)
+    text = _text_unit(table, place, dimension, others=named is not None or given is not None)
+    stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
+    unit = agree_on_unit(stated, given, dimension, where)
+    if dimension == "acceleration" and table.stated.peaks and not np.isnan(values).any():
+        columns = _value_columns(table)
+        names, advice = (
+            [column_names(table)[k] for k in columns],
+            ". If the text is about other samples, give skip= to leave it out",
+        )
+        index, decimals = columns.index(place), table.decimals[place]
+        check_peaks(table.stated.peaks, names, index, values, decimals, unit, table.file, advice)
+    return unit
+
+
 def csv_series(
     table: Table,
-    column: str | None = None,
+    column: int | str | None = None,
     dt: float | None = None,
+    units: str | None = None,
     missing: Sequence[float] | None = None,
     uneven: bool = False,
 ) -> Series:
-    """Return one column of a table as a series, checked against the comments (see `read_csv`)."""
+    """Return one column of a table as a series, checked against what the file states (see `read_csv`)."""
     place = value_column(table, column)
-    stated = re.search(r"\bnpts\s*=\s*(\d+)", table.comments)
-    if stated:
-        where = f"{table.file}: npts in the comments"
-        check_count(len(table.values), parse_count(stated[1], where), where)
-    comment = re.search(r"\bunits:\s*([^\s;,]+)", table.comments)
-    unit = stated_unit(table, place, "acceleration")
-    if comment and unit is not None:
-        unit = agree_on_unit(unit, comment[1], "acceleration", f"{table.file} (column and comment)")
     values = column_values(table, place, missing)
+    unit = unit_of_column(table, place, values, units, "acceleration", table.file)
     warn_if_absent(table, [place], missing, stacklevel=4)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
@@ -117,7 +170,6 @@ def csv_series(
             f"needs all samples, {absent.size} are missing: interpolate them, or cut the file"
         )
     title = table.comments.split("\n", 1)[0]
-    unit = unit or (comment and comment[1])
     if uneven:
         return Series(title, math.nan, unit, values, row_times(table, dt))
     return Series(title, table_step(table, dt), unit, values)

@@ -6,7 +6,6 @@ such: ``1,234.5``, ``1.234,5``, ``1'234``. Text before the header line is left o
 counts as such text only if a header line follows it.
 """
 
-import codecs
 import csv
 import itertools
 import re
@@ -19,9 +18,9 @@ from typing import NamedTuple
 from ..units import find_unit
 from .clock_times import is_clock, is_date
 from .logger_formats import logger_table
-from .text_files import LARGEST_FILE, is_number, read_bytes
+from .text_files import LARGEST_FILE, check_count, decode_text, is_number, number_cells, parse_count, read_bytes
 
-__all__ = ["Rows", "decode_table", "read_rows"]
+__all__ = ["Rows", "read_rows"]
 
 _SEPARATORS = (";", "\t", ",", " ")
 _LAST_LINES = 50  # lines that determine the separator
@@ -34,6 +33,8 @@ _SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\
 _SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
 _SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
 _HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
+_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
+_STEP = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")  # below 1 s
 _EXCEL = {".xlsx", ".xlsm"}
 _LARGEST_WORKBOOK, _MOST_CELLS = 256 * 2**20, 50_000_000  # bytes of the unpacked workbook; cells of the sheet
 
@@ -51,25 +52,18 @@ class Rows(NamedTuple):
         Number of the line and cells, with decimal points. A missing cell is an empty string.
     comments : list of str
         Comment lines, without the ``#``.
+    above : list of str
+        Lines above the rows that are no comments.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     cells: list[tuple[int, list[str]]]
     comments: list[str]
+    above: Sequence[str] = ()
 
 
-def decode_table(content: bytes) -> str:
-    """Return the text of a file: UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1."""
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", errors="replace")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def read_rows(path: str | Path, skip: int | None = None) -> Rows:
+def read_rows(path: str | Path, skip: int | None = None, along_rows: bool = False) -> Rows:
     """Read the rows of a text file, or of the first sheet of an Excel workbook.
 
     Parameters
@@ -78,6 +72,8 @@ def read_rows(path: str | Path, skip: int | None = None) -> Rows:
         The file. Workbooks (``.xlsx``) need the package openpyxl.
     skip : int, optional
         Number of lines above the table. By default they are found.
+    along_rows : bool
+        Whether the numbers of the file are one column, row after row. The last row may then be shorter.
 
     Returns
     -------
@@ -91,19 +87,87 @@ def read_rows(path: str | Path, skip: int | None = None) -> Rows:
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
     if Path(path).suffix.lower() in _EXCEL:
-        return _arrange([line for line in _workbook(path) if line[0] > (skip or 0)], [], str(path), "")
+        cells = [line for line in _workbook(path) if line[0] > (skip or 0)]
+        lines, comments, separator = [(number, "\t".join(row)) for number, row in cells], [], ""
+    else:
+        lines, comments = _lines(path, skip or 0)
+        separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
+        cells = _cells_of(lines, separator, str(path))
+        cells, stated = logger_table(cells, str(path))
+        comments += stated
+    if along_rows and not any("rows" in row for _, row in cells[:_LAST_LINES]):
+        cells = _along_rows(cells, str(path))
+    elif found := _announced(cells, str(path)):
+        cells, comments = found[0], comments + found[1]
+    rows = _arrange(cells, comments, str(path), separator)
+    return rows._replace(above=[line for number, line in lines if number < rows.cells[0][0]])
+
+
+def _lines(path: str | Path, skip: int) -> tuple[list[tuple[int, str]], list[str]]:
+    """Numbers and text of the lines that are not blank, and the comments."""
     lines, comments = [], []
-    for number, line in enumerate(decode_table(read_bytes(path)).splitlines(), 1):
-        if number <= (skip or 0) or not line.strip():
+    for number, line in enumerate(decode_text(read_bytes(path)).splitlines(), 1):
+        if number <= skip or not line.strip():
             continue
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip("# \t"))
         else:
             lines.append((number, line))
-    separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
-    cells = [(number, _split(line, separator, f"{path}, line {number}")) for number, line in lines]
-    cells, stated = logger_table(cells, str(path))
-    return _arrange(cells, comments + stated, str(path), separator)
+    return lines, comments
+
+
+def _cells_of(lines: list[tuple[int, str]], separator: str, file: str) -> list[tuple[int, list[str]]]:
+    """Numbers and cells of lines; in the last lines, as far as these have nothing but numbers, numbers may touch."""
+    cells = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
+    texts = [line for _, line in reversed(lines)]
+    plain = (_NUMBERS.fullmatch(line) and (separator == " " or separator not in line) for line in texts)
+    first = len(lines) - sum(1 for _ in itertools.takewhile(bool, plain))
+    if any(cell.count(".") > 1 for _, row in cells[first:] for cell in row):
+        touching = number_cells([line for _, line in lines[first:]])
+        cells[first:] = [(number, row) for (number, _), row in zip(lines[first:], touching, strict=True)]
+    return cells
+
+
+def _along_rows(lines: list[tuple[int, list[str]]], file: str) -> list[tuple[int, list[str]]]:
+    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them."""
+    above = sum(1 for _ in itertools.takewhile(lambda line: _is_title(line[1]), lines))
+    width = len(lines[above][1]) if above < len(lines) else 0
+    for number, cells in lines[above:]:
+        if not all(map(_known, cells)):
+            wrong = next(cell for cell in cells if not _known(cell))
+            raise ValueError(f"{file}, line {number}: expected numbers below lines of text, got {wrong[:100]!r}")
+        if len(cells) != width and (number != lines[-1][0] or len(cells) > width):
+            raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
+    return [(number, [cell]) for number, cells in lines[above:] for cell in cells]
+
+
+def _is_title(cells: list[str]) -> bool:
+    """Whether a line has words, and no more numbers than other cells: a damaged row of numbers is no title."""
+    return any(re.search("[A-Za-z]{2}", cell) for cell in cells) and 2 * sum(map(_known, cells)) <= len(cells)
+
+
+def _announced(lines: list[tuple[int, list[str]]], file: str) -> tuple[list[tuple[int, list[str]]], list[str]] | None:
+    """One row per number below a line with their number and step, and title and step as comments; None without it.
+
+    eqsig writes this line above one sample per line, RSPMatch above several ones. In a table, the line would have as
+    many cells as the rows.
+    """
+    heads = [" ".join(cells).split() for _, cells in lines[:_LAST_LINES]]
+    place = next((k for k, head in enumerate(heads) if head and all(map(is_number, head))), len(lines))
+    rows = lines[place + 1 :]
+    if not rows or not _announces(heads[place]) or len(rows[0][1]) == len(heads[place]):
+        return None
+    if not all(map(_known, itertools.chain.from_iterable(cells for _, cells in rows))):
+        return None
+    numbers = _along_rows(rows, file)
+    check_count(len(numbers), parse_count(heads[place][0], file), f"{file}, line {lines[place][0]}")
+    title = [" ".join(cells) for _, cells in lines[: min(place, 1)]]
+    return numbers, [*title, f"dt = {heads[place][1]} s"]
+
+
+def _announces(head: list[str]) -> bool:
+    """Whether the cells of a line are a number of samples, a step below one second, and at most another integer."""
+    return 2 <= len(head) <= 3 and all(map(str.isdecimal, (head[0], *head[2:]))) and bool(_STEP.fullmatch(head[1]))
 
 
 def _split(line: str, separator: str, where: str) -> list[str]:
@@ -174,7 +238,12 @@ def _arrange(lines: list[tuple[int, list[str]]], comments: list[str], file: str,
         raise ValueError(f"{file}: expected rows of numbers, found none")
     for number, cells in rows:
         if len(cells) != width:
-            raise ValueError(f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}")
+            advice = ""
+            if not names and len(cells) < width and number == rows[-1][0] and all(map(_known, cells)):
+                advice = "; if the samples follow each other along the rows, give column='rows' and dt="
+            raise ValueError(
+                f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
+            )
     rows = _ungrouped(rows, file)
     _check_thousands(rows, file, separator)
     return _without_empty_columns(names, units, _with_points(rows, file), comments)

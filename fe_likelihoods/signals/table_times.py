@@ -1,5 +1,6 @@
 """Times of the rows of a table: the uniform step, and the time of the first row."""
 
+import contextlib
 import datetime
 import re
 
@@ -8,10 +9,11 @@ from numpy.typing import NDArray
 
 from ..units import find_unit, to_si
 from .clock_times import parse_clock
-from .tables import Table, stated_unit
-from .text_files import NUMBER, agree_on_unit
+from .tables import Table, column_names, stated_unit
+from .text_files import agree_on_unit
+from .uneven_times import uniform_times
 
-__all__ = ["nominal_step", "row_times", "table_start", "table_step", "time_column"]
+__all__ = ["row_times", "table_start", "table_step", "time_column"]
 
 _TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
 _STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
@@ -50,17 +52,30 @@ def table_step(table: Table, dt: float | None = None) -> float:
     step corresponds to a whole number of samples per second, within the rounding and within a relative 1e-4, this
     number is used.
     """
-    stated = re.search(rf"\bdt\s*=\s*({NUMBER})\s*s\b", table.comments)
     place = time_column(table)
     step, tolerance = (None, 0.0) if place is None else _uniform_step(table, place)
-    sources = {"the argument dt": dt, "the comments": float(stated[1]) if stated else None, "the time column": step}
-    known = [(source, value) for source, value in sources.items() if value is not None]
+    known = [("the argument dt", dt)] if dt is not None else []
+    known += [(repr(each.text), each.steps[0]) for each in table.stated.steps if len(each.steps) == 1]
+    known += [("the time column", step)] if step is not None else []
     if not known:
-        raise ValueError(f"{table.file} has no times (column time_s) and no comment 'dt = ... s': give dt= in seconds")
+        unclear = "".join(f", and states {each.text!r} without a unit" for each in table.stated.steps[:1])
+        raise ValueError(
+            f"{table.file} has no times (column time_s) and no comment 'dt = ... s'{unclear}: give dt= in seconds, or "
+            "the column of times, time="
+        )
     first, chosen = known[0]
+    if step is not None and dt is None and not abs(step - chosen) <= tolerance + 1e-6 * step:
+        first, chosen = known[-1]  # the times show a step that the text rounds
     for source, value in known[1:]:
-        if not abs(value - chosen) <= tolerance + 1e-6 * value:
-            raise ValueError(f"{table.file}: the step is {chosen} s by {first} but {value} s by {source}; correct one")
+        if source != "the time column" or abs(value - chosen) <= tolerance + 1e-6 * value:
+            continue
+        raise ValueError(f"{table.file}: the step is {chosen} s by {first} but {value} s by {source}; correct one")
+    for each in table.stated.steps:
+        if not each.fits(chosen, tolerance):
+            raise ValueError(
+                f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one, "
+                "or give skip= to leave out text that is about other samples"
+            )
     return chosen
 
 
@@ -110,7 +125,9 @@ def _clock_zero(table: Table, place: int | None, text: str) -> float:
 
 
 def time_column(table: Table) -> int | None:
-    """Number of the column with the times: by its name, else a clock, or the first one of a table without names."""
+    """Number of the column with the times: as given, by its name, else a clock, or the first one without names."""
+    if table.time is not None:
+        return table.time
     clock = min(table.clocks, default=None)
     if not table.names:
         return 0 if table.time_unit is not None and table.values.shape[1] > 1 else clock
@@ -136,7 +153,7 @@ def _time_unit(table: Table, place: int) -> str:
         return "s"
     stated, unix = stated_unit(table, place), _unix_unit(table, place)
     if stated is None and table.time_unit is None:
-        name = table.names[place]
+        name = column_names(table)[place]
         if unix is not None and _UNIX.search(name):
             return unix
         hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
@@ -167,11 +184,13 @@ def _uniform_step(table: Table, place: int) -> tuple[float, float]:
     off_grid = np.abs(times - times[0] - step * np.arange(times.size))[1:] > tolerance
     if bad.any() or off_grid.any():
         index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
+        advice = "insert rows with empty cells where the logger has missed samples, print the times with more digits"
+        with contextlib.suppress(ValueError):
+            even = uniform_times(times, None, table.file)
+            advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
         raise ValueError(
             f"{table.file}, line {table.lines[index + 1]}: expected a uniform time step of about {usual:g} s, got "
-            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; insert rows with "
-            "empty cells where the logger has missed samples, print the times with more digits, or give "
-            f"resample={nominal_step(usual):g} to interpolate to a uniform step"
+            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; {advice}"
         )
     tolerance /= increments.size
     rate = round(1 / step) if 1 / step < 1e15 else 0
@@ -199,12 +218,6 @@ def _times(table: Table, place: int) -> NDArray[np.float64]:
     return times
 
 
-def nominal_step(step: float) -> float:
-    """Return the step [s] of a whole number of samples per second, if it differs from `step` by less than 5 %."""
-    whole = 1.0 / max(round(1.0 / step), 1) if step > 1e-9 else step
-    return whole if abs(whole - step) <= 0.05 * step else step
-
-
 def _fits_single_precision(table: Table, place: int) -> bool:
     """Return whether each printed time is a float32, rounded to the printed digits."""
     printed = table.values[:, place]
@@ -215,6 +228,8 @@ def _fits_single_precision(table: Table, place: int) -> bool:
 
 def _check_single_clock(table: Table, place: int) -> None:
     """Raise ValueError if another column has different times, so that the times of the values are ambiguous."""
+    if table.time is not None:
+        return
     own_unit = _time_unit(table, place)
     times = to_si(table.values[:, place], own_unit, "time")
     for other, name in enumerate(table.names):
@@ -239,5 +254,5 @@ def _check_single_clock(table: Table, place: int) -> None:
         if not np.all(np.abs(ahead) <= digit):
             raise ValueError(
                 f"{table.file}: expected one column of times, the columns {table.names[place]!r} and {name!r} have "
-                "different times; write one file for each of them with its columns of values"
+                "different times; write one file for each of them with its columns of values, or name one, time="
             )

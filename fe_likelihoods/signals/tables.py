@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from ..units import find_unit
 from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight
+from .header_statements import Statements, read_statements
 from .table_rows import read_rows
 from .text_files import agree_on_unit, decimals_of, is_number, parse_number
 
-__all__ = ["Table", "column_unit", "read_table", "stated_unit"]
+__all__ = ["Table", "column_names", "column_unit", "listed_columns", "named_places", "read_table", "stated_unit"]
 
 _LONGEST_UNIT = 100
 
@@ -48,6 +49,10 @@ class Table(NamedTuple):
         Columns of dates or of text, such as a state of the logger, which have no values.
     clock : ClockTime or None
         The first clock time.
+    time : int or None
+        Number of the column of times, from 0, as given by the caller.
+    stated : Statements
+        What comments and the text above the table state.
     """
 
     file: str
@@ -61,9 +66,17 @@ class Table(NamedTuple):
     clocks: frozenset[int] = frozenset()
     dates: frozenset[int] = frozenset()
     clock: ClockTime | None = None
+    time: int | None = None
+    stated: Statements = Statements()
 
 
-def read_table(path: str | Path, skip: int | None = None, time_unit: str | None = None) -> Table:
+def read_table(
+    path: str | Path,
+    skip: int | None = None,
+    time_unit: str | None = None,
+    time: int | str | None = None,
+    along_rows: bool = False,
+) -> Table:
     """Read columns of numbers from a text file or an Excel workbook.
 
     Columns are separated by commas, semicolons, tabs or blanks, with decimal points or decimal commas. Text above the
@@ -77,6 +90,10 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
         Number of lines above the table. By default they are found.
     time_unit : str, optional
         Unit of the times, if the file does not state it. Without a header line, the first column then has the times.
+    time : str or int, optional
+        Name of the column of times, or its number in a file without a header line. By default it is found.
+    along_rows : bool
+        Whether the numbers of a file without a header line are one column, row after row.
 
     Returns
     -------
@@ -86,9 +103,10 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     Raises
     ------
     ValueError
-        If the file cannot be read, has no rows, has rows of different length, or a cell is not a finite number.
+        If the file cannot be read, has no rows, has rows of different length, a cell is not a finite number, or the
+        file states another number of samples.
     """
-    file, rows = str(path), read_rows(path, skip)
+    file, rows = str(path), read_rows(path, skip, along_rows)
     width = len(rows.cells[0][1])
     if time_unit is not None:
         find_unit(time_unit, "time")
@@ -112,7 +130,42 @@ def read_table(path: str | Path, skip: int | None = None, time_unit: str | None 
     lines = tuple(number for number, _ in rows.cells)
     units = rows.units or ("",) * width
     numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
-    return Table(file, *numbers, frozenset(clocks), frozenset(dates), clock)
+    stated = read_statements([*rows.comments, *rows.above])
+    for text, count in stated.counts:
+        if len(values) != count:
+            raise ValueError(
+                f"{file}: {text!r} announces {count} samples, the file has {len(values)}; it is truncated or damaged. "
+                "If the text is about other samples, give skip= to leave it out"
+            )
+    table = Table(file, *numbers, frozenset(clocks), frozenset(dates), clock, None, stated)
+    return table if time is None else table._replace(time=_time_place(table, time))
+
+
+def _time_place(table: Table, time: int | str) -> int:
+    places = [place for place in named_places(table, time) if place not in table.dates]
+    if len(places) != 1:
+        raise ValueError(
+            f"{table.file}: expected one column of times with time={time!r}, found {len(places)}; "
+            f"{listed_columns(table)}"
+        )
+    return places[0]
+
+
+def column_names(table: Table) -> tuple[str, ...]:
+    """Names of the columns, without a header line their numbers, from 1."""
+    return table.names or tuple(str(k + 1) for k in range(table.values.shape[1]))
+
+
+def named_places(table: Table, column: int | str) -> list[int]:
+    """Columns with a name, or without a header line with a number, from 1."""
+    return [place for place, name in enumerate(column_names(table)) if name == str(column)]
+
+
+def listed_columns(table: Table) -> str:
+    """The names of the columns, for messages."""
+    if table.names:
+        return f"the columns are {', '.join(table.names)}"
+    return f"the columns have no names: give a number from 1 to {table.values.shape[1]}"
 
 
 def _is_word(cell: str) -> bool:

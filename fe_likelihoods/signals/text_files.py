@@ -1,5 +1,7 @@
 """Shared by the readers of text files: reading, numbers, units and series of samples."""
 
+import codecs
+import itertools
 import math
 import re
 from pathlib import Path
@@ -12,14 +14,18 @@ from ..units import DIMENSIONS, find_unit
 
 __all__ = [
     "LARGEST_FILE",
+    "LINE_END",
     "NUMBER",
     "Series",
     "agree_on_unit",
     "check_count",
     "check_peak",
     "decimals_of",
+    "decode_text",
     "fixed_width_samples",
     "is_number",
+    "number_cells",
+    "opening_text",
     "parse_count",
     "parse_number",
     "read_bytes",
@@ -33,6 +39,13 @@ LARGEST_FILE = 256 * 2**20
 """Largest size of a text file or an archive [bytes]; long records have some MiB."""
 
 
+LINE_END = re.compile(r"\r+\n|\r")
+"""Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
+
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# What editors and transfers add after the last line: blank lines, ^Z (the end of a text in DOS), zero bytes as padding
+_PADDING = " \t\n\f\0\x1a"
+_CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
 _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
 
 
@@ -71,9 +84,84 @@ def read_bytes(path: str | Path) -> bytes:
         raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
 
 
+def decode_text(content: bytes) -> str:
+    """Return the text of a file without padding and a closing remark after its last line.
+
+    The text is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. A line such as ``*** End
+    data ***`` is a closing remark: it has no number, and no separator of cells. Zero bytes directly after a number are
+    kept, so that this number is refused: a table that a crash has cut and padded may have lost its last digits.
+    """
+    if content.startswith(_UTF_16):
+        text = content.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = content.decode("latin-1")
+    text = _without_padding(LINE_END.sub("\n", text))
+    while _CLOSING.fullmatch(text, text.rfind("\n") + 1):
+        text = _without_padding(text[: text.rfind("\n") + 1])
+    return text
+
+
+def _without_padding(text: str) -> str:
+    """A text up to the end of its last line, or ^Z; blanks at the end of this line may be empty cells."""
+    last = len(text.rstrip(_PADDING))
+    return text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
+
+
+def opening_text(content: bytes) -> str:
+    """Return the first letters of a file in which its format is recognised; of binary files, one letter per byte."""
+    start = content[:8000]
+    for mark, encoding in ((codecs.BOM_UTF8, "utf-8-sig"), *((each, "utf-16") for each in _UTF_16)):
+        if start.startswith(mark):
+            return start.decode(encoding, errors="replace")
+    return start.decode("latin-1")
+
+
 def read_text(path: str | Path) -> str:
-    """Return the text of a file; raise ValueError if it cannot be read."""
-    return read_bytes(path).decode("latin-1")  # decodes every byte; the formats read here are plain ASCII
+    """Return the text of a file in a format that states its number of samples; ValueError if it cannot be read."""
+    return decode_text(read_bytes(path)).rstrip("\0\x1a")
+
+
+def number_cells(lines: list[str]) -> list[list[str]]:
+    """Return the fields of lines of numbers, which blanks separate or which touch, as in some Fortran formats.
+
+    Numbers that touch have a decimal point each, and begin with a sign (``-12.34567-0.12345``) or end in the same
+    columns of all lines (``12.34567100.12345``). Other text is one field, which is no number.
+    """
+    rows = [[part for field in line.split() for part in _apart(field)] for line in lines]
+    if any(cell.count(".") > 1 for row in rows for cell in row):
+        first = sum(cell.count(".") for cell in rows[0]) == 1  # a line that announces number and step of the others
+        fields = _aligned([line.rstrip() for line in lines[first:]])
+        return rows if fields is None else rows[:first] + fields
+    return rows
+
+
+def _apart(field: str) -> list[str]:
+    """The numbers in a field that begin with a sign; the field if a part of it is no number with a decimal point."""
+    parts = [field] if field.count(".") < 2 else re.split(r"(?<=[\d.])(?=[-+])", field)
+    return parts if all(part.count(".") == 1 for part in parts) else [field]
+
+
+def _aligned(lines: list[str]) -> list[list[str]] | None:
+    """The fields of a Fortran format with three numbers or more, whose points are at equal distances; else None."""
+    points = [[match.start() for match in re.finditer(r"\.", line)] for line in lines]
+    most = max(points, key=len, default=[])
+    if len(most) < 3 or any(found != most[: len(found)] or not found for found in points):
+        return None
+    width, after = most[1] - most[0], len(lines[0]) - points[0][-1]  # columns of a field, and from its point to its end
+    starts = [point + after - width for point in most]
+    fields = [
+        [line[start : start + width].strip() for start in starts[: len(found)]]
+        for line, found in zip(lines, points, strict=True)
+    ]
+    whole = (
+        len(line) == starts[len(row) - 1] + width and not line[: starts[0]].strip()
+        for line, row in zip(lines, fields, strict=True)
+    )
+    even = all(b - a == width for a, b in itertools.pairwise(most)) and starts[0] >= 0
+    return fields if even and all(whole) and all(is_number(cell) for row in fields for cell in row) else None
 
 
 def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
@@ -177,6 +265,8 @@ def fixed_width_samples(
         values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
     if len(values) < 2:
         raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
+    if len(line) % width and len(lines[start].rstrip()) % width == 0:  # the last line ends within a number
+        raise ValueError(f"{where}: expected numbers of {width} columns, the last one is cut; the file is truncated")
     return np.array(values)
 
 

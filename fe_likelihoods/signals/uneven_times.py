@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .sampling import check_step
 
-__all__ = ["UniformTimes", "uniform_times"]
+__all__ = ["UniformTimes", "uniform_times", "without_repeated_times"]
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
@@ -22,6 +22,8 @@ class UniformTimes(NamedTuple):
     ----------
     times : ndarray, shape (n_samples,)
         The uneven times [s].
+    step : float
+        The uniform step [s].
     uniform : ndarray, shape (n_steps,)
         The uniform times, from the first uneven one on [s].
     usual : float
@@ -33,6 +35,7 @@ class UniformTimes(NamedTuple):
     """
 
     times: NDArray[np.float64]
+    step: float
     uniform: NDArray[np.float64]
     usual: float
     gaps: NDArray[np.float64]
@@ -89,15 +92,16 @@ class UniformTimes(NamedTuple):
         return np.interp(self.uniform, self.times, values)
 
 
-def uniform_times(times: NDArray[np.float64], step: float, where: str) -> UniformTimes:
+def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
     """Return times with the uniform `step` from the first to the last of the given times.
 
     Parameters
     ----------
     times : ndarray, shape (n_samples,)
         Times that increase [s].
-    step : float
-        Nominal step of the samples [s].
+    step : float or None
+        Nominal step of the samples [s]. By default that of a whole number of samples per second, if it is within 5 % of
+        the usual step, else the usual step.
     where : str
         The file, for messages.
 
@@ -111,7 +115,7 @@ def uniform_times(times: NDArray[np.float64], step: float, where: str) -> Unifor
         If the times do not increase, more than half of the samples are missing, or the step differs from their usual
         step by more than 5 %: another step would need a filter (`Record.resample`, `Measurements.decimate`).
     """
-    step = check_step(step, f"resample of {where}")
+    step = None if step is None else check_step(step, f"resample of {where}")
     increments = np.diff(times)
     if times.size < 2 or not np.all(increments > 0.0):
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
@@ -120,6 +124,9 @@ def uniform_times(times: NDArray[np.float64], step: float, where: str) -> Unifor
             f"{times[place]:.15g} s; if the times are those of packets, leave the column of times out and give dt="
         )
     usual = float(increments[increments <= _GAP * np.median(increments)].mean())
+    if step is None:
+        whole = 1.0 / max(round(1.0 / usual), 1) if usual > 1e-9 else usual
+        step = whole if abs(whole - usual) < 0.999 * _LARGEST_DIFFERENCE * usual else usual
     if abs(step - usual) > _LARGEST_DIFFERENCE * usual:
         raise ValueError(
             f"{where}: expected the nominal step of the samples, about {usual:.4g} s, got resample={step:g}; resample "
@@ -135,4 +142,17 @@ def uniform_times(times: NDArray[np.float64], step: float, where: str) -> Unifor
             f"{gaps.max():.4g} s; cut the file at its long gaps"
         )
     uniform = times[0] + step * np.arange(int((times[-1] - times[0]) / step + 1e-6) + 1)
-    return UniformTimes(times, uniform, usual, gaps, note)
+    return UniformTimes(times, step, uniform, usual, gaps, note)
+
+
+def without_repeated_times(
+    times: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
+    """Return times and samples of a digitised record with the mean of the samples of equal times, and what was done.
+
+    Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
+    """
+    first = np.concatenate([[True], np.diff(times) != 0.0])
+    number = np.cumsum(first) - 1
+    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
+    return times[first], np.bincount(number, weights=values) / np.bincount(number), note

@@ -34,6 +34,7 @@ from fe_likelihoods.units import G0
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, STEP
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
+from tests.signals.test_trade_files import EQSIG, ROWS, RSPMATCH, afad
 
 SLOW = 5.0
 TOKENS = (
@@ -125,6 +126,9 @@ def cases(folder):
         *(Case(name, read, ["\n".join(lines).encode()]) for name, read, lines in networks),
         Case("any", read_record, [*at2, *csv, v2[0], *("\n".join(lines).encode() for _, _, lines in networks)]),
         Case("csv", read_csv, csv + styles),
+        Case("acc", lambda path: read_record(path, units="g"), [text.encode() for text in (EQSIG, RSPMATCH)]),
+        Case("afad", read_record, [afad(("N-S",)).encode()]),
+        Case("dat", lambda path: read_record(path, "rows", "g", dt=0.01), ["\n".join(ROWS).encode()]),
         Case("uneven.csv", lambda path: read_csv(path, resample=0.02), csv + styles),
         Case("uneven.smc", lambda path: read_smc(path, resample=0.01), [uneven]),
         Case("listed", describe_data, [*at2, *csv, *styles, *v2, uneven, archives[0]]),

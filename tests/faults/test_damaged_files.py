@@ -66,7 +66,7 @@ def nested(depth):
             lambda: zipped([(f"{k}.zip", zipped([(f"{i}.v2", b"\0" * 2**22) for i in range(9)])) for k in "abc"]),
             "at most 2000 files with",
         ),
-        (lambda: zipped([("a.v2", b"\n" * 2**23)]), "at most 4000000 lines"),
+        (lambda: zipped([("a.v2", b"\n" * 2**23 + b"x")]), "at most 4000000 lines"),
     ],
     ids=["nested", "many", "large", "nested and large", "lines"],
 )

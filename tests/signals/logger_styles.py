@@ -41,6 +41,7 @@ TOA5 = (
 IN_MM = [9806.65 * value for value in ACCELERATION]  # [mm/s²]: thousands
 
 READ = {
+    "AM and PM": _table("Time,acc_g", lambda k: _clock(k, "%I:%M:%S.%f %p")),
     "comma": _table("time_s,acc_g", _seconds),
     "semicolon, decimal comma": _comma(_table("time_s;acc_g", _seconds, separator=";")),
     "tab, line of units": _table("Time\tAcc\n[s]\t[g]", _seconds, separator="\t"),
@@ -100,7 +101,6 @@ REFUSED = {
         _table("Time,acc_g", lambda k: _clock(k, "%m/%d/%Y %H:%M:%S.%f")),
         "which may begin with the day or the month; write the year first",
     ),
-    "AM and PM": (_table("Time,acc_g", lambda k: _clock(k, "%I:%M:%S.%f %p")), "write it without AM and PM"),
     "seconds without fraction": (
         _table("Time,acc_g", lambda k: _clock(k, "%H:%M:%S")),
         "print the times with more digits, or leave the column out and give dt=",

@@ -71,6 +71,11 @@ def test_unknown_unit_of_a_column_that_is_not_read(path):
 CLOCKS = {
     "clock": "Time,acc_g\n12:00:00.00,1\n12:00:00.01,2\n12:00:00.02,4\n",
     "label without unit": "Timestamp [hh:mm:ss],acc_g\n1:59:59.99,1\n2:00:00.00,2\n2:00:00.01,4\n",
+    "noon with AM and PM": "Time,acc_g\n11:59:59.99 AM,1\n12:00:00.00 PM,2\n12:00:00.01 PM,4\n",
+    "midnight with AM and PM": "Time,acc_g\n11:59:59.99 p.m.,1\n12:00:00.00 a.m.,2\n12:00:00.01 a.m.,4\n",
+    "one o'clock with AM and PM": "Time,acc_g\n12:59:59.99 PM,1\n01:00:00.00 PM,2\n01:00:00.01 PM,4\n",
+    "date with AM and PM": "Time,acc_g\n2019-07-06 11:59:59.99 PM,1\n2019-07-07 12:00:00.00 AM,2\n"
+    "2019-07-07 12:00:00.01 AM,4\n",
     "midnight": "Time,acc_g\n23:59:59.99,1\n00:00:00.00,2\n00:00:00.01,4\n",
     "dates": "UTC,acc_g\n2019-12-31T23:59:59.990Z,1\n2020-01-01T00:00:00.000Z,2\n2020-01-01T00:00:00.010Z,4\n",
     "decimal comma": "T;a [g]\n2019-07-06 03:19:53,00;1,0\n2019-07-06 03:19:53,01;2,0\n2019-07-06 03:19:53,02;4,0\n",
@@ -117,7 +122,9 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
         ("2019-02-03T12:00:00,1\n12:00:01,2\n", "expected a date in all clock times or in none"),
         ("12:00:00Z,1\n12:00:01+02:00,2\n", "expected one time zone in all clock times, got 2; write them alike"),
         ("12:59:59.99,1\n1:00:00.00,2\n1:00:00.01,3\n", "back from 12 to 1 o'clock, as on a clock of 12 hours"),
-        ("11:59:59 PM,1\n12:00:00 AM,2\n", "line 2: .*hours from 0 to 23; got '11:59:59 PM': write it without AM"),
+        ("13:00:00 PM,1\n13:00:01 PM,2\n", "line 2: .* hours from 1 to 12; got '13:00:00 PM'"),
+        ("0:00:00 AM,1\n0:00:01 AM,2\n", "line 2: .* hours from 1 to 12; got '0:00:00 AM'"),
+        ("11:59:59 AM,1\n12:00:00,2\n", "expected AM or PM in all clock times or in none"),
         ("99:00:00,1\n99:00:01,2\n", "line 2: .*hours from 0 to 23; got '99:00:00'"),
     ],
 )
