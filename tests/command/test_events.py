@@ -100,6 +100,7 @@ def test_events_are_predicted_and_scored(finished, run_once):
     assert "The motion meets the structure before any other event" in text
 
 
+@pytest.mark.slow
 def test_report_makes_events_again_without_simulations(finished, monkeypatch):
     first = (finished / "r" / "event-after.csv").read_text()
     simulated, one = [], linear_oscillator.respond
