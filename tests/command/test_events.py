@@ -100,6 +100,7 @@ def test_events_are_predicted_and_scored(finished, run_once):
     assert "The motion meets the structure before any other event" in text
 
 
+@pytest.mark.slow
 def test_report_makes_events_again_without_simulations(finished, monkeypatch):
     first = (finished / "r" / "event-after.csv").read_text()
     simulated, one = [], linear_oscillator.respond
@@ -110,6 +111,7 @@ def test_report_makes_events_again_without_simulations(finished, monkeypatch):
     assert 0 < len(simulated) <= 12  # verification of a few responses of each excitation, not 20 of each, 100 of one
 
 
+@pytest.mark.slow
 def test_an_event_is_added_to_a_finished_run_without_new_samples(events):
     (events / "oscillator.toml").write_text(SETTINGS)
     call("run", "oscillator.toml", "--out", "r", "--quiet")

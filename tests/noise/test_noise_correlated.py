@@ -298,6 +298,7 @@ def credible_interval(likelihood, noise, statistics, grid, options):
     return np.interp([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], cumulative / cumulative[-1], grid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [0.6, LIKE_THE_ERRORS])
 def test_coverage_of_each_noise_for_correlated_errors(rng, period):
     """The 90 % interval of the stiffness over 200 data sets whose errors are AR(1) with rho = 0.9.

@@ -196,6 +196,7 @@ def test_levels_in_bands_are_those_of_the_errors_whatever_the_time_step():
     assert spectrum[:320].sum() > 30.0 * spectrum[320:].sum()  # below 2 Hz
 
 
+@pytest.mark.slow
 def test_calibrated_parameters_have_uniform_ranks(rng):
     """Simulation-based calibration on a grid: exact posteriors, so that the ranks test the density alone."""
     n, repeats, channel = 120, 120, (CHANNELS[0],)
