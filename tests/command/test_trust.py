@@ -31,6 +31,7 @@ def _refuse(*arguments, **options):
     raise AssertionError("a report unpickles nothing")
 
 
+@pytest.mark.slow
 def test_a_report_of_a_folder_of_a_stranger_runs_no_code(folder, monkeypatch):  # noqa: F811
     source, settings = folder / "strange_model.py", folder / "r" / "settings.toml"
     source.write_text(FUNCTION)

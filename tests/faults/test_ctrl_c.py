@@ -11,7 +11,6 @@ import emcee
 import pytest
 
 import samplers
-from tests.covering import covering
 from tests.faults.kills import evaluated_again
 from tests.faults.resumable_run import STEPS, go_on, make, outcome, points_of
 
@@ -69,9 +68,10 @@ def whole_run(kind):
     return outcome(whole), points, counted.count
 
 
+@pytest.mark.parametrize("stored", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["file", "memory"])
 @pytest.mark.parametrize(
-    ("kind", "stored"),
-    covering(["smc", "moves", "guided", "map", "asynchronous", "thin"], [True, False], strength=1),
+    "kind",
+    ["smc", "guided", "map", *(pytest.param(k, marks=pytest.mark.slow) for k in ("moves", "asynchronous", "thin"))],
 )
 def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored, tmp_path):
     whole, evaluated, lines_traced = whole_run(kind)
