@@ -31,6 +31,7 @@ from ..simulation.model import (
     real_response,
     simulate_batch,
 )
+from ..simulation.opened import Observed, unpack
 from ..simulation.threads import run_on_threads
 from ..simulation.user_code import LIBRARY
 
@@ -204,7 +205,8 @@ def _run(
     items = [(theta.copy(), start) for theta, start in zip(thetas, starts, strict=True)]
     before = items_of({"class": type(model)})
     if pool is not None:
-        outcomes = list(pool.map(partial(_continue, responses, model), items)) if items else []
+        sent = Observed(partial(_continue, responses, model))
+        outcomes = [unpack(outcome, pool)[0] for outcome in pool.map(sent, items)] if items else []
     elif getattr(model, "runs_on_threads", False):
         outcomes = run_on_threads(partial(_continue, responses, model), items)
     else:

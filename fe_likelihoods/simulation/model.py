@@ -23,7 +23,9 @@ from ..noise.statistics import Statistic, reduce_response, statistic_width, sums
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of, shortened
+from .folder import Sender, in_worker, run_in_folder
 from .opened import Observed, note, unpack
+from .shared_files import warn_of_shared_files
 
 __all__ = [
     "ContinuedResponse",
@@ -409,11 +411,13 @@ def _run_each(
 ) -> tuple[np.ndarray, list[str]]:
     """Run simulations one by one, in this process or in the pool's workers."""
     if pool is None:
+        if in_worker():  # of the pool of a sampler
+            run = partial(_in_folder, run, Sender.of_this_worker())
         outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
         for outcome in pool.map(Observed(run), list(thetas)):
-            result, opened = unpack(outcome)
+            result, opened = unpack(outcome, pool)
             outcomes.append(result)
             note(opened)
     values = np.full((len(thetas), *shape), np.nan)
@@ -421,6 +425,12 @@ def _run_each(
         if result is not None:
             row[...] = result
     return values, [reason for _, reason in outcomes]
+
+
+def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
+    result, shared = run_in_folder(run, theta, sender)
+    warn_of_shared_files(shared, None)
+    return result
 
 
 @contextmanager

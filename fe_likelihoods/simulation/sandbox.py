@@ -65,10 +65,12 @@ class Sandbox:
         try:
             worker.send(item)
             answer = self._receive(worker, start)
-        except BaseException as error:
+        except RunFailed as error:
+            worker.kill(error.reason)
+            reason = error.reason.with_text(error.reason + worker.kept)
+            raise RunFailed(reason, time.monotonic() - start) from None
+        except BaseException:
             worker.kill()
-            if isinstance(error, RunFailed):
-                raise RunFailed(error.reason, time.monotonic() - start) from None
             raise
         if worker.calls >= (self.runs_per_process or math.inf):
             worker.kill()

@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -31,6 +31,8 @@ from typing import Any, NamedTuple
 
 from .by_value import Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
+from .folder import discard, serves, working_folder
+from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
 __all__ = ["Answer", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
 
@@ -58,6 +60,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew_starter)
 
 
+def _start(start: Callable[[], subprocess.Popen]) -> subprocess.Popen:
+    with of_this_library():
+        return start()
+
+
 class Worker:
     """A process that calls a function. Its methods may be called from one thread, apart from `kill`.
 
@@ -76,10 +83,12 @@ class Worker:
     ----------
     keys, calls
         Keys of the functions that are loaded (`Pickled`); number of items that were sent.
+    kept
+        Where the folder of a failed simulation was kept, to be added to the reason; "" before `kill`.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        self.output = output
+        self.output, self.kept = output, ""
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -93,8 +102,9 @@ class Worker:
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
+                cwd=working_folder() or None,
             )
-            self._process = _starter.submit(start).result()
+            self._process = _starter.submit(_start, start).result()
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
@@ -126,7 +136,7 @@ class Worker:
     def send(self, item: Any) -> None:
         """Send an item for the function that was loaded last; `receive` returns the answer."""
         self.keys.use(self._key)
-        self._send(self._key + pickle.dumps(item, protocol=5))
+        self._send(self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5))
         self.calls += 1
 
     def receive(self, seconds: float | None = None) -> "Answer | None":
@@ -144,7 +154,7 @@ class Worker:
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
-            reason = describe_exit(self.kill(), "the worker process")
+            reason = describe_exit(self.kill("the worker process died"), "the worker process") + self.kept
             said = "" if self.output is None else last_lines(self.output, 1)
             raise WorkerDied(TransientReason("; ".join(filter(None, [reason, said])))) from None
 
@@ -152,9 +162,13 @@ class Worker:
         with suppress(OSError):  # `receive` reports that the process has died
             self._connection.send_bytes(message)
 
-    def kill(self) -> int:
-        """Kill the process and its session; returns its exit code, as in `subprocess`."""
+    def kill(self, reason: str = "") -> int:
+        """Kill the process and its session; returns its exit code, as in `subprocess`.
+
+        With the `reason` why its simulation has failed, the simulation's folder may be kept, see `kept`.
+        """
         self._end()
+        self.kept = discard(self._process.pid, reason)
         return self._process.wait()
 
 
@@ -213,6 +227,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
+    serves()
     functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
         while True:
@@ -228,7 +243,8 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
                 else:
                     function = functions.use(bytes(message[:16]))
                     function.prepare()
-                    answer = _packed(function(pickle.loads(message[16:])))
+                    sender_holds_lock(bool(message[16]))
+                    answer = _packed(function(pickle.loads(message[17:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well
