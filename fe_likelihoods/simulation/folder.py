@@ -34,6 +34,7 @@ __all__ = [
     "KEEP",
     "Sender",
     "discard",
+    "get_ready",
     "in_worker",
     "keep_folder",
     "run_in_folder",
@@ -44,7 +45,7 @@ __all__ = [
 
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
-_MOST_BELOW = 200  # entries of subfolders that are linked one by one; larger subfolders are links
+_MOST_BELOW = 100  # entries of subfolders that are linked one by one; larger subfolders are links
 _DEEPEST = 3
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
@@ -111,50 +112,67 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
     if running_simulation() is not None or (is_home and is_main):  # one after the other
         return function(item), ""
     thread = 0 if is_main else threading.get_ident()
-    is_remote = sender is not None and sender.machine != os.uname().nodename
     if is_home or not (is_main or _is_only_thread_of_dask()):
-        simulation = RunningSimulation("", thread, is_remote)
+        simulation = RunningSimulation("", thread, _is_remote(sender))
         return simulation.run(function, item), simulation.shared
-    return _run_in_mirror(function, item, sender, thread, is_remote)
-
-
-def _run_in_mirror(
-    function: Callable[[Any], Any], item: Any, sender: Sender, thread: int, is_remote: bool
-) -> tuple[Any, str]:
-    global _mirror
     try:
-        if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
-            sys.path[:] = map(os.path.abspath, sys.path)
-            _mirror = _Mirror(sender, is_remote)
-        mirror, is_wanted = _mirror, True
-        while is_wanted:
-            mirror.prepare()
-            simulation, argument = RunningSimulation(mirror.path, thread, is_remote), copy.deepcopy(item)
-            result = error = None
-            before = working_folder()
-            os.chdir(mirror.path)
-            try:
-                result = simulation.run(function, argument)
-            except Exception as raised:
-                error = raised
-            finally:
-                with contextlib.suppress(FileNotFoundError):
-                    os.chdir(before)
-            is_wanted = mirror.was_written_through()
+        result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, sender, thread)
     except OSError as failure:
         text = f"the working folder of a simulation could not be made: {failure}"
         raise RunFailed(TransientReason(text)) from failure
+    if error is not None:
+        raise error
+    return result, shared
+
+
+def _is_remote(sender: Sender | None) -> bool:
+    return sender is not None and sender.machine != os.uname().nodename
+
+
+def get_ready(sender: Sender) -> None:
+    """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if sender.process != _name(os.getpid()) and running_simulation() is None and is_main:
+        with contextlib.suppress(OSError):
+            _mirror_for(sender)
+
+
+def _mirror_for(sender: Sender) -> "_Mirror":
+    global _mirror
+    if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
+        sys.path[:] = map(os.path.abspath, sys.path)
+        _mirror = _Mirror(sender)
+    return _mirror
+
+
+def _run_in_mirror(
+    mirror: "_Mirror", function: Callable[[Any], Any], item: Any, sender: Sender, thread: int
+) -> tuple[Any, Exception | None, str]:
+    """Result or exception of a simulation, and the first file that it shares with others."""
+    is_wanted = True
+    while is_wanted:
+        mirror.prepare()
+        simulation, argument = RunningSimulation(mirror.path, thread, _is_remote(sender)), copy.deepcopy(item)
+        result = error = None
+        before = working_folder()
+        os.chdir(mirror.path)
+        try:
+            result = simulation.run(function, argument)
+        except Exception as raised:
+            error = raised
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.chdir(before)
+        if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
+            return result, error, ""
+        is_wanted = mirror.was_written_through()
     reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
     kept = keep_folder(Path(mirror.path), sender.keep, reason) if reason and sender.keep else None
     mirror.clean(anew=kept is not None or (simulation.has_programs and _has_children()))
     if kept is not None and not isinstance(error, UnusableModel):
         reason = _with(reason, f" (its folder is {kept})")
-        if error is not None:
-            raise RunFailed(reason) from error
-        result = None, reason
-    if error is not None:
-        raise error
-    return result, simulation.shared
+        error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
+    return result, error, simulation.shared
 
 
 def _is_failure(result: Any) -> bool:
@@ -194,7 +212,9 @@ def shown(path: str) -> str | None:
     simulation = running_simulation()
     if simulation is None or not simulation.place or not path.startswith(simulation.place + os.sep):
         return path
-    path = os.path.realpath(path)
+    with contextlib.suppress(OSError):
+        return os.readlink(path).replace(_mirror.hop, _mirror.base, 1)
+    path = os.path.realpath(path)  # a link among its folders
     return None if path.startswith(simulation.place + os.sep) else path
 
 
@@ -265,29 +285,29 @@ Stamp = tuple[int, int, int]
 class _Mirror:
     """A folder `path` that shows another folder, `base`, to one simulation after the other.
 
-    Links go through one link, `_hop`, whose time of access tells whether any of them was used. A time of modification
+    Links go through one link, `hop`, whose time of access tells whether any of them was used. A time of modification
     of 0 says that nothing was added or removed in a folder.
     """
 
-    def __init__(self, sender: Sender, is_remote: bool) -> None:
+    def __init__(self, sender: Sender) -> None:
         self.base, self.owner = sender.folder, os.getpid()
-        place = sender.place if os.path.isdir(sender.place) and not is_remote else _place(os.getpid())
+        place = sender.place if os.path.isdir(sender.place) and not _is_remote(sender) else _place(os.getpid())
         _places.add(place)
         self._place = os.path.join(place, str(os.getpid()))
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
-        self._hop = os.path.join(self._place, "from")
-        os.symlink(self.base or "/", self._hop)
-        _mark(self._hop)
+        self.hop = os.path.join(self._place, "from")
+        os.symlink(self.base or "/", self.hop)
+        _mark(self.hop)
         with contextlib.suppress(FileNotFoundError):
-            os.stat(self._hop)
-        self._has_access_times = os.lstat(self._hop).st_atime_ns != 0  # not on every file system
+            os.stat(self.hop)
+        self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
         self._private: set[str] = set()
         self._build()
 
     def _build(self) -> None:
         self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
-        self._files: dict[str, Stamp | None] = {}  # linked files
+        self._files: dict[str, tuple[str, Stamp | None]] = {}  # linked files: paths and stamps
         self._folders: dict[str, Stamp | None] = {"": _stamp(self.base)}  # folders of `base` that are shown
         waiting, left = [("", entry) for entry in _scan(self.base)], _MOST_BELOW
         while waiting:
@@ -302,9 +322,9 @@ class _Mirror:
             elif name not in self._private:
                 self._link(name)
                 if entry.is_file():
-                    self._files[name] = _stamp(entry.path)
+                    self._files[name] = self._stamped(name)
         self._entries = {name: self._noted(name) for name in self._folders}
-        _mark(self._hop)
+        _mark(self.hop)
 
     def _is_folder(self, name: str, entry: os.DirEntry) -> bool:
         """Whether a folder may be shown as a folder, not as a link."""
@@ -312,8 +332,12 @@ class _Mirror:
             return False
         return not self._place.startswith(entry.path + os.sep)
 
+    def _stamped(self, name: str) -> tuple[str, Stamp | None]:
+        path = os.path.join(self.base, name)
+        return path, _stamp(path)
+
     def _link(self, name: str) -> None:
-        os.symlink(os.path.join(self._hop, name), os.path.join(self.path, name))
+        os.symlink(os.path.join(self.hop, name), os.path.join(self.path, name))
         _mark(os.path.join(self.path, name))
 
     def _noted(self, name: str) -> dict[str, int]:
@@ -327,7 +351,7 @@ class _Mirror:
         """Show what `base` contains now, before a simulation."""
         for name, stamp in self._folders.items():
             folder = os.path.join(self.base, name)
-            if stamp is None or _stamp(folder) != stamp:
+            if stamp is None or _status(folder) != stamp:
                 self._folders[name] = _stamp(folder)
                 private = {os.path.basename(each) for each in self._private if os.path.dirname(each) == name}
                 if {entry.name for entry in _scan(folder)} - private != self._entries[name].keys():
@@ -339,15 +363,12 @@ class _Mirror:
 
     def was_written_through(self) -> bool:
         """Whether files of `base` have changed whose links were used; they are private from now on."""
-        if self._has_access_times and os.lstat(self._hop).st_atime_ns == 0:
+        if self._has_access_times and os.lstat(self.hop).st_atime_ns == 0:
             return False
-        written = set()
-        for name, stamp in self._files.items():
-            self._files[name] = _stamp(os.path.join(self.base, name))
-            if self._files[name] is None or self._files[name] != stamp:
-                if not self._has_access_times or _access(os.path.join(self.path, name)):
-                    written.add(name)
-        _mark(self._hop)
+        changed = [name for name, (path, stamp) in self._files.items() if stamp is None or _status(path) != stamp]
+        self._files |= {name: self._stamped(name) for name in changed}
+        written = {n for n in changed if not self._has_access_times or _access(os.path.join(self.path, n))}
+        _mark(self.hop)
         if written:
             self._private |= written
             self._anew()
@@ -375,9 +396,12 @@ class _Mirror:
                     shutil.rmtree(entry.path)
                 else:
                     os.unlink(entry.path)
-            for lost in entries.keys() - present:
-                self._link(os.path.join(name, lost))
-            self._entries[name] = self._noted(name)
+            if lost := entries.keys() - present:
+                for each in lost:
+                    self._link(os.path.join(name, each))
+                self._entries[name] = self._noted(name)
+            else:
+                os.utime(folder, ns=(0, 0))
 
     def _anew(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
@@ -403,10 +427,16 @@ def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:
     return []
 
 
-def _stamp(path: str) -> Stamp | None:
-    """None if there is no such file, or it may still change with the same time of modification."""
-    with contextlib.suppress(OSError):
+def _status(path: str) -> Stamp | None:
+    """Stamp of a file; None if there is none."""
+    try:
         status = os.stat(path)
-        if status.st_mtime_ns < time.time_ns() - _CLOCK_TICK:
-            return status.st_mtime_ns, status.st_size, status.st_ino
-    return None
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def _stamp(path: str) -> Stamp | None:
+    """Stamp of a file; None if there is none, or if the file may still change with the same time of modification."""
+    stamp = _status(path)
+    return None if stamp is None or stamp[0] > time.time_ns() - _CLOCK_TICK else stamp

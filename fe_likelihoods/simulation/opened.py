@@ -18,7 +18,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .folder import Sender, run_in_folder, shown
+from .folder import Sender, get_ready, run_in_folder, shown
 from .shared_files import warn_of_shared_files
 
 __all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
@@ -92,6 +92,8 @@ class Observed:
 
     def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
         self.function, self._sender = function, sender
+        if sender is not None:
+            get_ready(sender)
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened | None = None
 

@@ -37,6 +37,7 @@ _CACHES_OF_NUMBA = (".nbi", ".nbc")
 
 _running: "dict[int, RunningSimulation]" = {}  # by thread; 0 for all threads of a process that runs one at a time
 _own = threading.local()
+when_waiting: Callable[[bool], None] = bool  # called when a simulation begins and ends to wait for the lock
 _has_hook = False
 _warned: set[str] = set()
 
@@ -63,7 +64,7 @@ class RunningSimulation:
 
     def __init__(self, place: str, thread: int, is_remote: bool) -> None:
         self.place, self._thread, self._is_remote = place, thread, is_remote
-        self.shared, self.has_programs = "", False
+        self.shared, self.has_programs, self._process = "", False, os.getpid()
         self._made: set[str] = set()  # files and folders
         self._lock: int | None = None
         self._refusal: UnusableModel | None = None
@@ -84,7 +85,7 @@ class RunningSimulation:
             return function(item)
         finally:
             del _running[self._thread]
-            if self._lock is not None:
+            if self._lock is not None and self._process == os.getpid():  # not in a copy of the process
                 fcntl.flock(self._lock, fcntl.LOCK_UN)  # processes that it has started may have the file open
                 os.close(self._lock)
                 self._lock = None
@@ -157,7 +158,12 @@ class RunningSimulation:
         self.shared = shown
         lock = os.path.join(temporary, f"fe_likelihoods_{os.getuid()}.lock")
         self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            when_waiting(True)
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+            when_waiting(False)
 
     def _is_own(self, path: str) -> bool:
         return bool(self.place) and path.startswith(self.place + os.sep)

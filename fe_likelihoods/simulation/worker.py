@@ -29,6 +29,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from . import shared_files
 from .by_value import Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
 from .folder import discard, serves, working_folder
@@ -40,6 +41,7 @@ _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
+_WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
@@ -83,12 +85,14 @@ class Worker:
     ----------
     keys, calls
         Keys of the functions that are loaded (`Pickled`); number of items that were sent.
+    waits
+        Whether its simulation waits for another one (`fe_likelihoods.simulation.shared_files`), as far as received.
     kept
         Where the folder of a failed simulation was kept, to be added to the reason; "" before `kill`.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        self.output, self.kept = output, ""
+        self.output, self.kept, self.waits = output, "", False
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -143,13 +147,17 @@ class Worker:
         """The answer, None if there is none within `seconds`; WorkerDied if the process has died."""
         stop = math.inf if seconds is None else time.monotonic() + seconds
         try:
-            while not self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+            while True:
+                if self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+                    message = self._connection.recv_bytes()
+                    if message not in _WAITS:
+                        return Answer(*pickle.loads(message))
+                    self.waits = message == _WAITS[True]
                 # a program that the function has started may hold the connection open
-                if _ended(self._process) and not self._poll(0):
+                elif _ended(self._process) and not self._poll(0):
                     raise EOFError
-                if time.monotonic() >= stop:
+                elif time.monotonic() >= stop:
                     return None
-            return Answer(*pickle.loads(self._connection.recv_bytes()))
         except (EOFError, OSError):
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
@@ -230,6 +238,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
     serves()
     functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
+        shared_files.when_waiting = lambda waits: connection.send_bytes(_WAITS[waits])
         while True:
             try:
                 message = memoryview(connection.recv_bytes())
