@@ -23,6 +23,7 @@ CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distribute
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}, "pints": {"pints"}, "nautilus": {"nautilus"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
 WORKERS = {"faults", "by_value", "user_code", "worker", "local_pool", "sandbox", "program_supervisor", "programs"}
+WORKERS |= {"folder", "shared_files"}
 ON_TOP_OF_BOTH = ("fe_likelihoods/reporting/", "fe_likelihoods/command/", "fe_likelihoods/__main__.py")
 
 

@@ -167,7 +167,8 @@ def _run_in_mirror(
             return result, error, ""
         is_wanted = mirror.was_written_through()
     reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
-    kept = keep_folder(Path(mirror.path), sender.keep, reason) if reason and sender.keep else None
+    is_kept = reason and sender.keep and mirror.has_changed
+    kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
     mirror.clean(anew=kept is not None or (simulation.has_programs and _has_children()))
     if kept is not None and not isinstance(error, UnusableModel):
         reason = _with(reason, f" (its folder is {kept})")
@@ -373,6 +374,11 @@ class _Mirror:
             self._private |= written
             self._anew()
         return bool(written)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether a simulation has added or removed files."""
+        return any((_status(os.path.join(self.path, name)) or (1,))[0] != 0 for name in self._folders)
 
     def clean(self, anew: bool) -> None:
         """Remove what a simulation has left; with `anew`, the next simulation gets a folder of another name."""
