@@ -25,7 +25,7 @@ from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, raise_if_it_ends_the_run, reason_of, shortened
 from .folder import Sender, in_worker, run_in_folder
 from .opened import Observed, note, unpack
-from .shared_files import warn_of_shared_files
+from .shared_files import warn_or_refuse
 
 __all__ = [
     "ContinuedResponse",
@@ -429,7 +429,7 @@ def _run_each(
 
 def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
     result, shared = run_in_folder(run, theta, sender)
-    warn_of_shared_files(shared, None)
+    warn_or_refuse(shared, None)
     return result
 
 

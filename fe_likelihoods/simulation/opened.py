@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .folder import Sender, get_ready, run_in_folder, shown
-from .shared_files import warn_of_shared_files
+from .shared_files import warn_or_refuse, worse
 
 __all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
 
@@ -51,7 +51,7 @@ class Opened(NamedTuple):
         return {name: " ".join(sorted(digests)) for name, digests in found.items()}
 
     def __or__(self, other: "Opened") -> "Opened":
-        return Opened(self.files | other.files, self.shared or other.shared)
+        return Opened(self.files | other.files, worse(self.shared, other.shared))
 
     def read_again(self) -> "Opened":
         """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
@@ -73,7 +73,7 @@ class _Observer:
         files, shared = ({}, "") if known is None else known
         if known is not None and self.noted.keys() <= files.keys() and len(sys.modules) == len(self.modules):
             if not any(path not in files and _counts(path) for path in self.read - self.written):
-                if bool(shared) or not self.shared:
+                if worse(shared, self.shared) is shared:
                     return None
         new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
         read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
@@ -107,7 +107,7 @@ class Observed:
         """The result for an item, and what was opened."""
         with observing() as observer:
             result, shared = run_in_folder(self.function, item, self._sender)
-            observer.shared = observer.shared or shared
+            observer.shared = worse(observer.shared, shared)
         new = observer.result(self._known)
         if new is not None:
             self._known = new if self._known is None else new | self._known
@@ -118,12 +118,12 @@ class Observed:
 def unpack(outcome: tuple, pool: Any) -> tuple[Any, Opened | None]:
     """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only.
 
-    Warns if simulations write files that they share.
+    Warns if simulations write files that they share; `UnusableModel` if that cannot be done one after the other.
     """
     if isinstance(outcome[1], str):
         return outcome, None
     if outcome[1] is not None:
-        warn_of_shared_files(outcome[1].shared, getattr(pool, "n_workers", None))
+        warn_or_refuse(outcome[1].shared, getattr(pool, "n_workers", None))
     return outcome
 
 
@@ -149,7 +149,7 @@ def note(opened: Opened | None) -> None:
     if opened is not None:
         for observer in list(_observers):
             observer.noted.update(opened.files)
-            observer.shared = observer.shared or opened.shared
+            observer.shared = worse(observer.shared, opened.shared)
 
 
 def file_digest(path: str | os.PathLike) -> str:

@@ -4,7 +4,8 @@ An audit hook (`sys.addaudithook`) sees what Python code is about to write. A fi
 folder, which the simulation has not made exclusively, may belong to other simulations too. Before such a write, the
 simulation waits for a lock, which all simulations of this user share on this machine, and holds it to its end.
 
-Not seen are files that compiled code or a program writes by an absolute path.
+Compiled code and programs write without an event. A file that they have written by an absolute path is noticed when
+Python code reads it: it has changed since the simulation began. If that happens twice, the model is refused.
 """
 
 import contextlib
@@ -15,6 +16,7 @@ import stat
 import sys
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,15 +25,18 @@ from .faults import UnusableModel
 
 __all__ = [
     "RunningSimulation",
+    "UnguardedFile",
     "holds_lock",
     "of_this_library",
     "running_simulation",
     "sender_holds_lock",
-    "warn_of_shared_files",
+    "warn_or_refuse",
+    "worse",
 ]
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _TEMPORARY = getattr(os, "O_TMPFILE", 0)  # a file without a name
+_SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
 _CACHES = {"__pycache__", ".cache", ".config"}  # written once per machine, by installed packages
 _CACHES_OF_NUMBA = (".nbi", ".nbc")
 
@@ -40,6 +45,16 @@ _own = threading.local()
 when_waiting: Callable[[bool], None] = bool  # called when a simulation begins and ends to wait for the lock
 _has_hook = False
 _warned: set[str] = set()
+_fresh: set[str] = set()  # files that simulations have read and that were written while they ran
+
+
+class UnguardedFile(str):
+    """Path of a file that simulations running at once write without an event, so that they cannot wait."""
+
+
+def worse(path: str, other: str) -> str:
+    """The more important one of two files that simulations share; "" for none."""
+    return other if isinstance(other, UnguardedFile) else path or other
 
 
 class RunningSimulation:
@@ -67,6 +82,7 @@ class RunningSimulation:
         self.shared, self.has_programs, self._process = "", False, os.getpid()
         self._made: set[str] = set()  # files and folders
         self._lock: int | None = None
+        self._start = time.time_ns()
         self._refusal: UnusableModel | None = None
 
     @property
@@ -96,7 +112,10 @@ class RunningSimulation:
 
     def opens(self, path: Any, mode: Any, flags: int) -> None:
         """A link in the own folder is replaced by a private file before it is opened for writing."""
-        if not flags & _WRITING or (_TEMPORARY and flags & _TEMPORARY == _TEMPORARY):
+        if not flags & _WRITING:
+            self.reads(path)
+            return
+        if _TEMPORARY and flags & _TEMPORARY == _TEMPORARY:
             return
         if (path := _full(path)) is None:
             return
@@ -110,6 +129,24 @@ class RunningSimulation:
             self.makes(path)
         elif not flags & os.O_APPEND:
             self.writes(path)
+
+    def reads(self, path: Any) -> None:
+        """Notice a file that was written while this simulation runs, but not by Python code of this simulation."""
+        if self.locked or not isinstance(path, str | bytes | os.PathLike):
+            return
+        path = os.path.abspath(os.fsdecode(path))
+        if path.startswith(_SYSTEM) or self._is_own(path):
+            return
+        with contextlib.suppress(OSError):
+            status = os.stat(path)
+            if not self._start <= status.st_mtime_ns <= time.time_ns() or not stat.S_ISREG(status.st_mode):
+                return
+            path = _full(path)
+            if self._is_own(path) or _is_cache(path) or self._has_made(path):
+                return
+            if path in _fresh:
+                self.shared = UnguardedFile(path)
+            _fresh.add(path)
 
     def makes(self, path: Any, *_: Any) -> None:
         if (path := _full(path)) is not None and not os.path.lexists(path):
@@ -142,7 +179,7 @@ class RunningSimulation:
         """Wait for the lock before a file is written, unless it belongs to this simulation alone."""
         if (path := _full(path)) is None or self._is_own(path) or self.locked or _is_cache(path):
             return
-        if any(path == made or path.startswith(made + os.sep) for made in self._made):
+        if self._has_made(path):
             return
         if os.path.exists(path) and not stat.S_ISREG(os.stat(path).st_mode):  # a terminal, a pipe, /dev/null
             return
@@ -155,7 +192,7 @@ class RunningSimulation:
                 "(docs/parallel.rst)"
             )
             raise self._refusal
-        self.shared = shown
+        self.shared = worse(shown, self.shared)
         lock = os.path.join(temporary, f"fe_likelihoods_{os.getuid()}.lock")
         self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:
@@ -164,6 +201,9 @@ class RunningSimulation:
             when_waiting(True)
             fcntl.flock(self._lock, fcntl.LOCK_EX)
             when_waiting(False)
+
+    def _has_made(self, path: str) -> bool:
+        return any(path == made or path.startswith(made + os.sep) for made in self._made)
 
     def _is_own(self, path: str) -> bool:
         return bool(self.place) and path.startswith(self.place + os.sep)
@@ -217,14 +257,24 @@ def sender_holds_lock(locked: bool) -> None:
     _own.sender_holds_lock = locked
 
 
-def warn_of_shared_files(path: str, n_workers: int | None) -> None:
-    """Warn, once for each folder, that simulations run one after the other, since they may write the same file."""
-    if path and n_workers != 1 and os.path.dirname(path) not in _warned:
+def warn_or_refuse(path: str, n_workers: int | None) -> None:
+    """Warn, once for each folder, that simulations run one after the other, since they may write the same file.
+
+    `UnusableModel` for an `UnguardedFile`. Nothing if there is one worker only, or `path` is "".
+    """
+    if not path or n_workers == 1:
+        return
+    advice = "a relative file name, which is private to each simulation (docs/parallel.rst)"
+    if isinstance(path, UnguardedFile):
+        raise UnusableModel(
+            f"The simulations read {path}, which a program or compiled code writes while they run, so that simulations "
+            f"in other workers may write it too: use {advice}, or pool=1"
+        )
+    if os.path.dirname(path) not in _warned:
         _warned.add(os.path.dirname(path))
         warnings.warn(
             f"The simulations write to {path}, where simulations in other workers may write too, so they run one after "
-            "the other from their first write on. Use a pool of processes and a relative file name, which is private "
-            "to each simulation (docs/parallel.rst)",
+            f"the other from their first write on. Use a pool of processes and {advice}",
             stacklevel=2,
         )
 

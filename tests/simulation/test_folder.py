@@ -259,7 +259,8 @@ def test_simulations_that_write_an_absolute_path_do_not_overlap(write, start, po
     with pytest.warns(UserWarning, match="relative file name, which is private") as warned:
         assert_right(lambda theta: write(str(path), theta), pool)
         assert_right(lambda theta: write(str(path), theta), pool)
-    assert len(warned) == 1 and str(path.parent) in str(warned[0].message)
+    [text] = [str(each.message) for each in warned if each.category is UserWarning]
+    assert str(path.parent) in text
     assert Path.cwd() == start
 
 
@@ -318,6 +319,29 @@ def test_a_simulation_that_holds_the_lock_may_run_an_isolated_model_that_writes_
     isolated = model(lambda theta: write_and_read(path, theta), isolated=True)
     with pytest.warns(UserWarning, match="one after the other"):
         assert_right(outer, pool, THETAS[:6])
+
+
+def test_an_absolute_path_of_a_program_is_refused_with_several_workers(start, pool, tmp_path_factory):
+    def program(theta):
+        command = ["/bin/sh", "-c", f'sleep 0.01; echo "$0" "$1" > {path}', *map(repr, theta.tolist())]
+        subprocess.run(command, check=True)
+        return [[float(word) for word in Path(path).read_text().split()]]
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    with LocalPool(1) as one:
+        assert_right(program, one, THETAS[:4])
+    with pytest.raises(UnusableModel, match="use a relative file name, .* or pool=1"):
+        simulate_batch(model(program), THETAS, pool)
+
+
+def test_an_input_file_that_is_written_before_each_batch_is_no_reason_to_refuse(start, pool, tmp_path_factory):
+    def read(theta):
+        return [[float(Path(path).read_text()), theta[1]]]
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    for k in range(6):
+        Path(path).write_text(str(k))
+        assert simulate_batch(model(read), THETAS[:4], pool).response[:, 0, 0].tolist() == [float(k)] * 4
 
 
 def test_a_disk_that_machines_share_is_refused(start, tmp_path_factory, monkeypatch):
