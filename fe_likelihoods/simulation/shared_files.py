@@ -127,6 +127,8 @@ class RunningSimulation:
                     shutil.copyfile(target, path)
         elif flags & os.O_EXCL:
             self.makes(path)
+        elif mode is None and not flags & (os.O_RDWR | os.O_TRUNC):  # Path.touch
+            return
         elif not flags & os.O_APPEND:
             self.writes(path)
 

@@ -278,6 +278,7 @@ def test_files_that_no_other_simulation_writes_are_no_reason_to_wait(start, pool
             os.replace(Path(place, "in.txt").absolute().as_posix(), f"{place}/b") if Path(
                 place, "in.txt"
             ).exists() else 0
+            Path(f"{log}.mark").touch()
             with open(log, "a") as text:
                 text.write("x")
             return write_and_read(f"{place}/in.txt", theta)
