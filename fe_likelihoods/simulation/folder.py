@@ -147,7 +147,7 @@ def _mirror_for(sender: Sender) -> "_Mirror":
 
 def _run_in_mirror(
     mirror: "_Mirror", function: Callable[[Any], Any], item: Any, sender: Sender, thread: int
-) -> tuple[Any, Exception | None, str]:
+) -> tuple[Any, BaseException | None, str]:
     """Result or exception of a simulation, and the first file that it shares with others."""
     is_wanted = True
     while is_wanted:
@@ -158,19 +158,19 @@ def _run_in_mirror(
         os.chdir(mirror.path)
         try:
             result = simulation.run(function, argument)
-        except Exception as raised:
+        except BaseException as raised:
             error = raised
         finally:
             with contextlib.suppress(FileNotFoundError):
                 os.chdir(before)
         if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
             return result, error, ""
-        is_wanted = mirror.was_written_through()
+        is_wanted = mirror.was_written_through() and not isinstance(error, KeyboardInterrupt)
     reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
     is_kept = reason and sender.keep and mirror.has_changed
     kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
     mirror.clean(anew=kept is not None or (simulation.has_programs and _has_children()))
-    if kept is not None and not isinstance(error, UnusableModel):
+    if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
         reason = _with(reason, f" (its folder is {kept})")
         error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
     return result, error, simulation.shared

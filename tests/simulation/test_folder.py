@@ -170,6 +170,16 @@ def test_nothing_is_left_for_the_next_simulation(start, pool):
     assert {str(path.relative_to(start)) for path in start.rglob("*")} == set(expected)
 
 
+def test_nothing_is_left_by_a_simulation_that_exits(start):
+    def exits(theta):
+        assert os.listdir() == []
+        Path("left.txt").write_text("left")
+        sys.exit("no convergence")
+
+    reasons = simulate_batch(model(exits, isolated=True), THETAS[:3]).reasons
+    assert ["no convergence" in reason for reason in reasons] == [True] * 3
+
+
 def test_an_isolated_function_has_a_folder_and_pool_none_has_not(start):
     thetas = THETAS[:2]
     assert_right(lambda theta: write_and_read("in.txt", theta), None, thetas, isolated=True)
