@@ -22,7 +22,8 @@ PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy", "umbridge"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-WORKERS = {"faults", "interrupts", "by_value", "user_code", "worker", "local_pool", "sandbox"} | {
+WORKERS = {"faults", "interrupts", "folder", "shared_files", "by_value", "user_code", "worker", "local_pool"} | {
+    "sandbox",
     "program_supervisor",
     "programs",
 }

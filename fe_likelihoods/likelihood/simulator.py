@@ -504,7 +504,7 @@ class Simulator:
                     running.received = True
                     pool.running.pop((running.key, responses), None)
                     try:
-                        outcome, opened = unpack(running.future.result())
+                        outcome, opened = unpack(running.future.result(), self.pool)
                         self._checked.complete(opened)
                         outcomes.append(outcome)
                         some.append(running)

@@ -22,6 +22,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.faults import RunFailed, TransientReason, reason_of
+from ..simulation.folder import keep_folder
 from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
@@ -346,19 +347,9 @@ class ExecutableModel(UserModel):
 
     def _keep(self, place: Path, values: dict[str, str], reason: str, seconds: float) -> None:
         """Move the folder of a failed run to `keep_failures`."""
-        if self.keep_failures is None:
-            return
-        with suppress(OSError):  # a full disk must not hide the reason of the failure
-            self.keep_failures.mkdir(parents=True, exist_ok=True)
-            if len(list(self.keep_failures.glob("failure_*"))) >= self.max_kept:
-                return
-            text = f"{reason}\nafter {seconds:.3g} s\n" + "".join(
-                f"{name} = {value}\n" for name, value in values.items()
-            )
-            (place / "reason.txt").write_text(text)
-            kept = tempfile.mkdtemp(prefix="failure_", dir=self.keep_failures)
-            for path in place.iterdir():
-                shutil.move(path, kept)
+        if self.keep_failures is not None:
+            lines = [reason, f"after {seconds:.3g} s", *(f"{name} = {value}" for name, value in values.items())]
+            keep_folder(place, self.keep_failures, "\n".join(lines) + "\n", self.max_kept)
 
 
 def _executable(name: str) -> str:

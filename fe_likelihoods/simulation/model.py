@@ -21,14 +21,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from samplers.interrupts import interrupts_end_the_run
+from samplers.interrupts import interrupts_end_the_run, is_worker
 
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
+from .folder import Sender, run_in_folder
 from .interrupts import raise_if_it_ends_the_run
 from .opened import Observed, note, unpack
+from .shared_files import warn_or_refuse
 
 __all__ = [
     "MisfitBatch",
@@ -401,11 +403,13 @@ def _run_each(
 ) -> tuple[np.ndarray, list[str]]:
     """Run simulations one by one, in this process or in the pool's workers."""
     if pool is None:
+        if is_worker():  # of the pool of a sampler
+            run = partial(_in_folder, run, Sender.of_this_worker())
         outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
         for outcome in pool.map(Observed(run), list(thetas)):
-            result, opened = unpack(outcome)
+            result, opened = unpack(outcome, pool)
             outcomes.append(result)
             note(opened)
     values = np.full((len(thetas), *shape), np.nan)
@@ -413,6 +417,12 @@ def _run_each(
         if result is not None:
             row[...] = result
     return values, [reason for _, reason in outcomes]
+
+
+def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
+    result, shared = run_in_folder(run, theta, sender)
+    warn_or_refuse(shared, None)
+    return result
 
 
 @contextmanager

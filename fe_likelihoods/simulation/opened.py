@@ -18,6 +18,9 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .folder import Sender, get_ready, run_in_folder, shown
+from .shared_files import warn_or_refuse, worse
+
 __all__ = ["Observed", "Opened", "file_digest", "note", "observing", "unpack"]
 
 _MOST_REPEATED = 100  # if more files were opened, a result names the new ones only
@@ -32,9 +35,13 @@ _digests: dict[str, tuple[tuple, float, str]] = {}
 
 
 class Opened(NamedTuple):
-    """What one simulation opened: digests of the contents of files, by path."""
+    """What one simulation opened: digests of the contents of files, by path.
+
+    `shared` is a file that it has written and that other simulations may write too; "" if there is none.
+    """
 
     files: dict[str, str]
+    shared: str = ""
 
     def items(self) -> dict[str, str]:
         """Digests by file name, so that the folder does not matter."""
@@ -44,7 +51,7 @@ class Opened(NamedTuple):
         return {name: " ".join(sorted(digests)) for name, digests in found.items()}
 
     def __or__(self, other: "Opened") -> "Opened":
-        return Opened(self.files | other.files)
+        return Opened(self.files | other.files, worse(self.shared, other.shared))
 
     def read_again(self) -> "Opened":
         """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
@@ -58,29 +65,35 @@ class _Observer:
         self.read: set[str] = set()
         self.written: set[str] = set()
         self.noted: dict[str, str] = {}
+        self.shared = ""
         self.modules = set(sys.modules)
 
     def result(self, known: Opened | None = None) -> Opened | None:
         """Files that were read and not written, including new modules and shared libraries; None if all are known."""
-        files = {} if known is None else known.files
+        files, shared = ({}, "") if known is None else known
         if known is not None and self.noted.keys() <= files.keys() and len(sys.modules) == len(self.modules):
             if not any(path not in files and _counts(path) for path in self.read - self.written):
-                return None
+                if worse(shared, self.shared) is shared:
+                    return None
         new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
         read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
         files = {path: _digest_or(path, "") for path in read - self.written if _counts(path)}
-        return Opened({path: digest for path, digest in files.items() if digest} | self.noted)
+        return Opened({path: digest for path, digest in files.items() if digest} | self.noted, self.shared)
 
 
 class Observed:
     """A function of one item for other processes, whose results include what it opened there.
 
+    In other processes, it is called in a working folder of its own (`fe_likelihoods.simulation.folder`).
+
     A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
     files if there are more than 100 in all; None if there is nothing to report.
     """
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
+        self.function, self._sender = function, sender
+        if sender is not None:
+            get_ready(sender)
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened | None = None
 
@@ -88,12 +101,13 @@ class Observed:
         return repr(self.function)
 
     def __reduce__(self) -> tuple:
-        return Observed, (self.function,)
+        return Observed, (self.function, self._sender or Sender.here())
 
     def __call__(self, item: Any) -> tuple[Any, Opened | None]:
         """The result for an item, and what was opened."""
         with observing() as observer:
-            result = self.function(item)
+            result, shared = run_in_folder(self.function, item, self._sender)
+            observer.shared = worse(observer.shared, shared)
         new = observer.result(self._known)
         if new is not None:
             self._known = new if self._known is None else new | self._known
@@ -101,9 +115,16 @@ class Observed:
         return result, self._known if len(self._known.files) <= _MOST_REPEATED else new
 
 
-def unpack(outcome: tuple) -> tuple[Any, Opened | None]:
-    """Simulation result from a worker, and what it opened; for a lost worker, the pool reports a result only."""
-    return (outcome, None) if isinstance(outcome[1], str) else outcome
+def unpack(outcome: tuple, pool: Any) -> tuple[Any, Opened | None]:
+    """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only.
+
+    Warns if simulations write files that they share; `UnusableModel` if that cannot be done one after the other.
+    """
+    if isinstance(outcome[1], str):
+        return outcome, None
+    if outcome[1] is not None:
+        warn_or_refuse(outcome[1].shared, getattr(pool, "n_workers", None))
+    return outcome
 
 
 @contextlib.contextmanager
@@ -128,6 +149,7 @@ def note(opened: Opened | None) -> None:
     if opened is not None:
         for observer in list(_observers):
             observer.noted.update(opened.files)
+            observer.shared = worse(observer.shared, opened.shared)
 
 
 def file_digest(path: str | os.PathLike) -> str:
@@ -168,7 +190,8 @@ def _hook(event: str, arguments: tuple) -> None:
 
 def _add(path: Any, writes: bool) -> None:
     if isinstance(path, str | bytes | os.PathLike):
-        path = os.path.abspath(os.fsdecode(path))
+        if (path := shown(os.path.abspath(os.fsdecode(path)))) is None:
+            return
         for observer in list(_observers):
             (observer.written if writes else observer.read).add(path)
 

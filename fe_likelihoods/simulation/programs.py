@@ -17,6 +17,7 @@ from pathlib import Path
 
 from . import program_supervisor
 from .faults import RunFailed, TransientReason
+from .shared_files import of_this_library
 
 __all__ = ["run_program"]
 
@@ -29,15 +30,16 @@ class _Supervisor:
     """A supervisor process, seen from the process that uses it."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", program_supervisor.__file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-            bufsize=0,
-            cwd="/",
-        )
+        with of_this_library():
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", program_supervisor.__file__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+                bufsize=0,
+                cwd="/",
+            )
         self._owner = os.getpid()
         self._end = weakref.finalize(self, _end, self._process, self._owner)
 

@@ -30,7 +30,7 @@ class Sandbox:
     function : callable
         Takes one argument. ValueError if it cannot be sent to another process.
     time_limit : float, optional
-        Largest duration of a call [s], without the start of the process.
+        Largest duration of a call [s], without the start of the process and without waiting for other simulations.
     memory_limit : int
         Limit of the process's address space [bytes]; 0 for no limit.
     max_output : int
@@ -65,10 +65,12 @@ class Sandbox:
         try:
             worker.send(item)
             answer = self._receive(worker, start)
-        except BaseException as error:
+        except RunFailed as error:
+            worker.kill(error.reason)
+            reason = error.reason.with_text(error.reason + worker.kept)
+            raise RunFailed(reason, time.monotonic() - start) from None
+        except BaseException:
             worker.kill()
-            if isinstance(error, RunFailed):
-                raise RunFailed(error.reason, time.monotonic() - start) from None
             raise
         if worker.calls >= (self.runs_per_process or math.inf):
             worker.kill()
@@ -106,7 +108,9 @@ class Sandbox:
         """Answer of a worker; RunFailed if there is none within the limit, or it dies or prints too much."""
         limit = math.inf if self.time_limit is None else self.time_limit
         while (left := start + limit - time.monotonic()) > 0.0:
+            before = time.monotonic()
             answer = worker.receive(min(left, _POLL_INTERVAL))
+            start += time.monotonic() - before if worker.waits else 0.0
             if os.fstat(worker.output.fileno()).st_size > self.max_output:
                 raise RunFailed(TransientReason(f"stopped because it printed more than {self.max_output} bytes"))
             if answer is not None:

@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -29,8 +29,13 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from samplers.interrupts import become_worker
+
+from . import shared_files
 from .by_value import Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
+from .folder import discard, working_folder
+from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
 __all__ = ["Answer", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
 
@@ -38,6 +43,7 @@ _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
+_WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
@@ -58,6 +64,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew_starter)
 
 
+def _start(start: Callable[[], subprocess.Popen]) -> subprocess.Popen:
+    with of_this_library():
+        return start()
+
+
 class Worker:
     """A process that calls a function. Its methods may be called from one thread, apart from `kill`.
 
@@ -76,10 +87,14 @@ class Worker:
     ----------
     keys, calls
         Keys of the functions that are loaded (`Pickled`); number of items that were sent.
+    waits
+        Whether its simulation waits for another one (`fe_likelihoods.simulation.shared_files`), as far as received.
+    kept
+        Where the folder of a failed simulation was kept, to be added to the reason; "" before `kill`.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        self.output = output
+        self.output, self.kept, self.waits = output, "", False
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -93,8 +108,9 @@ class Worker:
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
+                cwd=working_folder() or None,
             )
-            self._process = _starter.submit(start).result()
+            self._process = _starter.submit(_start, start).result()
         readable = select.poll()  # kept, since Connection.poll makes one for each call
         readable.register(self._connection, select.POLLIN)
         self._poll = readable.poll
@@ -126,25 +142,29 @@ class Worker:
     def send(self, item: Any) -> None:
         """Send an item for the function that was loaded last; `receive` returns the answer."""
         self.keys.use(self._key)
-        self._send(self._key + pickle.dumps(item, protocol=5))
+        self._send(self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5))
         self.calls += 1
 
     def receive(self, seconds: float | None = None) -> "Answer | None":
         """The answer, None if there is none within `seconds`; WorkerDied if the process has died."""
         stop = math.inf if seconds is None else time.monotonic() + seconds
         try:
-            while not self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+            while True:
+                if self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+                    message = self._connection.recv_bytes()
+                    if message not in _WAITS:
+                        return Answer(*pickle.loads(message))
+                    self.waits = message == _WAITS[True]
                 # a program that the function has started may hold the connection open
-                if _ended(self._process) and not self._poll(0):
+                elif _ended(self._process) and not self._poll(0):
                     raise EOFError
-                if time.monotonic() >= stop:
+                elif time.monotonic() >= stop:
                     return None
-            return Answer(*pickle.loads(self._connection.recv_bytes()))
         except (EOFError, OSError):
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
-            reason = describe_exit(self.kill(), "the worker process")
+            reason = describe_exit(self.kill("the worker process died"), "the worker process") + self.kept
             said = "" if self.output is None else last_lines(self.output, 1)
             raise WorkerDied(TransientReason("; ".join(filter(None, [reason, said])))) from None
 
@@ -152,9 +172,13 @@ class Worker:
         with suppress(OSError):  # `receive` reports that the process has died
             self._connection.send_bytes(message)
 
-    def kill(self) -> int:
-        """Kill the process and its session; returns its exit code, as in `subprocess`."""
+    def kill(self, reason: str = "") -> int:
+        """Kill the process and its session; returns its exit code, as in `subprocess`.
+
+        With the `reason` why its simulation has failed, the simulation's folder may be kept, see `kept`.
+        """
         self._end()
+        self.kept = discard(self._process.pid, reason)
         return self._process.wait()
 
 
@@ -213,8 +237,10 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
 
         resource.setrlimit(resource.RLIMIT_AS, (memory_limit, memory_limit))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent, which ends this process
+    become_worker()
     functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
+        shared_files.when_waiting = lambda waits: connection.send_bytes(_WAITS[waits])
         while True:
             try:
                 message = memoryview(connection.recv_bytes())
@@ -228,7 +254,8 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
                 else:
                     function = functions.use(bytes(message[:16]))
                     function.prepare()
-                    answer = _packed(function(pickle.loads(message[16:])))
+                    sender_holds_lock(bool(message[16]))
+                    answer = _packed(function(pickle.loads(message[17:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well

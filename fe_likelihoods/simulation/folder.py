@@ -1,0 +1,433 @@
+"""A working folder of its own for each simulation in a worker process.
+
+User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder.
+Simulations that shared a folder would read each other's files. So a worker process changes into a temporary folder for
+each simulation. This folder shows the sender's working folder: files as links, subfolders as folders with links. If
+Python code opens a link for writing, a private file takes its place first (`fe_likelihoods.simulation.shared_files`).
+If compiled code or a program has written through a link, this name is a private copy from then on, and the simulation
+is run again.
+
+Threads of one process share its working folder: there, simulations that write run one after the other.
+"""
+
+import atexit
+import contextlib
+import copy
+import functools
+import itertools
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .faults import RunFailed, TransientReason, UnusableModel, reason_of
+from .shared_files import RunningSimulation, of_this_library, running_simulation
+
+__all__ = [
+    "KEEP",
+    "Sender",
+    "discard",
+    "get_ready",
+    "keep_folder",
+    "run_in_folder",
+    "shown",
+    "working_folder",
+]
+
+KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
+_MOST_KEPT = 20
+_MOST_BELOW = 100  # entries of subfolders that are linked one by one; larger subfolders are links
+_DEEPEST = 3
+_CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
+
+_mirror: "_Mirror | None" = None
+_places: set[str] = set()  # folders for the folders of workers
+
+
+class Sender(NamedTuple):
+    """The process that sends simulations: its name, machine and working folder, a place for folders, and `KEEP`."""
+
+    process: str
+    machine: str
+    folder: str
+    place: str
+    keep: str
+
+    @classmethod
+    def here(cls) -> "Sender":
+        """This process."""
+        keep = os.path.abspath(os.environ[KEEP]) if os.environ.get(KEEP) else ""
+        return cls(_name(os.getpid()), os.uname().nodename, working_folder(), _place(os.getpid()), keep)
+
+    @classmethod
+    def of_this_worker(cls) -> "Sender":
+        """The process that this process works for, whose name is not known, in the working folder of this process."""
+        return cls.here()._replace(process="")
+
+
+@functools.cache
+def _name(pid: int) -> str:
+    """Random name of this process; a forked process has a different name."""
+    return os.urandom(16).hex()
+
+
+def working_folder() -> str:
+    """Working folder of this process, also while a simulation runs in its own folder; "" if it was removed."""
+    simulation = running_simulation()
+    if simulation is not None and simulation.place and _mirror is not None:
+        return _mirror.base
+    with contextlib.suppress(FileNotFoundError):
+        return os.getcwd()
+    return ""
+
+
+def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None) -> tuple[Any, str]:
+    """Result of a function for one item, and the first file that the simulation shares with others, or "".
+
+    `sender` is the process that has sent the function; None if it was not sent.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    is_home = sender is None or sender.process == _name(os.getpid())
+    if running_simulation() is not None or (is_home and is_main):  # one after the other
+        return function(item), ""
+    thread = 0 if is_main else threading.get_ident()
+    if is_home or not (is_main or _is_only_thread_of_dask()):
+        simulation = RunningSimulation("", thread, _is_remote(sender))
+        return simulation.run(function, item), simulation.shared
+    try:
+        result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, sender, thread)
+    except OSError as failure:
+        text = f"the working folder of a simulation could not be made: {failure}"
+        raise RunFailed(TransientReason(text)) from failure
+    if error is not None:
+        raise error
+    return result, shared
+
+
+def _is_remote(sender: Sender | None) -> bool:
+    return sender is not None and sender.machine != os.uname().nodename
+
+
+def get_ready(sender: Sender) -> None:
+    """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if sender.process != _name(os.getpid()) and running_simulation() is None and is_main:
+        with contextlib.suppress(OSError):
+            _mirror_for(sender)
+
+
+def _mirror_for(sender: Sender) -> "_Mirror":
+    global _mirror
+    if _mirror is None or _mirror.base != sender.folder or _mirror.owner != os.getpid():
+        sys.path[:] = map(os.path.abspath, sys.path)
+        _mirror = _Mirror(sender)
+    return _mirror
+
+
+def _run_in_mirror(
+    mirror: "_Mirror", function: Callable[[Any], Any], item: Any, sender: Sender, thread: int
+) -> tuple[Any, BaseException | None, str]:
+    """Result or exception of a simulation, and the first file that it shares with others."""
+    is_wanted = True
+    while is_wanted:
+        mirror.prepare()
+        simulation, argument = RunningSimulation(mirror.path, thread, _is_remote(sender)), copy.deepcopy(item)
+        result = error = None
+        before = working_folder()
+        os.chdir(mirror.path)
+        try:
+            result = simulation.run(function, argument)
+        except BaseException as raised:
+            error = raised
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.chdir(before)
+        if mirror.owner != os.getpid():  # the simulation has forked, and its copy has returned as well
+            return result, error, ""
+        is_wanted = mirror.was_written_through() and not isinstance(error, KeyboardInterrupt)
+    reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
+    is_kept = reason and sender.keep and mirror.has_changed
+    kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
+    mirror.clean(anew=kept is not None or (simulation.has_programs and _has_children()))
+    if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
+        reason = _with(reason, f" (its folder is {kept})")
+        error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
+    return result, error, simulation.shared
+
+
+def _is_failure(result: Any) -> bool:
+    """Whether a result is an `Outcome` with a reason."""
+    return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
+
+
+def _with(reason: str, more: str) -> str:
+    """A longer reason of the same kind."""
+    text = reason + more
+    return reason.with_text(text) if isinstance(reason, TransientReason) else type(reason)(text)
+
+
+def _is_only_thread_of_dask() -> bool:
+    """Whether this is the thread of a dask worker that runs one task at a time."""
+    distributed = sys.modules.get("distributed")
+    try:
+        distributed.get_worker()
+        return [worker.state.nthreads for worker in distributed.Worker._instances] == [1]
+    except (AttributeError, ValueError):
+        return False
+
+
+def _has_children() -> bool:
+    """Whether this process has started processes that it has not waited for; they may still write."""
+    if not hasattr(os, "waitid"):  # macOS before Python 3.13
+        return True
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
+
+
+def shown(path: str) -> str | None:
+    """The file that a link in a simulation's own folder shows; None for the simulation's own file, else `path`."""
+    simulation = running_simulation()
+    if simulation is None or not simulation.place or not path.startswith(simulation.place + os.sep):
+        return path
+    with contextlib.suppress(OSError):
+        return os.readlink(path).replace(_mirror.hop, _mirror.base, 1)
+    path = os.path.realpath(path)  # a link among its folders
+    return None if path.startswith(simulation.place + os.sep) else path
+
+
+def keep_folder(place: Path, folder: str | Path, reason: str, most: int = _MOST_KEPT) -> Path | None:
+    """Move what a failed simulation has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
+
+    None if `most` folders are there already, or it fails: a full disk must not hide the reason of the failure.
+    """
+    folder = Path(folder)
+    with contextlib.suppress(OSError), of_this_library():
+        folder.mkdir(parents=True, exist_ok=True)
+        if len(list(folder.glob("failure_*"))) < most:
+            (place / "reason.txt").write_text(reason)
+            kept = tempfile.mkdtemp(prefix="failure_", dir=folder)
+            for path in place.iterdir():
+                shutil.move(path, kept)
+            return Path(kept)
+    return None
+
+
+# places -------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _place(pid: int) -> str:
+    """A temporary folder for the workers of this process, removed when this process ends, even if it is killed."""
+    with of_this_library():
+        place = os.path.realpath(tempfile.mkdtemp(prefix="fe_likelihoods_"))
+        # standard input closes when this process ends, and workers end a little later
+        remove = 'cat; for i in 1 2 3 4 5 6 7 8 9; do rm -rf "$0"; [ -e "$0" ] || exit; sleep 1; done'
+        process = subprocess.Popen(
+            ["/bin/sh", "-c", remove, place],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            start_new_session=True,
+        )
+    atexit.register(_remove, process, pid)
+    _places.add(place)
+    return place
+
+
+def _remove(process: subprocess.Popen, owner: int) -> None:
+    process.stdin.close()
+    if owner == os.getpid():
+        process.wait()
+
+
+def discard(process: int, reason: str = "") -> str:
+    """Remove the folder of a worker process that was killed; returns what to add to the reason of its simulation.
+
+    With the `reason` of a failure, the folder is kept if `KEEP` says so.
+    """
+    kept = None
+    for place in [os.path.join(place, str(process)) for place in _places]:
+        if os.path.isdir(place):
+            if reason and os.environ.get(KEEP):
+                kept = keep_folder(Path(place), os.environ[KEEP], reason)
+            shutil.rmtree(place, ignore_errors=True)
+    return "" if kept is None else f" (its folder is {kept})"
+
+
+Stamp = tuple[int, int, int]
+"""Time of modification [ns], size and inode of a file."""
+
+
+class _Mirror:
+    """A folder `path` that shows another folder, `base`, to one simulation after the other.
+
+    Links go through one link, `hop`, whose time of access tells whether any of them was used. A time of modification
+    of 0 says that nothing was added or removed in a folder.
+    """
+
+    def __init__(self, sender: Sender) -> None:
+        self.base, self.owner = sender.folder, os.getpid()
+        place = sender.place if os.path.isdir(sender.place) and not _is_remote(sender) else _place(os.getpid())
+        _places.add(place)
+        self._place = os.path.join(place, str(os.getpid()))
+        shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
+        os.mkdir(self._place)
+        self.hop = os.path.join(self._place, "from")
+        os.symlink(self.base or "/", self.hop)
+        _mark(self.hop)
+        with contextlib.suppress(FileNotFoundError):
+            os.stat(self.hop)
+        self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
+        self._private: set[str] = set()
+        self._build()
+
+    def _build(self) -> None:
+        self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
+        self._files: dict[str, tuple[str, Stamp | None]] = {}  # linked files: paths and stamps
+        self._folders: dict[str, Stamp | None] = {"": _stamp(self.base)}  # folders of `base` that are shown
+        waiting, left = [("", entry) for entry in _scan(self.base)], _MOST_BELOW
+        while waiting:
+            folder, entry = waiting.pop(0)
+            name = os.path.join(folder, entry.name)
+            entries = _scan(entry.path, left + 1) if self._is_folder(name, entry) else None
+            if entries is not None and len(entries) <= left:
+                left -= len(entries)
+                os.mkdir(os.path.join(self.path, name))
+                self._folders[name] = _stamp(entry.path)
+                waiting += [(name, each) for each in entries]
+            elif name not in self._private:
+                self._link(name)
+                if entry.is_file():
+                    self._files[name] = self._stamped(name)
+        self._entries = {name: self._noted(name) for name in self._folders}
+        _mark(self.hop)
+
+    def _is_folder(self, name: str, entry: os.DirEntry) -> bool:
+        """Whether a folder may be shown as a folder, not as a link."""
+        if not entry.is_dir(follow_symlinks=False) or entry.name.startswith(".") or name.count(os.sep) >= _DEEPEST:
+            return False
+        return not self._place.startswith(entry.path + os.sep)
+
+    def _stamped(self, name: str) -> tuple[str, Stamp | None]:
+        path = os.path.join(self.base, name)
+        return path, _stamp(path)
+
+    def _link(self, name: str) -> None:
+        os.symlink(os.path.join(self.hop, name), os.path.join(self.path, name))
+        _mark(os.path.join(self.path, name))
+
+    def _noted(self, name: str) -> dict[str, int]:
+        """Inodes of what a folder contains at the beginning of a simulation, by name."""
+        folder = os.path.join(self.path, name)
+        entries = {entry.name: entry.inode() for entry in _scan(folder)}
+        os.utime(folder, ns=(0, 0))
+        return entries
+
+    def prepare(self) -> None:
+        """Show what `base` contains now, before a simulation."""
+        for name, stamp in self._folders.items():
+            folder = os.path.join(self.base, name)
+            if stamp is None or _status(folder) != stamp:
+                self._folders[name] = _stamp(folder)
+                private = {os.path.basename(each) for each in self._private if os.path.dirname(each) == name}
+                if {entry.name for entry in _scan(folder)} - private != self._entries[name].keys():
+                    self._anew()
+                    break
+        for name in self._private:
+            with contextlib.suppress(FileNotFoundError):
+                shutil.copy2(os.path.join(self.base, name), os.path.join(self.path, name))
+
+    def was_written_through(self) -> bool:
+        """Whether files of `base` have changed whose links were used; they are private from now on."""
+        if self._has_access_times and os.lstat(self.hop).st_atime_ns == 0:
+            return False
+        changed = [name for name, (path, stamp) in self._files.items() if stamp is None or _status(path) != stamp]
+        self._files |= {name: self._stamped(name) for name in changed}
+        written = {n for n in changed if not self._has_access_times or _access(os.path.join(self.path, n))}
+        _mark(self.hop)
+        if written:
+            self._private |= written
+            self._anew()
+        return bool(written)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether a simulation has added or removed files."""
+        return any((_status(os.path.join(self.path, name)) or (1,))[0] != 0 for name in self._folders)
+
+    def clean(self, anew: bool) -> None:
+        """Remove what a simulation has left; with `anew`, the next simulation gets a folder of another name."""
+        anew = anew or not all(os.path.isdir(os.path.join(self.path, name)) for name in self._folders)
+        try:
+            self._tidy() if not anew else self._anew()
+        except OSError:  # it has made a folder that cannot be removed
+            self._anew()
+
+    def _tidy(self) -> None:
+        for name, entries in self._entries.items():
+            folder = os.path.join(self.path, name)
+            if os.stat(folder).st_mtime_ns == 0:
+                continue
+            present = set()
+            for entry in _scan(folder):
+                is_link = os.path.join(name, entry.name) not in self._folders
+                if entries.get(entry.name) == entry.inode() and entry.is_symlink() == is_link:
+                    present.add(entry.name)
+                elif entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path)
+                else:
+                    os.unlink(entry.path)
+            if lost := entries.keys() - present:
+                for each in lost:
+                    self._link(os.path.join(name, each))
+                self._entries[name] = self._noted(name)
+            else:
+                os.utime(folder, ns=(0, 0))
+
+    def _anew(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._build()
+
+
+def _mark(link: str) -> None:
+    """Set the time of access of a link to 0."""
+    os.utime(link, ns=(0, 0), follow_symlinks=False)
+
+
+def _access(link: str) -> int:
+    """Time of access of a link; 1 if it is not there any more."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.lstat(link).st_atime_ns
+    return 1
+
+
+def _scan(folder: str, most: int | None = None) -> list[os.DirEntry]:
+    """Entries of a folder, the first `most`; none if it cannot be read."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return list(itertools.islice(entries, most))
+    return []
+
+
+def _status(path: str) -> Stamp | None:
+    """Stamp of a file; None if there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def _stamp(path: str) -> Stamp | None:
+    """Stamp of a file; None if there is none, or if the file may still change with the same time of modification."""
+    stamp = _status(path)
+    return None if stamp is None or stamp[0] > time.time_ns() - _CLOCK_TICK else stamp

@@ -1,0 +1,468 @@
+"""Each simulation in a worker has a working folder of its own; simulations that write elsewhere do not overlap."""
+
+import contextlib
+import itertools
+import logging
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe_likelihoods.models.function import FunctionModel
+from fe_likelihoods.models.opensees import OpenSeesModel
+from fe_likelihoods.signals.channels import Channel
+from fe_likelihoods.simulation import folder, shared_files
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
+from fe_likelihoods.simulation.faults import UnusableModel
+from fe_likelihoods.simulation.folder import Sender, run_in_folder
+from fe_likelihoods.simulation.model import simulate_batch
+from fe_likelihoods.simulation.opened import Observed
+
+CHANNELS = [Channel("top", "displacement", "mm")]
+THETAS = np.random.default_rng(1).uniform(0.5, 1.5, (24, 2))
+
+
+def model(function, **options):
+    return FunctionModel(function, ["a", "b"], CHANNELS, 0.01, 2, **options)
+
+
+def write_and_read(path, theta):
+    """A wrapper of a program: its input file has the same name in every simulation."""
+    with open(path, "w") as file:
+        file.write(" ".join(repr(float(x)) for x in theta))
+    time.sleep(0.002)
+    return [[float(word) for word in Path(path).read_text().split()]]
+
+
+def of_program(theta):
+    command = [
+        "/bin/sh",
+        "-c",
+        'echo "$0" "$1" > in.txt; sleep 0.002; cat in.txt > out.txt',
+        *map(repr, theta.tolist()),
+    ]
+    subprocess.run(command, check=True)
+    return [[float(word) for word in Path("out.txt").read_text().split()]]
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with LocalPool(2) as pool:
+        yield pool
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """The working folder of this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(shared_files, "_warned", set())
+    return tmp_path
+
+
+def old(path, text):
+    """A file that was written long ago."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    os.utime(path, (1e9, 1e9))
+
+
+def assert_right(function, pool, thetas=THETAS, **options):
+    batch = simulate_batch(model(function, **options), thetas, as_executor(pool))
+    assert batch.reasons == [""] * len(thetas)
+    np.testing.assert_array_equal(batch.response[:, 0], thetas)
+
+
+# names inside of the folder -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["in.txt", "results/in.txt"])
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_fixed_relative_name_is_private_to_a_simulation(name, is_there, start, pool):
+    old(start / "results" / "notes.txt", "kept")
+    if is_there:
+        old(start / name, "1.0 1.0")
+    before = sorted(start.rglob("*"))
+    assert_right(lambda theta: write_and_read(name, theta), pool)
+    assert sorted(start.rglob("*")) == before
+    assert not is_there or (start / name).read_text() == "1.0 1.0"
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_program_with_fixed_names_runs_in_the_folder(is_there, start, pool):
+    if is_there:  # the program writes through the links: seen after the first simulation, which is run again
+        old(start / "in.txt", "1.0 1.0")
+        old(start / "out.txt", "1.0 1.0")
+    assert_right(of_program, pool, THETAS[:12])
+    assert is_there or list(start.iterdir()) == []
+
+
+def test_a_file_that_was_written_through_its_link_is_a_private_copy_afterwards(start, pool):
+    def append(theta):
+        subprocess.run(["/bin/sh", "-c", "echo 1 >> log.txt"], check=True)
+        return [[float(len(Path("log.txt").read_text().split()))] * 2]
+
+    old(start / "log.txt", "1\n")
+    with LocalPool(1) as one:
+        found = simulate_batch(model(append), THETAS[:4], one).response[:, 0, 0]
+    assert found.tolist() == [3.0] * 4  # the first simulation was run again
+    assert (start / "log.txt").read_text() == "1\n1\n"
+
+
+def test_a_file_that_others_write_meanwhile_is_read_from_one_simulation_of_the_file(start, pool):
+    """A file that a simulation reads, and that changes meanwhile: the simulation is run again with the new content."""
+
+    def reads_twice(theta):
+        first = Path("shared.txt").read_text()
+        if not Path("seen", "done").exists():
+            subprocess.run(["/bin/sh", "-c", f"echo 2 > {seen}/shared.txt; touch {seen}/seen/done"], check=True)
+        return [[float(first), float(Path("shared.txt").read_text())]]
+
+    seen = str(start)
+    (start / "seen").mkdir()
+    old(start / "shared.txt", "1")
+    with LocalPool(1) as one:
+        assert simulate_batch(model(reads_twice), THETAS[:2], one).response.tolist() == [[[2.0, 2.0]]] * 2
+
+
+def test_files_of_the_starting_folder_are_readable_as_they_are_now(start, pool):
+    def read(theta):
+        names = ["a.txt", "data/b.txt", ".hidden/c.txt", "1/2/3/4/5/d.txt", "late.txt"]
+        return [[float(sum(int(Path(name).read_text()) for name in names if Path(name).exists())), 0.0]]
+
+    for place, number in (("a.txt", 1), ("data/b.txt", 10), (".hidden/c.txt", 100), ("1/2/3/4/5/d.txt", 1000)):
+        (start / place).parent.mkdir(parents=True, exist_ok=True)
+        (start / place).write_text(str(number))
+    assert simulate_batch(model(read), THETAS, pool).response[:, 0, 0].tolist() == [1111.0] * len(THETAS)
+    (start / "late.txt").write_text("10000")
+    (start / "data" / "b.txt").write_text("20")
+    assert simulate_batch(model(read), THETAS, pool).response[:, 0, 0].tolist() == [11121.0] * len(THETAS)
+
+
+def test_nothing_is_left_for_the_next_simulation(start, pool):
+    def untidy(theta):
+        found = sorted(str(path) for path in Path().rglob("*"))
+        texts = [path.read_text() for path in sorted(Path().rglob("*.txt"))]
+        os.remove("a.txt")
+        Path("b.txt").write_text("changed")
+        os.rename("sub/c.txt", "sub/d.txt")
+        Path("new", "deep").mkdir(parents=True)
+        Path("new", "deep", "file").write_text("left")
+        if theta[0] > 1.0:
+            os.chdir("sub")
+            os.remove("d.txt")
+            os.chdir("..")
+            os.rmdir("sub")
+        return [[float(found == expected), float(texts == ["a", "b", "c"])]]
+
+    expected = ["a.txt", "b.txt", "sub", "sub/c.txt"]
+    for name in ("a.txt", "b.txt", "sub/c.txt"):
+        old(start / name, Path(name).stem)
+    assert simulate_batch(model(untidy), THETAS, pool).response.tolist() == [[[1.0, 1.0]]] * len(THETAS)
+    assert {str(path.relative_to(start)) for path in start.rglob("*")} == set(expected)
+
+
+def test_nothing_is_left_by_a_simulation_that_exits(start):
+    def exits(theta):
+        assert os.listdir() == []
+        Path("left.txt").write_text("left")
+        sys.exit("no convergence")
+
+    reasons = simulate_batch(model(exits, isolated=True), THETAS[:3]).reasons
+    assert ["no convergence" in reason for reason in reasons] == [True] * 3
+
+
+def test_an_isolated_function_has_a_folder_and_pool_none_has_not(start):
+    thetas = THETAS[:2]
+    assert_right(lambda theta: write_and_read("in.txt", theta), None, thetas, isolated=True)
+    assert list(start.iterdir()) == []
+    assert_right(lambda theta: write_and_read("in.txt", theta), None, thetas)
+    assert [path.name for path in start.iterdir()] == ["in.txt"]
+
+
+def test_modules_beside_the_script_are_found(start, monkeypatch):
+    def imports(theta):
+        import beside_the_script
+
+        return [[beside_the_script.VALUE, 0.0]]
+
+    (start / "beside_the_script.py").write_text("VALUE = 5.0\n")
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    with LocalPool(1) as one:
+        assert simulate_batch(model(imports), THETAS[:1], one).response[0, 0, 0] == 5.0
+
+
+def test_the_label_names_files_of_the_starting_folder(start):
+    def read(theta):
+        Path("made.txt").write_text("own")
+        return Path("made.txt").read_text() + Path("input.txt").read_text()
+
+    old(start / "input.txt", "1")
+    with LocalPool(1) as one:
+        [(text, opened)] = one.map(Observed(read), [THETAS[0]])
+    assert text == "own1"
+    assert [path for path in opened.files if path.endswith(".txt")] == [str(start / "input.txt")]
+
+
+def test_the_folder_of_a_failed_simulation_is_kept_if_asked(start, tmp_path_factory, monkeypatch):
+    def fails(theta):
+        Path("in.txt").write_text(str(theta[0]))
+        if theta[1] == 2.0:
+            time.sleep(60.0)
+        raise RuntimeError("diverged")
+
+    kept = tmp_path_factory.mktemp("kept")
+    monkeypatch.setenv(folder.KEEP, str(kept))
+    isolated, late = model(fails, isolated=True), model(fails, time_limit=1.0)
+    with LocalPool(1) as one:
+        reasons = simulate_batch(model(fails), [np.array([1.0, 1.0])], one).reasons
+    reasons += simulate_batch(isolated, [np.array([2.0, 1.0])]).reasons
+    reasons += simulate_batch(late, [np.array([3.0, 2.0])]).reasons
+    places = [Path(reason.split("its folder is ")[1].split(")")[0]) for reason in reasons]
+    assert [place.parent for place in places] == [kept] * 3
+    assert [next(place.rglob("in.txt")).read_text() for place in places] == ["1.0", "2.0", "3.0"]
+    assert [(place / "reason.txt").read_text().partition(":")[0] for place in places[:2]] == ["RuntimeError"] * 2
+    assert reasons[2].startswith("stopped at the time limit of 1 s")
+
+
+def test_folders_are_removed_with_the_process(tmp_path):
+    code = (
+        "import numpy as np\n"
+        "from tests.simulation.test_folder import *\n"
+        "simulate_batch(model(of_program), THETAS[:2], as_executor(2))\n"
+        "simulate_batch(model(of_program, isolated=True), THETAS[:1])\n"
+        "print(len(list(Path(tempfile.gettempdir()).glob('fe_likelihoods_*/*'))))\n"
+    )
+    command, environment = [sys.executable, "-c", code], os.environ | {"TMPDIR": str(tmp_path)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3"]
+    assert list(tmp_path.iterdir()) == []
+
+
+# files outside of the folder ----------------------------------------------------------------------------------------
+
+
+def rewritten(path, theta):
+    """Written under another name, and renamed."""
+    result = write_and_read(f"{path}.{os.getpid()}.{threading.get_ident()}", theta)
+    os.replace(f"{path}.{os.getpid()}.{threading.get_ident()}", path)
+    time.sleep(0.002)
+    return [[float(word) for word in Path(path).read_text().split()]] if result else []
+
+
+def in_its_folder(path, theta):
+    os.chdir(Path(path).parent)
+    return write_and_read("in.txt", theta)
+
+
+@pytest.mark.parametrize("write", [write_and_read, rewritten, in_its_folder])
+def test_simulations_that_write_an_absolute_path_do_not_overlap(write, start, pool, tmp_path_factory):
+    path = tmp_path_factory.mktemp("place") / "in.txt"
+    with pytest.warns(UserWarning, match="relative file name, which is private") as warned:
+        assert_right(lambda theta: write(str(path), theta), pool)
+        assert_right(lambda theta: write(str(path), theta), pool)
+    [text] = [str(each.message) for each in warned if each.category is UserWarning]
+    assert str(path.parent) in text
+    assert Path.cwd() == start
+
+
+@pytest.mark.parametrize("function", [lambda theta: write_and_read("in.txt", theta), of_program])
+def test_threads_share_the_working_folder_and_do_not_overlap(function, start):
+    with ThreadPoolExecutor(4) as threads, pytest.warns(UserWarning, match="one after the other"):
+        assert_right(function, threads, THETAS[:12])
+
+
+def test_files_that_no_other_simulation_writes_are_no_reason_to_wait(start, pool, tmp_path_factory):
+    def harmless(theta):
+        with tempfile.TemporaryDirectory() as place, tempfile.NamedTemporaryFile("w") as file, open(os.devnull, "w"):
+            file.write("text")
+            subprocess.run(["true"], cwd=place, check=True)
+            os.replace(Path(place, "in.txt").absolute().as_posix(), f"{place}/b") if Path(
+                place, "in.txt"
+            ).exists() else 0
+            Path(f"{log}.mark").touch()
+            with open(log, "a") as text:
+                text.write("x")
+            return write_and_read(f"{place}/in.txt", theta)
+
+    log = str(tmp_path_factory.mktemp("place") / "log.txt")
+    with warnings.catch_warnings(), ThreadPoolExecutor(2) as threads:
+        warnings.simplefilter("error", UserWarning)
+        assert_right(harmless, pool)
+        assert_right(harmless, threads)
+    assert Path(log).read_text() == "x" * 2 * len(THETAS)
+
+
+def test_one_worker_and_pool_none_do_not_warn(start, tmp_path_factory):
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    with warnings.catch_warnings(), LocalPool(1) as one:
+        warnings.simplefilter("error", UserWarning)
+        for pool, options in ((one, {}), (None, {"isolated": True}), (None, {})):
+            assert_right(lambda theta: write_and_read(path, theta), pool, THETAS[:3], **options)
+
+
+def test_waiting_for_another_simulation_does_not_count_towards_the_time_limit(start, tmp_path_factory):
+    def slow(theta):
+        with open(path, "w") as file:
+            file.write(str(theta[0]))
+        time.sleep(0.7)
+        return [[float(Path(path).read_text()), theta[1]]]
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    with ThreadPoolExecutor(4) as threads, pytest.warns(UserWarning, match="one after the other"):
+        assert_right(slow, threads, THETAS[:4], time_limit=2.0)
+
+
+def test_a_simulation_that_holds_the_lock_may_run_an_isolated_model_that_writes_too(start, pool, tmp_path_factory):
+    def outer(theta):
+        Path(path).write_text("outer")
+        return isolated.simulate(theta)
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    isolated = model(lambda theta: write_and_read(path, theta), isolated=True)
+    with pytest.warns(UserWarning, match="one after the other"):
+        assert_right(outer, pool, THETAS[:6])
+
+
+def test_an_absolute_path_of_a_program_is_refused_with_several_workers(start, pool, tmp_path_factory):
+    def program(theta):
+        command = ["/bin/sh", "-c", f'sleep 0.01; echo "$0" "$1" > {path}', *map(repr, theta.tolist())]
+        subprocess.run(command, check=True)
+        return [[float(word) for word in Path(path).read_text().split()]]
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    with LocalPool(1) as one:
+        assert_right(program, one, THETAS[:4])
+    with pytest.raises(UnusableModel, match="use a relative file name, .* or pool=1"):
+        simulate_batch(model(program), THETAS, pool)
+
+
+def test_an_input_file_that_is_written_before_each_batch_is_no_reason_to_refuse(start, pool, tmp_path_factory):
+    def read(theta):
+        return [[float(Path(path).read_text()), theta[1]]]
+
+    path = str(tmp_path_factory.mktemp("place") / "in.txt")
+    for k in range(6):
+        Path(path).write_text(str(k))
+        assert simulate_batch(model(read), THETAS[:4], pool).response[:, 0, 0].tolist() == [float(k)] * 4
+
+
+def test_a_disk_that_machines_share_is_refused(start, tmp_path_factory, monkeypatch):
+    """This process in the place of a worker on another machine."""
+    sender = Sender.here()._replace(process="another", machine="another")
+    place, devices = tmp_path_factory.mktemp("place"), itertools.count()
+    assert run_in_folder(lambda theta: write_and_read("in.txt", theta), THETAS[0], sender)[0] == [THETAS[0].tolist()]
+    assert run_in_folder(lambda theta: write_and_read(place / "in.txt", theta), THETAS[0], sender)[1] != ""
+    monkeypatch.setattr(shared_files, "_device", lambda path: next(devices))
+    with pytest.raises(UnusableModel, match="on another machine"):
+        run_in_folder(lambda theta: write_and_read(place / "in.txt", theta), THETAS[0], sender)
+    assert Path.cwd() == start
+
+
+# all pools ----------------------------------------------------------------------------------------------------------
+
+
+def relative(theta):
+    return write_and_read("in.txt", theta)
+
+
+@contextlib.contextmanager
+def opened(kind, workers):
+    """A pool of a kind."""
+    if kind.startswith("dask"):
+        distributed = pytest.importorskip("distributed")
+        options = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
+        with (
+            distributed.LocalCluster(workers, threads_per_worker=int(kind[4:]), **options) as cluster,
+            distributed.Client(cluster) as pool,
+        ):
+            yield pool
+        return
+    make = {
+        "local": LocalPool,
+        "processes": lambda n: ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn")),
+        "multiprocessing": multiprocessing.get_context("spawn").Pool,
+        "threads": ThreadPoolExecutor,
+    }[kind]
+    with make(workers) as pool:
+        yield pool
+
+
+def bar(ops, theta, recorder=None):
+    ops.model("basic", "-ndm", 1, "-ndf", 1)
+    for node in (1, 2):
+        ops.node(node, 0.0)
+    ops.fix(1, 1)
+    ops.uniaxialMaterial("Elastic", 1, theta[0])
+    ops.element("zeroLength", 1, 1, 2, "-mat", 1, "-dir", 1)
+    ops.timeSeries("Linear", 1)
+    ops.pattern("Plain", 1, 1)
+    ops.load(2, theta[1])
+    if recorder is not None:
+        ops.recorder("Node", "-file", recorder, "-precision", 17, "-node", 2, "-dof", 1, "disp")
+    for command, word in (("constraints", "Plain"), ("numberer", "Plain"), ("system", "BandGeneral")):
+        getattr(ops, command)(word)
+    ops.algorithm("Linear")
+    ops.integrator("LoadControl", 1.0)
+    ops.analysis("Static")
+    found = []
+    for _ in range(2):
+        if ops.analyze(1) != 0:
+            raise RuntimeError("no convergence")
+        found.append(ops.nodeDisp(2, 1))
+    if recorder is not None:
+        ops.wipe()
+        found = np.loadtxt(recorder)
+    return [found]
+
+
+CASES = {
+    "relative": relative,
+    "in a subfolder": lambda theta: write_and_read("results/in.txt", theta),
+    "absolute": lambda theta: write_and_read(f"{os.environ['PLACE_OF_TEST']}/in.txt", theta),
+    "program": of_program,
+    "recorder": lambda ops, theta: bar(ops, theta, "disp.out"),
+    "recorder in a subfolder": lambda ops, theta: bar(ops, theta, "results/disp.out"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 8])
+@pytest.mark.parametrize("kind", ["local", "processes", "multiprocessing", "threads", "dask1", "dask4"])
+@pytest.mark.parametrize("case", CASES)
+def test_no_simulation_reads_files_of_another(case, kind, workers, start, tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("PLACE_OF_TEST", str(tmp_path_factory.mktemp("place")))
+    n = 300 if case in ("relative", "absolute") else 60
+    thetas = np.random.default_rng(2).uniform(0.5, 1.5, (n, 2))
+    for name in ("in.txt", "out.txt", "disp.out", "results/in.txt", "results/disp.out"):
+        old(start / name, "1.0 1.0\n")
+    user = model(CASES[case])
+    expected = thetas[:, None]
+    if case.startswith("recorder"):
+        pytest.importorskip("openseespy")
+        user = OpenSeesModel(CASES[case], ["a", "b"], CHANNELS, 0.01, 2)
+        expected = simulate_batch(OpenSeesModel(bar, ["a", "b"], CHANNELS, 0.01, 2), thetas).response
+    with opened(kind, workers) as pool, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        batch = simulate_batch(user, thetas, as_executor(pool))
+    assert batch.reasons == [""] * n
+    np.testing.assert_allclose(batch.response, expected, rtol=1e-12)
+
+
+def simulated(theta):
+    """As the pool of a sampler calls a model."""
+    return simulate_batch(model(relative), theta[None]).response[0, 0].tolist()
+
+
+def test_the_workers_of_a_sampler_have_folders_too(start):
+    with multiprocessing.get_context("fork").Pool(2) as processes:
+        assert processes.map(simulated, THETAS, chunksize=1) == THETAS.tolist()
+    assert list(start.iterdir()) == []
