@@ -66,7 +66,9 @@ def outcomes(posterior, guide, limit, runs=RUNS):
     return np.array(deviations), np.array(statuses)
 
 
-@pytest.mark.parametrize("limit", [200, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "limit", [200, pytest.param(500, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("case", CASES)
 def test_two_standard_errors_cover(case, limit):
     """At least 90 %, less two standard deviations of the number of 40 runs; a converged result is never far off."""
