@@ -150,7 +150,8 @@ def test_ratios_of_several_quantities_are_of_each():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_events, correlation", [(5, -0.8), (10, 0.0)])
+@pytest.mark.parametrize("correlation", (0.0, -0.8))
+@pytest.mark.parametrize("n_events", (5, 10))
 def test_intervals_cover_new_events_whose_ratio_goes_with_their_parameters(n_events, correlation, rng):
     sets, new = 200, 20
     hierarchy = population([f"EQ{k}" for k in range(n_events)], rng)
