@@ -250,6 +250,6 @@ def test_material_and_section_curves_include_the_failure(column):
     np.testing.assert_array_equal(curves[1], stress)
     assert np.abs(curves[0] - curves[1]).max() > 50e6
 
-    there = np.concatenate([np.linspace(0.0, 0.04, 30), np.linspace(0.04, -0.04, 60)])
+    there = np.interp(np.arange(161) / 20, np.arange(9), [0.0, *[0.04, -0.04] * 4])
     moments = [moment_curvature(m, [1.0], there).moment for m in (column, model)]
-    assert abs(moments[1][-1]) < 0.97 * abs(moments[0][-1])
+    assert abs(moments[1][-1]) < 0.9 * abs(moments[0][-1])
