@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from fe_likelihoods import FELikelihood, FunctionModel, Measurements
+from fe_likelihoods import FELikelihood, FunctionModel, Measurements, plot_residuals
 from fe_likelihoods.noise.residuals import (
     autocorrelation,
     effective_samples,
     innovations,
     lag_one_sums,
-    plot_residuals,
     residual_checks,
 )
 from fe_likelihoods.signals.channels import Channel
