@@ -263,7 +263,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     # ------------------------------------------------------------------ running
 
-    @interrupts_end_the_run()
     def run_mcmc(self, initial_state, nsteps, **kwargs):
         """Anneal to beta = 1 if that has not been done, then make `nsteps` steps at beta = 1.
 
@@ -303,8 +302,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Nothing is stored for the points that were interrupted.
         """
         state = None
-        for each in self.sample(initial_state, iterations=nsteps, **kwargs):
-            state = each
+        with interrupts_end_the_run():
+            for each in self.sample(initial_state, iterations=nsteps, **kwargs):
+                state = each
         return State(get_previous_state(self), copy=True) if state is None else state
 
     def sample(

@@ -8,9 +8,8 @@ ended and its verdict is "not usable", 130 after Ctrl-C.
 
 import contextlib
 import shlex
-import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -188,52 +187,3 @@ def data(files: tuple[Path, ...]) -> None:
             unread.append(str(error))
     if unread:
         raise ValueError("\nError: ".join(unread))
-
-
-@main.group()
-def cache() -> None:
-    """Look after a cache of simulations (simulations.sqlite in the folder of a run)."""
-
-
-def _cache_command(name: str) -> Callable:
-    return lambda function: cache.command(name)(click.argument("file", type=_FILE)(function))
-
-
-@_cache_command("info")
-def info(file: Path) -> None:
-    """Numbers of simulations and failures, computing time and size of FILE."""
-    from .caches import describe
-
-    click.echo(describe(file))
-
-
-@_cache_command("verify")
-@click.option("--settings", type=_FILE, help="TOML file: also simulate stored points of its model again and compare.")
-def verify(file: Path, settings: Path | None) -> None:
-    """Compare every row of FILE with its checksum; with --settings, some of them with new simulations.
-
-    Exit code 1 if FILE is damaged (it is not changed), or new simulations differ from the stored ones.
-    """
-    from .caches import verify_cache
-
-    found = verify_cache(file, settings)
-    click.echo(found.text)
-    sys.exit(0 if found.good else ERROR)
-
-
-@_cache_command("export")
-@click.option("--out", type=_FILE, help="New file.", show_default="FILE with -copy in its name")
-def export(file: Path, out: Path | None) -> None:
-    """Write a copy of FILE, with all of its rows, to archive it or to take it to another machine."""
-    from .caches import export_cache
-
-    click.echo(export_cache(file, out or file.with_name(f"{file.stem}-copy{file.suffix}")))
-
-
-@_cache_command("salvage")
-@click.option("--out", type=_FILE, help="New cache.", show_default="FILE with -salvaged in its name")
-def salvage(file: Path, out: Path | None) -> None:
-    """Copy the readable simulations and responses of a damaged FILE to a new cache; FILE is not changed."""
-    from .caches import salvage_cache
-
-    click.echo(salvage_cache(file, out or file.with_name(f"{file.stem}-salvaged{file.suffix}")))

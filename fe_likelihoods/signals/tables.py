@@ -165,7 +165,10 @@ def listed_columns(table: Table) -> str:
     """The names of the columns, for messages."""
     if table.names:
         return f"the columns are {', '.join(table.names)}"
-    return f"the columns have no names: give a number from 1 to {table.values.shape[1]}"
+    return (
+        f"the columns have no names: give a number from 1 to {table.values.shape[1]}. Numbers with decimal commas need "
+        "another separator between columns, such as ';'"
+    )
 
 
 def _is_word(cell: str) -> bool:

@@ -117,7 +117,7 @@ def test_help_imports_neither_numba_nor_matplotlib():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
-    for name in ("new", "check", "run", "report", "cache"):
+    for name in ("new", "check", "run", "report", "data"):
         assert f"  {name} " in output
 
 
@@ -313,57 +313,6 @@ def test_another_file_of_the_same_name_is_refused(finished):
     assert (folder / "results-oscillator" / "origin.json").read_text() == before
 
 
-def test_caches(finished):
-    file = "results-oscillator/simulations.sqlite"
-    assert "simulations " in call("cache", "info", file)
-    assert "0 of which do not match" in call("cache", "verify", file)
-    assert "stored points were simulated again" in call("cache", "verify", file, "--settings", "oscillator.toml")
-    assert "simulations copied to all.sqlite" in call("cache", "export", file, "--out", "all.sqlite")
-    assert "simulations and " in call("cache", "salvage", file, "--out", "new.sqlite")
-    told, copied = (call("cache", "info", name).splitlines() for name in (file, "new.sqlite"))
-    assert told[1] == copied[1] and told[3] == copied[3] and not told[3].startswith("responses    0,")
-    assert "there is no file" in call("cache", "info", "nothing.sqlite", code=1)
-    assert not Path("nothing.sqlite").exists()
-
-
-def test_verify_tells_that_new_simulations_differ(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_function(tmp_path, "weaker")
-    write_function(tmp_path, "stronger", "0.02 * STIFFNESS", "0.021 * STIFFNESS")
-    posterior = make_problem(read_job(tmp_path / "weaker.toml"), SimulationCache("stored.sqlite")).posterior
-    posterior(posterior.sample_prior(3, 1))
-    posterior.likelihood.simulator.cache.close()
-    verify = ["cache", "verify", "stored.sqlite", "--settings"]
-    assert "points were simulated again and agree" in call(*verify, "weaker.toml")
-    assert "in stronger.toml differ from the stored ones" in call(*verify, "stronger.toml", code=1)
-
-
-def test_a_damaged_cache_is_told_and_not_changed(folder):
-    from fe_likelihoods import LinearOscillator
-    from fe_likelihoods.problems import table_motion
-
-    model = LinearOscillator(table_motion().trim(0.0, 2.0).resample(0.02), 0.8)
-    cache, n = SimulationCache("cache.sqlite"), 200
-    thetas = np.random.default_rng(1).uniform(0.8, 1.2, (n, 2))
-    cache.store("key", thetas, 10, np.ones((n, 2)), [""] * n, 1.0)
-    cache.store_responses(model, thetas, np.ones((n, 2, model.n_steps)))
-    cache.close()
-    data = bytearray(Path("cache.sqlite").read_bytes())
-    leaves = [start for start in range(4096, len(data), 4096) if data[start] == 0x0D]
-    leaf = leaves[len(leaves) // 2]
-    data[leaf : leaf + 4096] = b"\xa5" * 4096
-    Path("cache.sqlite").write_bytes(data)
-    files = {path.name for path in folder.iterdir()}
-    for command in ("verify", "info", "export"):
-        output = call("cache", command, "cache.sqlite", code=1)
-        assert "is damaged" in output and "cache salvage cache.sqlite" in output
-    assert Path("cache.sqlite").read_bytes() == bytes(data) and {path.name for path in folder.iterdir()} == files
-    output = call("cache", "salvage", "cache.sqlite", "--out", "new.sqlite")
-    kept, responses = (int(word) for word in output.split() if word.isdigit())
-    assert max(kept, responses) <= n and n < kept + responses < 2 * n
-    assert "good" not in output and SimulationCache("new.sqlite").info()[1:4] == (kept, 0, responses)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -452,7 +401,6 @@ def test_slashes_in_names_of_channels(tmp_path, monkeypatch):
     call("run", "function.toml", "--quiet")
     output = call("check", "function.toml")
     assert "CAUTION" not in output and "\nThese data determine stiffness and strength (" in output
-    assert "agree" in call("cache", "verify", "results-function/simulations.sqlite", "--settings", "function.toml")
     assert "report.html" in call("report", "results-function", "--run-code")
     assert "acc/top" in (tmp_path / "results-function" / "report.html").read_text(encoding="utf-8")
     assert "sigma_disp/top" in (tmp_path / "results-function" / "summary.csv").read_text()
