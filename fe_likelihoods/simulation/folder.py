@@ -17,6 +17,7 @@ import functools
 import itertools
 import os
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -42,8 +43,10 @@ __all__ = [
 
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
-_MOST_BELOW = 100  # entries of subfolders that are linked one by one; larger subfolders are links
+_MOST_BELOW = 300  # entries of subfolders that are linked one by one; larger subfolders are links until they are used
+_MOST_USED = 3000  # entries of a subfolder that was used
 _DEEPEST = 3
+_MOST_BESIDE = 300  # entries beside the working folder that ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None
@@ -213,10 +216,15 @@ def keep_folder(place: Path, folder: str | Path, reason: str, most: int = _MOST_
     with contextlib.suppress(OSError), of_this_library():
         folder.mkdir(parents=True, exist_ok=True)
         if len(list(folder.glob("failure_*"))) < most:
-            (place / "reason.txt").write_text(reason)
+            for link in [path for path in place.rglob("*") if path.is_symlink()]:  # the links of a mirror end with it
+                target = os.path.realpath(link)
+                link.unlink()
+                link.symlink_to(target)
             kept = tempfile.mkdtemp(prefix="failure_", dir=folder)
             for path in place.iterdir():
                 shutil.move(path, kept)
+            (Path(kept) / "reason.txt").unlink(missing_ok=True)  # a link shows a file of the user
+            (Path(kept) / "reason.txt").write_text(reason)
             return Path(kept)
     return None
 
@@ -258,8 +266,8 @@ def discard(process: int, reason: str = "") -> str:
     kept = None
     for place in [os.path.join(place, str(process)) for place in _places]:
         if os.path.isdir(place):
-            if reason and os.environ.get(KEEP):
-                kept = keep_folder(Path(place), os.environ[KEEP], reason)
+            for run in Path(place).glob("run_*") if reason and os.environ.get(KEEP) else ():
+                kept = keep_folder(run, os.environ[KEEP], reason)
             shutil.rmtree(place, ignore_errors=True)
     return "" if kept is None else f" (its folder is {kept})"
 
@@ -282,41 +290,57 @@ class _Mirror:
         self._place = os.path.join(place, str(os.getpid()))
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder
         os.mkdir(self._place)
-        self.hop = os.path.join(self._place, "from")
+        self.hop = os.path.join(self._place, ".from")
         os.symlink(self.base or "/", self.hop)
         _mark(self.hop)
         with contextlib.suppress(FileNotFoundError):
             os.stat(self.hop)
         self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
         self._private: set[str] = set()
+        parent = os.path.dirname(self.base)
+        for entry in _scan(parent, _MOST_BESIDE) if self.base else ():
+            with contextlib.suppress(FileExistsError):
+                os.symlink(entry.path, os.path.join(self._place, entry.name))
         self._build()
 
     def _build(self) -> None:
         self.path = tempfile.mkdtemp(prefix="run_", dir=self._place)
         self._files: dict[str, tuple[str, Stamp | None]] = {}  # linked files: paths and stamps
+        self._linked: list[str] = []  # linked folders
         self._folders: dict[str, Stamp | None] = {"": _stamp(self.base)}  # folders of `base` that are shown
         waiting, left = [("", entry) for entry in _scan(self.base)], _MOST_BELOW
         while waiting:
             folder, entry = waiting.pop(0)
             name = os.path.join(folder, entry.name)
-            entries = _scan(entry.path, left + 1) if self._is_folder(name, entry) else None
-            if entries is not None and len(entries) <= left:
-                left -= len(entries)
+            most = _MOST_USED if name in self._private else left
+            entries = _scan(entry.path, most + 1) if self._is_folder(name, entry) else None
+            if entries is not None and len(entries) <= most:
+                left -= 0 if name in self._private else len(entries)
                 os.mkdir(os.path.join(self.path, name))
                 self._folders[name] = _stamp(entry.path)
                 waiting += [(name, each) for each in entries]
+            elif entry.is_dir():
+                self._link(name)
+                self._linked.append(name)
             elif name not in self._private:
                 self._link(name)
                 if entry.is_file():
                     self._files[name] = self._stamped(name)
-        self._entries = {name: self._noted(name) for name in self._folders}
+        self._names = {name: {entry.name for entry in _scan(os.path.join(self.path, name))} for name in self._folders}
+        for name in self._folders:
+            os.utime(os.path.join(self.path, name), ns=(0, 0))
         _mark(self.hop)
 
     def _is_folder(self, name: str, entry: os.DirEntry) -> bool:
-        """Whether a folder may be shown as a folder, not as a link."""
-        if not entry.is_dir(follow_symlinks=False) or entry.name.startswith(".") or name.count(os.sep) >= _DEEPEST:
+        """Whether a folder, or a link to one, may be shown as a folder."""
+        if not entry.is_dir() or any(each.startswith(os.path.realpath(entry.path) + os.sep) for each in self._above):
             return False
-        return not self._place.startswith(entry.path + os.sep)
+        return name in self._private or not (entry.name.startswith(".") or name.count(os.sep) >= _DEEPEST)
+
+    @property
+    def _above(self) -> tuple[str, str]:
+        """Paths whose folders must not be shown within themselves."""
+        return os.path.join(os.path.realpath(self.base), ""), os.path.join(self._place, "")
 
     def _stamped(self, name: str) -> tuple[str, Stamp | None]:
         path = os.path.join(self.base, name)
@@ -326,73 +350,54 @@ class _Mirror:
         os.symlink(os.path.join(self.hop, name), os.path.join(self.path, name))
         _mark(os.path.join(self.path, name))
 
-    def _noted(self, name: str) -> dict[str, int]:
-        """Inodes of what a folder contains at the beginning of a simulation, by name."""
-        folder = os.path.join(self.path, name)
-        entries = {entry.name: entry.inode() for entry in _scan(folder)}
-        os.utime(folder, ns=(0, 0))
-        return entries
-
     def prepare(self) -> None:
         """Show what `base` contains now, before a simulation."""
         for name, stamp in self._folders.items():
             folder = os.path.join(self.base, name)
             if stamp is None or _status(folder) != stamp:
                 self._folders[name] = _stamp(folder)
-                private = {os.path.basename(each) for each in self._private if os.path.dirname(each) == name}
-                if {entry.name for entry in _scan(folder)} - private != self._entries[name].keys():
+                private = {n for n in self._private if os.path.dirname(n) == name and n not in self._folders}
+                if {e.name for e in _scan(folder)} - set(map(os.path.basename, private)) != self._names[name]:
                     self._anew()
                     break
-        for name in self._private:
+        for name in self._private.difference(self._folders, self._linked):
             with contextlib.suppress(FileNotFoundError):
                 shutil.copy2(os.path.join(self.base, name), os.path.join(self.path, name))
 
     def was_written_through(self) -> bool:
-        """Whether files of `base` have changed whose links were used; they are private from now on."""
+        """Whether files of `base` have changed whose links were used, or a linked folder was used.
+
+        The files are private from now on, and the folders are shown as folders.
+        """
         if self._has_access_times and os.lstat(self.hop).st_atime_ns == 0:
             return False
         changed = [name for name, (path, stamp) in self._files.items() if stamp is None or _status(path) != stamp]
         self._files |= {name: self._stamped(name) for name in changed}
         written = {n for n in changed if not self._has_access_times or _access(os.path.join(self.path, n))}
+        if self._has_access_times:
+            written |= {n for n in self._linked if _access(os.path.join(self.path, n))} - self._private
         _mark(self.hop)
         if written:
             self._private |= written
             self._anew()
         return bool(written)
 
-    @property
-    def has_changed(self) -> bool:
-        """Whether a simulation has added or removed files."""
-        return any((_status(os.path.join(self.path, name)) or (1,))[0] != 0 for name in self._folders)
-
     def clean(self, anew: bool) -> None:
         """Remove what a simulation has left; with `anew`, the next simulation gets a folder of another name."""
-        anew = anew or not all(os.path.isdir(os.path.join(self.path, name)) for name in self._folders)
-        try:
-            self._tidy() if not anew else self._anew()
-        except OSError:  # it has made a folder that cannot be removed
+        if anew or self.has_changed:
             self._anew()
 
-    def _tidy(self) -> None:
-        for name, entries in self._entries.items():
-            folder = os.path.join(self.path, name)
-            if os.stat(folder).st_mtime_ns == 0:
-                continue
-            present = set()
-            for entry in _scan(folder):
-                is_link = os.path.join(name, entry.name) not in self._folders
-                if entries.get(entry.name) == entry.inode() and entry.is_symlink() == is_link:
-                    present.add(entry.name)
-                elif entry.is_dir(follow_symlinks=False):
-                    shutil.rmtree(entry.path)
-                else:
-                    os.unlink(entry.path)
-            if lost := entries.keys() - present:
-                for each in lost:
-                    self._link(os.path.join(name, each))
-                self._entries[name] = self._noted(name)
-            else:
-                os.utime(folder, ns=(0, 0))
+    @property
+    def has_changed(self) -> bool:
+        """Whether a simulation has added or removed files or folders."""
+        return not all(map(self._is_untouched, self._folders))
+
+    def _is_untouched(self, name: str) -> bool:
+        """Whether a simulation has added and removed nothing in a folder."""
+        with contextlib.suppress(OSError):
+            status = os.lstat(os.path.join(self.path, name))
+            return stat.S_ISDIR(status.st_mode) and status.st_mtime_ns == 0
+        return False
 
     def _anew(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)

@@ -117,7 +117,7 @@ class RunningSimulation:
             return
         if _TEMPORARY and flags & _TEMPORARY == _TEMPORARY:
             return
-        if (path := _full(path)) is None:
+        if (path := _full(path)) is None or os.path.isdir(path):  # of tempfile, which opens a file in it
             return
         if self._is_own(path):
             if os.path.islink(path) and not flags & os.O_EXCL:
@@ -136,15 +136,14 @@ class RunningSimulation:
         """Notice a file that was written while this simulation runs, but not by Python code of this simulation."""
         if self.locked or not isinstance(path, str | bytes | os.PathLike):
             return
-        path = os.path.abspath(os.fsdecode(path))
+        path = _full(path)
         if path.startswith(_SYSTEM) or self._is_own(path):
             return
         with contextlib.suppress(OSError):
             status = os.stat(path)
             if not self._start <= status.st_mtime_ns <= time.time_ns() or not stat.S_ISREG(status.st_mode):
                 return
-            path = _full(path)
-            if self._is_own(path) or _is_cache(path) or self._has_made(path):
+            if _is_cache(path) or self._has_made(path):
                 return
             if path in _fresh:
                 self.shared = UnguardedFile(path)
@@ -157,9 +156,13 @@ class RunningSimulation:
     def renames(self, source: Any, path: Any, *_: Any) -> None:
         self.writes(path)
 
-    def removes(self, path: Any, folder: int = -1) -> None:
-        if folder == -1:
+    def removes(self, path: Any, folder: int | None = None) -> None:
+        if folder in (None, -1):  # else within a folder, whose removal has an event of its own
             self.writes(path)
+
+    def connects(self, database: Any) -> None:
+        if isinstance(database, str | bytes | os.PathLike) and os.fsdecode(database) not in ("", ":memory:"):
+            self.writes(database)
 
     def forks(self) -> None:
         self.has_programs = True
@@ -183,8 +186,10 @@ class RunningSimulation:
             return
         if self._has_made(path):
             return
-        if os.path.exists(path) and not stat.S_ISREG(os.stat(path).st_mode):  # a terminal, a pipe, /dev/null
-            return
+        with contextlib.suppress(OSError):
+            mode = os.stat(path).st_mode
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a terminal, a pipe, /dev/null
+                return
         shown = os.path.dirname(path) if path.endswith("/*") else path
         temporary = os.path.realpath(tempfile.gettempdir())
         if self._is_remote and _device(os.path.dirname(path)) != _device(temporary):
@@ -215,13 +220,19 @@ _EVENTS = {
     "open": RunningSimulation.opens,
     "os.chdir": RunningSimulation.enters,
     "os.fork": RunningSimulation.forks,
-    "os.mkdir": RunningSimulation.makes,
+    "os.link": RunningSimulation.renames,
+    "os.mkdir": RunningSimulation.writes,
     "os.posix_spawn": RunningSimulation.starts_here,
     "os.remove": RunningSimulation.removes,
     "os.rename": RunningSimulation.renames,
+    "os.rmdir": RunningSimulation.removes,
+    "os.symlink": RunningSimulation.renames,
     "os.system": RunningSimulation.starts_here,
     "os.truncate": RunningSimulation.writes,
+    "shutil.rmtree": RunningSimulation.removes,
+    "sqlite3.connect": RunningSimulation.connects,
     "subprocess.Popen": RunningSimulation.starts,
+    "tempfile.mkdtemp": RunningSimulation.makes,
 }
 
 

@@ -5,6 +5,8 @@ import itertools
 import logging
 import multiprocessing
 import os
+import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -180,6 +182,47 @@ def test_nothing_is_left_by_a_simulation_that_exits(start):
     assert ["no convergence" in reason for reason in reasons] == [True] * 3
 
 
+@pytest.mark.parametrize("isolated", [True, False])
+def test_files_of_the_user_survive_a_simulation_that_empties_their_folder(isolated, start, pool):
+    """Its folder shows them as links, and a folder that it makes again has none of them."""
+
+    def empties(theta):
+        shutil.rmtree("results")
+        os.mkdir("results")
+        return write_and_read("results/in.txt", theta)
+
+    for k in range(3):
+        old(start / "results" / f"thesis{k}.csv", "precious")
+    assert_right(empties, None if isolated else pool, THETAS[:8], **({"isolated": True} if isolated else {}))
+    assert {path.name for path in (start / "results").iterdir()} == {f"thesis{k}.csv" for k in range(3)}
+    assert all(not path.is_symlink() and path.read_text() == "precious" for path in (start / "results").iterdir())
+
+
+@pytest.mark.parametrize("kind", ["link", "large", "deep", "hidden"])
+def test_names_below_folders_that_are_shown_as_links_are_private(kind, start, pool, tmp_path_factory):
+    folder = start / {"link": "out", "large": "out", "deep": "a/b/c/d/e", "hidden": ".out"}[kind]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "link":
+        folder.symlink_to(tmp_path_factory.mktemp("elsewhere"))
+    for k in range(310 if kind == "large" else 1):
+        old(folder / f"{k}.txt", "old")
+    name = folder.relative_to(start).as_posix()
+
+    def by_program(theta):
+        code = f'echo "$0 $1" > {name}/in.txt; sleep .005; cat {name}/in.txt > {name}/out.txt'
+        subprocess.run(["/bin/sh", "-c", code, *map(repr, theta.tolist())], check=True)
+        return [[float(word) for word in Path(name, "out.txt").read_text().split()]]
+
+    old(folder / "in.txt", "old")
+    assert_right(by_program, pool, THETAS[:12])
+    assert (folder / "0.txt").read_text() == "old"
+
+
+def test_files_beside_the_starting_folder_are_readable(start, pool):
+    old(start.parent / "data" / "x.txt", "2.0")
+    assert_right(lambda theta: [(theta * float(Path("../data/x.txt").read_text()) / 2.0).tolist()], pool, THETAS[:4])
+
+
 def test_an_isolated_function_has_a_folder_and_pool_none_has_not(start):
     thetas = THETAS[:2]
     assert_right(lambda theta: write_and_read("in.txt", theta), None, thetas, isolated=True)
@@ -263,7 +306,31 @@ def in_its_folder(path, theta):
     return write_and_read("in.txt", theta)
 
 
-@pytest.mark.parametrize("write", [write_and_read, rewritten, in_its_folder])
+def remade(path, theta):
+    """A scratch folder of a fixed name, emptied before each run."""
+    folder = Path(path).parent / "scratch"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return write_and_read(folder / "in.txt", theta)
+
+
+def made_once(path, theta):
+    folder = Path(path).parent / "scratch"
+    folder.mkdir(exist_ok=True)
+    return write_and_read(folder / "in.txt", theta)
+
+
+def in_a_database(path, theta):
+    with contextlib.closing(sqlite3.connect(path, timeout=30.0)) as file:
+        file.execute("create table if not exists x (a, b)")
+        file.execute("delete from x")
+        file.execute("insert into x values (?, ?)", theta.tolist())
+        file.commit()
+        time.sleep(0.002)
+        return [list(file.execute("select * from x").fetchone())]
+
+
+@pytest.mark.parametrize("write", [write_and_read, rewritten, in_its_folder, remade, made_once, in_a_database])
 def test_simulations_that_write_an_absolute_path_do_not_overlap(write, start, pool, tmp_path_factory):
     path = tmp_path_factory.mktemp("place") / "in.txt"
     with pytest.warns(UserWarning, match="relative file name, which is private") as warned:
