@@ -14,8 +14,10 @@ __all__ = [
     "SentFunction",
     "become_worker",
     "deferred_interrupts",
+    "interrupts",
     "interrupts_end_the_run",
     "is_worker",
+    "raise_if_interrupted",
     "raise_if_it_ends_the_run",
 ]
 
@@ -27,12 +29,29 @@ class _RaisesKeyboardInterrupt:
         self.handler = handler
 
     def __call__(self, *arguments: Any) -> None:
+        global _interrupts
         try:
             self.handler(*arguments)
         except KeyboardInterrupt:
+            _interrupts += 1
             raise
         except BaseException as error:
+            _interrupts += 1
             raise KeyboardInterrupt from error
+
+
+_interrupts = 0
+
+
+def interrupts() -> int:
+    """How often Ctrl-C has interrupted this process in `interrupts_end_the_run`."""
+    return _interrupts
+
+
+def raise_if_interrupted(before: int) -> None:
+    """Raise KeyboardInterrupt if Ctrl-C came after `before` was `interrupts()`: a bare ``except`` may have caught it."""
+    if _interrupts != before:
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -45,8 +64,8 @@ def interrupts_end_the_run() -> Iterator[None]:
     stays ignored. The handler that was set before is put back at the end.
     """
     handler = signal.getsignal(signal.SIGINT)
-    raises = handler is signal.default_int_handler or isinstance(handler, _RaisesKeyboardInterrupt)
-    if threading.current_thread() is not threading.main_thread() or not callable(handler) or raises:
+    is_ours = isinstance(handler, _RaisesKeyboardInterrupt)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler) or is_ours:
         yield
         return
     ours = _RaisesKeyboardInterrupt(handler)

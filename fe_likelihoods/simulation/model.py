@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from samplers.interrupts import interrupts_end_the_run, is_worker
+from samplers.interrupts import interrupts, interrupts_end_the_run, is_worker, raise_if_interrupted
 
 from ..noise.statistics import Statistic, reduce_response, statistic_width, sums_of_squares
 from ..signals.channels import Channel
@@ -388,12 +388,14 @@ def _attempt(
     run: Callable[[Model, np.ndarray], np.ndarray], model: Model, theta: np.ndarray
 ) -> tuple[np.ndarray | None, str]:
     """Run one simulation; returns its result and an empty reason, or None and the reason. Called in the worker."""
-    before = sys.exception()
+    before, known = sys.exception(), interrupts()
     try:
         result = run(model, theta)
     except BaseException as error:  # a model may raise anything
         raise_if_it_ends_the_run(error, before)
+        raise_if_interrupted(known)
         return None, reason_of(error)
+    raise_if_interrupted(known)
     reason = not_finite(model, result)
     return (None, reason) if reason else (result, "")
 
@@ -428,9 +430,10 @@ def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.nda
 @contextmanager
 def _one_by_one_if_it_fails(model: Model) -> Iterator[None]:
     """Log a failure of the model's own batch method, which must not make all its parameter sets fail."""
-    before = sys.exception()
+    before, known = sys.exception(), interrupts()
     try:
         yield
+        raise_if_interrupted(known)
     except BaseException as error:
         raise_if_it_ends_the_run(error, before)
         logger.warning(

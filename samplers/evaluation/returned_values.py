@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..blobs import stacked
-from ..interrupts import raise_if_it_ends_the_run
+from ..interrupts import interrupts, raise_if_interrupted, raise_if_it_ends_the_run
 
 __all__ = ["ErrorCapturing", "Failed", "log_densities", "log_probabilities", "outcomes"]
 
@@ -165,15 +165,17 @@ class ErrorCapturing:
         self.function, self.args, self.kwargs, self.vectorize = function, args, kwargs or {}, vectorize
 
     def __call__(self, points: Any) -> Any:
-        before = sys.exception()
+        before, known = sys.exception(), interrupts()
         try:
             # a copy, since the points are needed after a function that changes them
             result = self.function(copy.deepcopy(points), *self.args, **self.kwargs)
+            raise_if_interrupted(known)
             owner = getattr(self.function, "__self__", self.function)  # of a method such as log_likelihood
             fault = "" if self.vectorize or not hasattr(owner, "fault") else owner.fault(points)
             return Failed(fault) if fault else result
         except (Exception, SystemExit) as error:
             raise_if_it_ends_the_run(error, before)
+            raise_if_interrupted(known)
             if getattr(error, "ends_run", False):
                 raise
             if not self.vectorize:
