@@ -49,7 +49,7 @@ def interrupts() -> int:
 
 
 def raise_if_interrupted(before: int) -> None:
-    """Raise KeyboardInterrupt if Ctrl-C came after `before` was `interrupts()`: a bare ``except`` may have caught it."""
+    """Raise KeyboardInterrupt if there were more `interrupts` than `before`: a bare ``except`` may have caught it."""
     if _interrupts != before:
         raise KeyboardInterrupt
 

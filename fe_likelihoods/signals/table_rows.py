@@ -93,6 +93,8 @@ def read_rows(path: str | Path, skip: int | None = None, along_rows: bool = Fals
         lines, comments = _lines(path, skip or 0)
         separator = _find_separator([line for _, line in lines[-_LAST_LINES:]])
         cells = _cells_of(lines, separator, str(path))
+        if separator == ",":
+            _check_decimal_commas(cells, str(path))
         cells, stated = logger_table(cells, str(path))
         comments += stated
     if along_rows and not any("rows" in row for _, row in cells[:_LAST_LINES]):
@@ -266,6 +268,19 @@ def _check_short_header(lines: Sequence[tuple[int, list[str]]], width: int, file
             f"{file}, line {number}: expected a name for each of the {width} cells in a row, got {len(cells)}; write "
             "decimal points, or semicolons between the cells, if commas separate cells and decimals; leave out the "
             "names of rows, in R with row.names = FALSE"
+        )
+
+
+def _check_decimal_commas(lines: Sequence[tuple[int, list[str]]], file: str) -> None:
+    """Raise ValueError if the line above the rows has half as many names as the rows have cells without a point."""
+    first = next((k for k, (_, row) in enumerate(lines) if _is_data(row)), 0)
+    number, names = lines[first - 1] if first else (0, [])
+    rows = [row for _, row in lines[first : first + _LAST_LINES]]
+    if 2 * len(names) == len(rows[0]) and _is_text(names) and all(names) and not any("." in "".join(r) for r in rows):
+        raise ValueError(
+            f"{file}, line {number}: expected a name for each of the {len(rows[0])} cells in a row, got {len(names)}: "
+            "commas separate cells and decimals. Numbers with decimal commas need another separator between columns, "
+            "such as ';'"
         )
 
 

@@ -55,8 +55,9 @@ SMOOTH_WEIGHTS = 0.6
 # in 10 dimensions, where the nearest points are far away.
 ROUGH_WEIGHTS = 0.25
 NEIGHBOURS = 3
-# Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of long sums.
-ROUNDING = 1e-9
+# Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of a sum of 1e4
+# terms. With 1e-9, right runs with a log-likelihood of 1e11 and a range of 100 were refused.
+ROUNDING = 1e-12
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
 # Differences of evidences and shares, and of means in many parameters, are reported beyond this many standard errors.
@@ -84,7 +85,8 @@ def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concer
     """A concern if the log-likelihood has one value at all points that a run begins with, so that it tells nothing.
 
     The posterior is then the prior, or it is where none of these points is, and the value is a penalty or comes from a
-    model that ignores its parameters. A value of 0 beside -inf is the likelihood of an indicator, which is right.
+    model that ignores its parameters. Beside -inf, one value may be the likelihood of uniform errors, which is right,
+    or a penalty: the concern is not grave; for a value of 0, an indicator, there is none.
 
     Parameters
     ----------
@@ -98,16 +100,17 @@ def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concer
     error = ROUNDING * (1.0 + np.abs([log_prob[known], log_prior[known]]).max())
     if np.ptp(values) > error or (not known.all() and np.abs(values).max() <= error):
         return []
-    others = (
-        "" if known.all() else f" (the other {len(known) - len(values)} failed or have -inf; inside, an indicator is 0)"
-    )
+    others, indicator = "", ""
+    if not known.all():
+        others = f" (the other {len(known) - len(values)} failed or have -inf)"
+        indicator = " If errors are uniform, such a likelihood is right, and so is the result."
     message = (
         f"the log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with{others}: it is a "
         "penalty in place of a failure, or the model ignores its parameters, or the data are not used. The result is "
         "the prior, and a posterior elsewhere was not found. Look at responses to a few draws of the prior; let failed "
-        "simulations raise an exception or return NaN, and narrow the prior to where the model works"
+        f"simulations raise an exception or return NaN, and narrow the prior to where the model works.{indicator}"
     )
-    return [Concern(message, True)]
+    return [Concern(message, bool(known.all()))]
 
 
 def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Concern]:

@@ -48,17 +48,16 @@ def needs(module):
 @pytest.fixture(autouse=True)
 def nothing_is_left():
     """No process that a test started outlives it."""
-    before = set(descendants(os.getpid())) if Path("/proc").is_dir() else set()
+    before = workers_now() if Path("/proc").is_dir() else set()
     yield
     gc.collect()  # samplers and their states refer to each other
     if Path("/proc").is_dir():
-        # the resource tracker of multiprocessing stays
-        left = [
-            pid
-            for pid in set(descendants(os.getpid())) - before
-            if b"fe_likelihoods.simulation.worker" in _command(pid)
-        ]
-        assert gone(left)
+        assert gone(list(workers_now() - before))  # the resource tracker of multiprocessing stays
+
+
+def workers_now():
+    """Worker processes of this process, also those of pools that other tests share."""
+    return {child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)}
 
 
 def _command(pid):
@@ -111,9 +110,10 @@ def test_processes_may_die_while_they_load_the_function(tmp_path):
 
 @needs_proc
 def test_idle_worker_that_is_killed_is_replaced():
+    others = workers_now()
     with LocalPool(1) as pool:
         expected = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
-        (pid,) = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
+        (pid,) = workers_now() - others
         os.kill(pid, 9)
         assert gone([pid])
         batch = simulate_batch(Treacherous(), theta(bad.FINE, 3), pool)
@@ -122,9 +122,9 @@ def test_idle_worker_that_is_killed_is_replaced():
 
 @needs_proc
 def test_workers_end_with_the_likelihood_and_after_an_interrupt():
-    posterior = posterior_of(Treacherous(), pool=2)
+    others, posterior = workers_now(), posterior_of(Treacherous(), pool=2)
     posterior(posterior.sample_prior(4, 1))
-    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
+    workers = list(workers_now() - others)
     assert len(workers) == 2
     del posterior
     assert gone(workers)
@@ -135,9 +135,9 @@ def test_workers_end_with_the_likelihood_and_after_an_interrupt():
 @needs_proc
 def test_a_pool_that_is_closed_while_a_process_loads_ends_that_process(tmp_path):
     function = LoadsOnce(tmp_path)  # only the first process can load it
-    pool = LocalPool(2)
+    others, pool = workers_now(), LocalPool(2)
     assert pool.map(function, [1, 2, 3]) == [1, 2, 3]
-    workers = [child for child in descendants(os.getpid()) if b"fe_likelihoods.simulation.worker" in _command(child)]
+    workers = list(workers_now() - others)
     assert len(workers) == 2
     pool.close()
     assert not any(worker in descendants(os.getpid()) for worker in workers)

@@ -153,11 +153,17 @@ INF = np.inf
 @pytest.mark.parametrize(
     "values",
     [[0.0] * 4, [-37.25] * 4, [-1e10] * 4, [-1e300] * 4, [-1e10, np.nan, -1e10, -1e10], [-1e10, -INF, -1e10, -1e10],
-     [-1e10, -1e10 + 1e-6, -1e10, -1e10]],
+     [-3.2, -INF, -3.2, -3.2], [-1e10, -1e10 + 1e-6, -1e10, -1e10]],
 )  # fmt: skip
-def test_one_log_likelihood_at_all_first_points_is_grave(values):
+def test_one_log_likelihood_at_all_first_points_is_doubted(values):
+    """Beside -inf, it may be the likelihood of uniform errors."""
     (doubt,) = check_likelihood(np.array(values) + LOG_PRIOR, LOG_PRIOR)
-    assert doubt.grave and f"the log-likelihood is {values[0]:.6g} at all" in doubt.message
+    assert f"the log-likelihood is {values[0]:.6g} at all" in doubt.message
+    assert doubt.grave == np.isfinite(values).all()
+
+
+def test_real_structure_on_a_large_offset_is_no_reason_to_doubt():
+    assert not check_likelihood(1e11 + np.array([0.0, -3.0, -50.0, -7.0]) + LOG_PRIOR, LOG_PRIOR)
 
 
 @pytest.mark.parametrize(

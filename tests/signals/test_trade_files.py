@@ -548,3 +548,15 @@ def test_a_bad_at2_file_is_still_named(tmp_path):
     path.write_bytes(at2().replace("E-02", "E-abc", 1).encode() + b"\x1a")
     with pytest.raises(ValueError, match="line 5: expected a number, got '.*E-abc'"):
         read_at2(path)
+
+
+@pytest.mark.parametrize("names", ["time_s,acc_g", "acc_g"])
+@pytest.mark.parametrize("arguments", [{}, {"column": 1, "dt": 0.01}, {"column": "rows", "dt": 0.01}])
+def test_decimal_commas_between_commas_are_never_read_as_other_numbers(names, arguments, tmp_path):
+    rows = [
+        ",".join(f"{x:.3f}".replace(".", ",") for x in (0.01 * k, np.sin(k))[-len(names.split(",")) :])
+        for k in range(9)
+    ]
+    (tmp_path / "logger.csv").write_text("\n".join([names, *rows]))
+    with pytest.raises(ValueError, match="decimal commas need another separator"):
+        read_record(tmp_path / "logger.csv", units="g", **arguments)
