@@ -276,7 +276,13 @@ def _check_decimal_commas(lines: Sequence[tuple[int, list[str]]], file: str) -> 
     first = next((k for k, (_, row) in enumerate(lines) if _is_data(row)), 0)
     number, names = lines[first - 1] if first else (0, [])
     rows = [row for _, row in lines[first : first + _LAST_LINES]]
-    if 2 * len(names) == len(rows[0]) and _is_text(names) and all(names) and not any("." in "".join(r) for r in rows):
+    if (
+        rows
+        and 2 * len(names) == len(rows[0])
+        and _is_text(names)
+        and all(names)
+        and not any("." in "".join(r) for r in rows)
+    ):
         raise ValueError(
             f"{file}, line {number}: expected a name for each of the {len(rows[0])} cells in a row, got {len(names)}: "
             "commas separate cells and decimals. Numbers with decimal commas need another separator between columns, "
