@@ -69,8 +69,8 @@ def interrupts_end_the_run() -> Iterator[None]:
         yield
         return
     ours = _RaisesKeyboardInterrupt(handler)
-    signal.signal(signal.SIGINT, ours)
     try:
+        signal.signal(signal.SIGINT, ours)
         yield
     finally:
         if signal.getsignal(signal.SIGINT) is ours:  # else the user's code has set another one meanwhile

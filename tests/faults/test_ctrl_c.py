@@ -23,7 +23,7 @@ class Interrupt:
     """Raises KeyboardInterrupt at a line, counted from the start, except where Ctrl-C is deferred."""
 
     def __init__(self, line=None):
-        self.line, self.count, self.handler = line, 0, signal.getsignal(signal.SIGINT)
+        self.line, self.count = line, 0
 
     def __enter__(self):
         sys.settrace(self._enter)
@@ -37,7 +37,8 @@ class Interrupt:
 
     def _trace(self, frame, event, value):
         name = frame.f_code.co_name
-        if event == "line" and signal.getsignal(signal.SIGINT) is self.handler and name != "deferred_interrupts":
+        deferred = "deferred_interrupts" in getattr(signal.getsignal(signal.SIGINT), "__qualname__", "")
+        if event == "line" and not deferred and name != "deferred_interrupts":
             self.count += 1
             if self.count == self.line:
                 sys.settrace(None)
