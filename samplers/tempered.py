@@ -481,8 +481,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 return self._repeated(start)
             if self._reopened:
                 raise ValueError(
-                    f"{self.backend.filename} contains a run from other draws of the prior: pass None as "
-                    "initial_state to go on with it, or use another file; backend.reset(nwalkers, ndim) discards it"
+                    f"{self._place} contains a run from other draws of the prior: pass None as initial_state to go on "
+                    "with it, or use another file; backend.reset(nwalkers, ndim) discards it"
                 )
         if given is None and previous is not None:
             given = previous
@@ -536,9 +536,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
             )
         if found := self._differences():
             raise ValueError(
-                f"{self.backend.filename} contains another run: {'; '.join(found)}. Use another file, or "
+                f"{self._place} contains another run: {'; '.join(found)}. Use another file or backend, or "
                 "backend.reset(nwalkers, ndim)"
             )
+
+    @property
+    def _place(self) -> str:
+        """Where the chain is, for messages."""
+        return getattr(self.backend, "filename", "the backend in memory")
 
     def _differences(self) -> list[str]:
         """Differences of a stored run in its posterior or settings, as text; none after they were found to agree."""

@@ -233,6 +233,16 @@ def test_reset_of_the_backend_of_a_living_sampler(kind, tmp_path, whole_run):
     assert same(again, sampler) and not posterior.evaluated
 
 
+@pytest.mark.parametrize("kind", OURS)
+def test_another_function_on_a_backend_in_memory_is_refused(kind):
+    Sampler, settings = KINDS[kind]
+    backend, draws = emcee.backends.Backend(), np.random.default_rng(1).standard_normal((N, NDIM))
+    Sampler(N, NDIM, Counted(), backend=backend, **settings).run_mcmc(draws, 2)
+    other = Sampler(N, NDIM, Counted("other", centre=0.3), backend=backend, **settings)
+    with pytest.raises(ValueError, match="the backend in memory contains another run"):
+        other.run_mcmc(None, 1)
+
+
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
 def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_path):
