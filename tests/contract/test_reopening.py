@@ -237,8 +237,8 @@ def test_reset_of_the_backend_of_a_living_sampler(kind, tmp_path, whole_run):
 def test_another_function_on_a_backend_in_memory_is_refused(kind):
     Sampler, settings = KINDS[kind]
     backend, draws = emcee.backends.Backend(), np.random.default_rng(1).standard_normal((N, NDIM))
-    Sampler(N, NDIM, Counted(), backend=backend, **settings).run_mcmc(draws, 2)
-    other = Sampler(N, NDIM, Counted("other", centre=0.3), backend=backend, **settings)
+    Sampler(N, NDIM, Counted(None), backend=backend, **settings).run_mcmc(draws, 2)
+    other = Sampler(N, NDIM, Counted(None, centre=0.3), backend=backend, **settings)
     with pytest.raises(ValueError, match="the backend in memory contains another run"):
         other.run_mcmc(None, 1)
 
