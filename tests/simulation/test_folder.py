@@ -502,8 +502,10 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [2, 8])
-@pytest.mark.parametrize("kind", ["local", "processes", "multiprocessing", "threads", "dask1", "dask4"])
+@pytest.mark.parametrize(
+    ("kind", "workers"),
+    [("local", 2), ("local", 8), ("processes", 2), ("multiprocessing", 2), ("threads", 8), ("dask1", 2), ("dask4", 2)],
+)
 @pytest.mark.parametrize("case", CASES)
 def test_no_simulation_reads_files_of_another(case, kind, workers, start, tmp_path_factory, monkeypatch):
     monkeypatch.setenv("PLACE_OF_TEST", str(tmp_path_factory.mktemp("place")))
