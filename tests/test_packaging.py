@@ -89,6 +89,6 @@ def test_a_new_environment_runs_the_readme(tmp_path):
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert not names ^ distributed()
     run(python, "-m", "pip", "install", "--quiet", wheel)
-    (tmp_path / "first.py").write_text(blocks(ROOT / "README.md", "python", slow=False)[0])
+    (tmp_path / "first.py").write_text(blocks(ROOT / "README.md", "python")[0])
     assert "log-evidence" in run(python, "first.py")
     assert "Usage" in run(tmp_path / "new" / "bin" / "fe-likelihoods", "--help")

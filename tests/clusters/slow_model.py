@@ -5,6 +5,7 @@ import time
 
 WALKERS = 250
 SECONDS = float(os.environ.get("SECONDS_PER_SIMULATION", "0.1"))
+PLACE = os.getcwd()  # of the script: a simulation in a worker has a folder of its own
 at_once = free_vibration  # noqa: F821
 
 
@@ -18,5 +19,5 @@ def free_vibration(theta):
 
 
 def _note(name, theta):
-    with open(name, "a") as file:
+    with open(os.path.join(PLACE, name), "a") as file:
         file.write(f"{theta[0]!r} {theta[1]!r}\n")
