@@ -46,7 +46,7 @@ _MOST_KEPT = 20
 _MOST_BELOW = 300  # entries of subfolders that are linked one by one; larger subfolders are links until they are used
 _MOST_USED = 3000  # entries of a subfolder that was used
 _DEEPEST = 3
-_MOST_BESIDE = 300  # entries beside the working folder that ``..`` shows
+_MOST_BESIDE = 3000  # entries beside the working folder that ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None

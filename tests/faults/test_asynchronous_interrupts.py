@@ -1,6 +1,5 @@
 """Ctrl-C in asynchronous runs with a file: what has been evaluated is in the record, and the same script goes on."""
 
-import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor, wait
 
@@ -12,6 +11,7 @@ from samplers import SMCSampler
 from samplers.evaluation import asynchronous, pool_queue
 from tests.contract.targets import Gaussian
 from tests.faults.records import points_of
+from tests.faults.test_ctrl_c import is_deferred
 from tests.faults.treacherous import Treacherous, posterior_of
 
 N, NDIM, WORKERS = 40, 2, 3
@@ -107,7 +107,6 @@ class Interrupt:
 
     def __init__(self, line, evaluated):
         self.line, self.count, self.evaluated, self.known = line, 0, evaluated, None
-        self.handler = signal.getsignal(signal.SIGINT)
 
     def __enter__(self):
         sys.settrace(self._enter)
@@ -127,7 +126,7 @@ class Interrupt:
         return self._trace
 
     def _trace(self, frame, event, value):
-        if event == "line" and signal.getsignal(signal.SIGINT) is self.handler:  # otherwise Ctrl-C is deferred
+        if event == "line" and not is_deferred():
             self.count += 1
             if self.count == self.line:
                 sys.settrace(None)

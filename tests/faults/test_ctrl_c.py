@@ -19,6 +19,11 @@ FOLDERS = tuple(str(Path(package.__file__).parent) for package in (samplers, emc
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
 
 
+def is_deferred():
+    """Whether Ctrl-C takes effect at the end of a `deferred_interrupts` context."""
+    return "deferred_interrupts" in getattr(signal.getsignal(signal.SIGINT), "__qualname__", "")
+
+
 class Interrupt:
     """Raises KeyboardInterrupt at a line, counted from the start, except where Ctrl-C is deferred."""
 
@@ -37,8 +42,7 @@ class Interrupt:
 
     def _trace(self, frame, event, value):
         name = frame.f_code.co_name
-        deferred = "deferred_interrupts" in getattr(signal.getsignal(signal.SIGINT), "__qualname__", "")
-        if event == "line" and not deferred and name != "deferred_interrupts":
+        if event == "line" and not is_deferred() and name != "deferred_interrupts":
             self.count += 1
             if self.count == self.line:
                 sys.settrace(None)

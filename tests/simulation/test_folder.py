@@ -218,8 +218,10 @@ def test_names_below_folders_that_are_shown_as_links_are_private(kind, start, po
     assert (folder / "0.txt").read_text() == "old"
 
 
-def test_files_beside_the_starting_folder_are_readable(start, pool):
-    old(start.parent / "data" / "x.txt", "2.0")
+def test_files_beside_the_starting_folder_are_readable(start, pool, monkeypatch):
+    (start / "scripts").mkdir()
+    monkeypatch.chdir(start / "scripts")
+    old(start / "data" / "x.txt", "2.0")
     assert_right(lambda theta: [(theta * float(Path("../data/x.txt").read_text()) / 2.0).tolist()], pool, THETAS[:4])
 
 
