@@ -297,6 +297,8 @@ class _Mirror:
             os.stat(self.hop)
         self._has_access_times = os.lstat(self.hop).st_atime_ns != 0  # not on every file system
         self._private: set[str] = set()
+        # folders that contain these paths must not be shown: they would be within themselves
+        self._above = os.path.join(os.path.realpath(self.base), ""), os.path.join(self._place, "")
         parent = os.path.dirname(self.base)
         for entry in _scan(parent, _MOST_BESIDE) if self.base else ():
             with contextlib.suppress(FileExistsError):
@@ -336,11 +338,6 @@ class _Mirror:
         if not entry.is_dir() or any(each.startswith(os.path.realpath(entry.path) + os.sep) for each in self._above):
             return False
         return name in self._private or not (entry.name.startswith(".") or name.count(os.sep) >= _DEEPEST)
-
-    @property
-    def _above(self) -> tuple[str, str]:
-        """Paths whose folders must not be shown within themselves."""
-        return os.path.join(os.path.realpath(self.base), ""), os.path.join(self._place, "")
 
     def _stamped(self, name: str) -> tuple[str, Stamp | None]:
         path = os.path.join(self.base, name)

@@ -6,8 +6,10 @@ from functools import partial
 from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
+from samplers.interrupts import Ended
+
 from .local_pool import Outcome
-from .sent_functions import Ended, FunctionReference, Missing, PrivateFiles
+from .sent_functions import FunctionReference, Missing, PrivateFiles
 
 __all__ = ["PoolExecutor", "resolve"]
 

@@ -11,29 +11,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from samplers.interrupts import interrupts_end_the_run
+from samplers.interrupts import Ended, interrupts_end_the_run
 
 from .by_value import Pickled, Recent
 
-__all__ = ["Ended", "FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
+__all__ = ["FunctionReference", "Missing", "PrivateFiles", "loaded_functions"]
 
 
 class Missing(NamedTuple):
     """Reply of a worker that does not have the function."""
 
 
-class Ended(NamedTuple):
-    """Reply of a worker whose function raised KeyboardInterrupt or SystemExit: raised in the caller's thread.
-
-    If it were raised in the worker, threads and processes of `multiprocessing.pool` and workers of dask would end, and
-    the item would be waited for or run again.
-    """
-
-    error: BaseException
-
-
 def _called(function: Callable, item: Any) -> Any:
-    """The result of a function for an item, or `Ended`."""
+    """The result of a function for an item, or `Ended`: raised in a pool, it would end processes of the pool."""
     try:
         with interrupts_end_the_run():
             return function(item)
