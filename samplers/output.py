@@ -5,6 +5,7 @@ emcee's backend writes the chain. In an HDF5 file, the group of the chain has th
 attributes of the backend.
 """
 
+import contextlib
 import json
 import logging
 import os
@@ -343,11 +344,12 @@ def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
         with made.open("a") as file:
             file[made.name].attrs["run"] = run
 
-    try:
-        present = open_file(backend, "r")
-    except OSError as error:
-        logger.debug("no group is copied from %s: %s", backend.filename, error)
-        replace_file(backend, make, None)
-        return
-    with present:
-        replace_file(backend, make, present)
+    while True:
+        is_new = not os.path.exists(backend.filename)
+        try:
+            present = None if is_new else open_file(backend, "r+")
+        except OSError as error:
+            logger.debug("no group is copied from %s: %s", backend.filename, error)
+            present = None
+        with contextlib.nullcontext() if present is None else present, contextlib.suppress(FileExistsError):
+            return replace_file(backend, make, present, is_new)

@@ -10,6 +10,7 @@ import io
 import logging
 import os
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -101,7 +102,11 @@ def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True
     end = time.monotonic() + (SECONDS if wait else 0.0)
     while True:
         try:
-            return opens()
+            before = _identity(backend)
+            file = opens()
+            if before in (None, _identity(backend)):
+                return file
+            file.close()  # another sampler has replaced the file while it was opened
         except OSError as error:
             if not isinstance(error, BlockingIOError) and "already open" not in str(error):
                 raise
@@ -109,6 +114,15 @@ def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True
                 held = f"{backend.filename} is held open by another program ({error})"
                 raise FileHeld(f"{held}: close the file there, and try again") from error
         time.sleep(PAUSE)
+
+
+def _identity(backend: HDFBackend) -> tuple[int, int] | None:
+    """Device and inode of the file of a backend; None if there is no file."""
+    try:
+        status = os.stat(backend.filename)
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def open_file(backend: HDFBackend, mode: str, wait: bool = True) -> h5py.File:
@@ -125,23 +139,32 @@ def patient_open(backend: Backend) -> PatientOpen | None:
     return backend.open
 
 
-def replace_file(backend: HDFBackend, make: Callable[[Path], None], present: h5py.File | None) -> None:
+def replace_file(
+    backend: HDFBackend, make: Callable[[Path], None], present: h5py.File | None, is_new: bool = False
+) -> None:
     """Replace the file of a backend in one step by a file that `make` writes; other readable groups are kept.
 
-    The present file is closed, since Windows replaces no open file.
+    `present` is the file, open for writing, so that no other sampler writes to it meanwhile, or None if it cannot be
+    read. FileExistsError if the file `is_new`, and another sampler has made it meanwhile.
     """
     path = Path(backend.filename).resolve()
-    new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    make(new)
-    if present is not None:
-        with h5py.File(new, "a") as file:
-            try:
-                _copy_missing(present, file, backend.name)
-            except OSError as error:
-                logger.debug("not all groups of %s can be kept: %s", path, error)
-        present.close()
-    os.replace(new, path)
+    new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
+    try:
+        make(new)
+        if present is not None:
+            with h5py.File(new, "a") as file:
+                try:
+                    _copy_missing(present, file, backend.name)
+                except OSError as error:
+                    logger.debug("not all groups of %s can be kept: %s", path, error)
+            if os.name == "nt":  # Windows replaces no open file
+                present.close()
+        if is_new:
+            os.link(new, path)
+        else:
+            os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import io
+import multiprocessing
 import os
 import pickle
 import resource
@@ -233,6 +234,35 @@ def test_groups_of_one_file_are_runs_of_their_own(tmp_path):
     assert np.array_equal(again.get_chain(), first.get_chain())
     other.run_mcmc(None, 1)
     assert other.iteration == 3
+
+
+def run_in_a_group(path, number, together):
+    """A run of two steps, which begins together with others in one file."""
+    backend = emcee.backends.HDFBackend(str(path), name=f"group {number}")
+    together.wait()
+    sampler = SMCSampler(N, NDIM, Gaussian(NDIM, sd=0.05), vectorize=True, seed=number, backend=backend)
+    sampler.run_mcmc(None, 2)
+
+
+def test_processes_that_begin_in_one_file_at_one_moment_keep_all_groups(tmp_path):
+    """They make the file, or their group in it, at the same time."""
+    context, chains = multiprocessing.get_context("fork"), []
+    for number in range(4):
+        alone = SMCSampler(N, NDIM, Gaussian(NDIM, sd=0.05), vectorize=True, seed=number)
+        alone.run_mcmc(None, 2)
+        chains.append(alone.get_chain())
+    for trial in range(2):
+        path, together = tmp_path / f"run {trial}.h5", context.Barrier(4)
+        processes = [context.Process(target=run_in_a_group, args=(path, number, together)) for number in range(4)]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+        assert [process.exitcode for process in processes] == [0] * 4
+        with h5py.File(path) as file:
+            for number, chain in enumerate(chains):
+                assert np.array_equal(file[f"group {number}/chain"], chain)
+    assert not list(tmp_path.glob("*.new"))
 
 
 HOLDER = """
