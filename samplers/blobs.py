@@ -35,7 +35,7 @@ def joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
         parts = np.split(whole, np.cumsum([len(array) for array in arrays])[:-1])
         if not any(_lost(array, part).any() for array, part in zip(arrays, parts, strict=True)):
             return whole
-    return _objects(row for array in arrays for row in array.tolist())
+    return _objects(row for array in arrays for row in _rows(array))
 
 
 def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declared: bool = False) -> np.ndarray:
@@ -43,7 +43,7 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
     if blobs.dtype == dtype and blobs.shape[1:] == shape:
         return blobs
     if dtype.kind == "O" and shape == ():
-        return _objects(blobs.tolist())
+        return _objects(_rows(blobs))
     if blobs.shape[1:] != shape:
         raise ValueError(
             f"the blobs of each point must have the shape {shape} of the first evaluations; got {blobs.shape[1:]}. "
@@ -143,6 +143,11 @@ def _as_objects(blobs: list) -> np.ndarray:
         return np.array(blobs, dtype=object)
     except ValueError:
         return _objects(blobs)
+
+
+def _rows(array: np.ndarray) -> list:
+    """The blobs of an array (n, ...): numbers of Python, or arrays where a blob has several values."""
+    return list(array) if array.ndim > 1 and array.dtype.kind != "O" else array.tolist()
 
 
 def _objects(rows: Iterable) -> np.ndarray:

@@ -193,7 +193,9 @@ def test_types_with_a_pool(asynchronous):
 def test_arrays_of_batches():
     assert joined([np.array([1]), np.array([0.5])]).tolist() == [1.0, 0.5]
     assert joined([np.array([BIG]), np.array([0.5])]).tolist() == [BIG, 0.5]
-    assert joined([np.array([[1, 2]]), np.array([[1]])]).tolist() == [[1, 2], [1]]
+    of_two_lengths = joined([np.array([[1, 2]]), np.array([[1]])])
+    assert [type(row) for row in of_two_lengths] == [np.ndarray] * 2  # as one batch of two lengths would have them
+    assert [row.tolist() for row in of_two_lengths] == [[1, 2], [1]]
     assert joined([np.array([b"a"]), np.array([1.0])]).tolist() == [b"a", 1.0]
     assert stacked([(1,), (2**63,), (-1,)]).tolist() == [1, 2**63, -1]
     assert stacked([(1,), (2.5,)]).dtype == float and stacked([(1,), (2,)]).dtype == int
