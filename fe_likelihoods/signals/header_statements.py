@@ -28,20 +28,22 @@ _STEP = re.compile(
     re.IGNORECASE,
 )
 _RATE = re.compile(
-    r"\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|samples per sec(?:ond)?\b)"
+    r"(?:\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|samples per sec(?:ond)?\b)|"
+    r"^\W*(?:fs|rate)\b(?=\s*[\[(:=,;\t]))"
     rf"\s*{_UNIT}{_IS}({NUMBER})\s*"
     r"(k?hz|sps|(?:samples|pts|points)\s*(?:per|/)\s*s(?:ec(?:ond)?)?)?",
     re.IGNORECASE,
 )
 _COUNT = re.compile(
     r"\b(?:npts|ndata|(?:number|no\.?|num)[ _]of[ _](?:data|samples|scans|rows|values)(?:[ _]points)?|"
-    rf"(?:number|no\.?|num)[ _]of[ _]points){_IS}(\d+)(?![\d.])",
+    rf"(?:number|no\.?|num)[ _]of[ _]points){_IS}(\d+)(?![\d.])|"
+    r"^\W*(?:samples|points|scans)\s*[:=,;\t]\s*(\d+)\W*$",
     re.IGNORECASE,
 )
 _UNIT_LINE = re.compile(r"\bunits?(?:\s+of\s+[a-z]{1,20})?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
 _UNITS_ARE = re.compile(r"\bunits?\s+(?:of|are|is)\s+[(\[]?\s*([^\s,;()\[\]]+)", re.IGNORECASE)
 _PEAK = re.compile(
-    rf"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?)(?:\s+values?)?\s*{_UNIT}\s*[:=]\s*(.{{0,200}})",
+    rf"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?)(?:\s+values?)?\s*{_UNIT}\s*[:=,;\t]\s*(.{{0,200}})",
     re.IGNORECASE,
 )
 _NAMED = re.compile(rf"\(([^)]{{1,40}})\)\s*({NUMBER})")
@@ -123,7 +125,7 @@ def read_statements(lines: Sequence[str]) -> Statements:
     for line in (each[:_LONGEST] for each in lines):
         steps += [found for match in _STEP.finditer(line) if (found := _stated_step(match))]
         steps += [found for match in _RATE.finditer(line) if (found := _stated_rate(match))]
-        counts += [(match[0], parse_count(match[1], match[0][:60])) for match in _COUNT.finditer(line)]
+        counts += [(match[0], parse_count(match[1] or match[2], match[0][:60])) for match in _COUNT.finditer(line)]
         units += [(match[0], match[1]) for match in _UNIT_LINE.finditer(line)]
         units += [(match[0], match[1]) for match in _UNITS_ARE.finditer(line) if _is_acceleration(match[1])]
         peaks += [found for match in _PEAK.finditer(line) if (found := _stated_peak(match)).printed]

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from ..units import find_unit
 from .clock_times import is_clock, is_date
+from .header_statements import read_statements
 from .logger_formats import logger_table
 from .text_files import LARGEST_FILE, check_count, decode_text, is_number, number_cells, parse_count, read_bytes
 
@@ -352,7 +353,8 @@ def _find_header(
             words.pop()
         if spare and len(words) == width - 1 and width > 2:
             words.append("")
-        if len(words) == width and _is_text(words):
+        states = width == 1 and any(read_statements(words))  # a line such as "Time step: 10 ms" names no column
+        if len(words) == width and _is_text(words) and not states:
             found.append((place, tuple(words)))
     if not found:
         return (), (), len(lines)

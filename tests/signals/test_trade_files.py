@@ -297,6 +297,14 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
         (text("Units: gal", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "states the unit 'gal' but units = 'g'"),
         (text("Units: counts", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "unknown unit 'counts'"),
         (text("Peak acceleration: 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak acceleration: 2.5 g'"),
+        (text("Samples: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Samples: 3' announces 3 samples, the file has 2"),
+        (text("fs: 50", "acc_g", "1", "2"), {"dt": 0.01}, "but 0.02 s by 'fs: 50'"),
+        (
+            text("PGA (g),1.0", "acc_g", "1.0", "2.0"),
+            {"dt": 0.01},
+            r"states 'PGA \(g\),1.0', the samples have a peak of 2",
+        ),
+        (text("Time step: 10 ms", "1", "2"), {"dt": 0.02, "units": "g"}, "but 0.01 s by 'Time step: 10 ms'"),
         (EQSIG, {"units": "g", "dt": 0.02}, "0.02 s by the argument dt but 0.01 s by 'dt = 0.0100 s'"),
         (EQSIG.replace("40 0", "41 0"), {"units": "g"}, "line 2 announces 41 samples, the file has 40"),
         (EQSIG, {}, "does not state the unit of its acceleration"),
@@ -319,12 +327,16 @@ def test_a_contradiction_of_what_a_header_states_is_refused(tmp_path, content, g
         ("Sampling period [ms] : 5", 0.005),
         ("dt = 5 ms", 0.005),
         ("Time step 0.005 seconds", 0.005),
+        ("fs = 200 Hz", 0.005),
+        ("Rate, 0.2 kHz", 0.005),
         ("2 points at equal spacing of 0.005 sec", 0.005),
     ],
 )
 def test_the_stated_step_is_used(tmp_path, line, step):
     assert read(tmp_path, "a.txt", text(line, "acc_g", "1", "2")).dt == pytest.approx(step, rel=1e-15)
     assert read_record(tmp_path / "a.txt", dt=step).dt == step
+    alone = read(tmp_path, "b.txt", text(line, "1", "2"), units="g")  # the line is no name of the only column
+    assert alone.dt == pytest.approx(step, rel=1e-15)
     with pytest.raises(ValueError, match="correct one"):
         read_record(tmp_path / "a.txt", dt=0.99 * step)
 
@@ -344,6 +356,11 @@ def test_the_stated_step_is_used(tmp_path, line, step):
         "PGA (g): 4.0",
         "Peak acc.: -39.2 m/s2 at 0.02 s",
         "Number of data points: 3",
+        "Samples: 3",
+        "Samples: 3 of 12 channels",
+        "fs: 100",
+        "Rate of the clock: 7",
+        "PGA (g),4.0",
     ],
 )
 def test_what_a_header_states_rightly_or_about_something_else_is_no_obstacle(tmp_path, line):
