@@ -226,15 +226,7 @@ class Record:
 
 
 class SubdividedHistory(NamedTuple):
-    """A refined displacement history.
-
-    Attributes
-    ----------
-    history : DisplacementHistory
-        The history with inserted points.
-    indices : ndarray, shape (n_steps,)
-        Indices of the original points in `history`.
-    """
+    """A refined displacement history, and the indices (n_steps,) of the original points in it."""
 
     history: "DisplacementHistory"
     indices: NDArray[np.intp]
