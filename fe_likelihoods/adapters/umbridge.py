@@ -109,13 +109,7 @@ def serve(
 
 
 class UMBridgeServer:
-    """A running server; see `serve` for the parameters.
-
-    Attributes
-    ----------
-    url : str
-        Its address, as in ``"http://127.0.0.1:4242"``.
-    """
+    """A running server; see `serve` for the parameters. `url` is its address, as in ``"http://127.0.0.1:4242"``."""
 
     def __init__(self, served: Mapping[str, Any], host: str, port: int, pool: Any) -> None:
         if not served:
@@ -156,24 +150,12 @@ class _Error(Exception):
 
 
 class _Evaluator(NamedTuple):
-    """How a posterior or model is evaluated.
+    """How a posterior or model is evaluated."""
 
-    Attributes
-    ----------
-    input_size : int
-        Number of parameters.
-    output_sizes : list of int
-        Lengths of the output vectors.
-    densities : tuple of str
-        Values that ``"density"`` may have in the configuration, the default first; empty for a model.
-    evaluate : callable
-        Function of points (n, input_size) and a density that returns for each point the output, or an `_Error`.
-    """
-
-    input_size: int
-    output_sizes: list[int]
-    densities: tuple[str, ...]
-    evaluate: Callable[[np.ndarray, str], list]
+    input_size: int  # number of parameters
+    output_sizes: list[int]  # lengths of the output vectors
+    densities: tuple[str, ...]  # of the configuration, the default first; empty for a model
+    evaluate: Callable[[np.ndarray, str], list]  # (n, input_size) and a density -> output or `_Error` per point
 
     def density_of(self, config: Any) -> str:
         """The density that a configuration names, empty for a model; `_Error` for another configuration."""

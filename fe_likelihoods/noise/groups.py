@@ -22,19 +22,11 @@ _ROUND_OFF_OF_FREQUENCY = 1e-9
 
 
 class Layout(NamedTuple):
-    """Times of the measured samples, and the number of coordinates in each group.
+    """Times of the measured samples, and the number of coordinates in each group."""
 
-    Attributes
-    ----------
-    steps, starts : tuple of float
-        Time step and first sample time of each channel [s].
-    counts : tuple of tuple of int, (n_groups, n_channels)
-        Number of coordinates in each group, per channel.
-    """
-
-    steps: tuple[float, ...]
-    starts: tuple[float, ...]
-    counts: tuple[tuple[int, ...], ...]
+    steps: tuple[float, ...]  # time step per channel [s]
+    starts: tuple[float, ...]  # first sample time per channel [s]
+    counts: tuple[tuple[int, ...], ...]  # (n_groups, n_channels)
 
 
 class GroupSums(ABC):
@@ -64,15 +56,9 @@ class GroupSums(ABC):
 
 @dataclass(frozen=True)
 class EventSums(GroupSums):
-    """Groups are the samples of events.
+    """Groups are the samples of events."""
 
-    Parameters
-    ----------
-    windows : tuple of (int, int)
-        First sample of each event, and the one after its last.
-    """
-
-    windows: tuple[tuple[int, int], ...]
+    windows: tuple[tuple[int, int], ...]  # first sample of each event, and the one after its last
 
     of_response: ClassVar[bool] = False
 
@@ -88,19 +74,11 @@ class EventSums(GroupSums):
 
 @dataclass(frozen=True)
 class PartSums(GroupSums):
-    """Groups are the samples in equal parts of the time, from time zero on.
+    """Groups are the samples in equal parts of the time, from time zero on."""
 
-    Parameters
-    ----------
-    part : float
-        Length of a part [s].
-    steps, starts : tuple of float
-        Time step and first sample time of each channel [s].
-    """
-
-    part: float
-    steps: tuple[float, ...]
-    starts: tuple[float, ...]
+    part: float  # length [s]
+    steps: tuple[float, ...]  # time step per channel [s]
+    starts: tuple[float, ...]  # first sample time per channel [s]
 
     of_response: ClassVar[bool] = True
 
@@ -143,20 +121,11 @@ class BandSums(GroupSums):
 
     A stretch is a run of samples without a gap; each stretch is transformed separately. Groups are the bands of the
     first stretch from low to high, then the bands of the next one.
-
-    Parameters
-    ----------
-    edges : tuple of float
-        Frequencies between the bands [Hz].
-    steps : tuple of float
-        Time step of each channel [s].
-    of_response : bool
-        Whether the sums of the response are needed too.
     """
 
-    edges: tuple[float, ...]
-    steps: tuple[float, ...]
-    of_response: bool
+    edges: tuple[float, ...]  # frequencies between the bands [Hz]
+    steps: tuple[float, ...]  # time step per channel [s]
+    of_response: bool  # sums of the response are needed too
 
     def powers(self, histories: np.ndarray, there: np.ndarray) -> np.ndarray:
         """See `GroupSums`."""
