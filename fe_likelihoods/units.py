@@ -1,10 +1,8 @@
 """Units: a table from the name of a unit to its SI factor and its dimension.
 
-All numbers inside the library are in SI units. They are converted in two places only: where files are read (`to_si`),
-and where labels and figures are made (`from_si`). A unit that is unknown or has another dimension than the quantity
-raises ValueError, because a wrong unit gives results that look right.
-
-The factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, standard gravity 9.80665 m/s².
+All numbers inside the library are in SI units; they are converted only where files are read (`to_si`), and where labels
+and figures are made (`from_si`). An unknown unit, or one of another dimension, raises ValueError, because a wrong unit
+gives results that look right. Factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, g = 9.80665 m/s².
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Server of UM-Bridge for posteriors and models, so that clients in other languages and processes can evaluate them.
 
-Requests that wait are evaluated together, as one batch. Posteriors and models are therefore never called by two threads
-at once, and their pools or compiled batch methods work on all points that wait. Numbers are sent with all their digits.
-
-The server of the package umbridge accepts connections from all networks, and its answers are not JSON where an output
-is infinite or the model raises an exception. This one is based on the standard library.
+Requests that wait are evaluated together, as one batch, so posteriors and models are never called by two threads at
+once. Numbers are sent with all their digits. The server of the package umbridge accepts connections from all networks,
+and its answers are not JSON where an output is infinite or the model raises an exception. This one is based on the
+standard library.
 """
 
 from __future__ import annotations

@@ -197,8 +197,7 @@ def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
 def kernel(
     function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False, cache: bool = True
 ) -> Callable:
-    """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation, cached on disk, ``.py_func`` is the
-    Python.
+    """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation; ``.py_func`` stays plain Python.
 
     Kernels are compiled without numba's reference counting: the caller provides every array, and an allocation is a
     compile error. Reference counting took 110 of the 180 ns of one evaluation of a section.

@@ -1,10 +1,9 @@
 """Squared residuals summed in groups of orthonormal coordinates: sufficient statistics of Gaussian noise.
 
-Errors are independent in the coordinates, with one variance for each group. The coordinates are the samples (groups are
-events, or parts of the time) or the coefficients of an orthonormal cosine transform (groups are frequency bands). An
-orthonormal transform preserves sums of squares and has a Jacobian of one, so the density of the coefficients is the
-density of the samples. The sufficient statistics of a group are the number of coordinates, the sum of squared residuals
-and, for a variance that depends on the response, the sum of squared response coordinates.
+Errors are independent in the coordinates, with one variance per group. Coordinates are samples (groups are events, or
+parts of the time) or coefficients of an orthonormal cosine transform (frequency bands), which preserves sums of squares
+and densities. The statistics of a group are the number of coordinates, the sum of squared residuals and, for a variance
+that depends on the response, the sum of squared response coordinates.
 """
 
 from abc import ABC, abstractmethod

@@ -4,13 +4,10 @@ Given the sum of squared residuals J of n samples, the likelihood is one integra
 
     L(J) = integral of (2 pi)^(-n/2) sigma^-n exp(-J / (2 sigma^2)) p(sigma) d sigma
 
-under its prior p. A sampler then searches fewer dimensions; the evidence and the posterior of the structural parameters
-are the same. The standard deviations are drawn afterwards, given the structural parameters.
-
-In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood dominates. A refined
-grid finds the maximum, bisection finds the integration limits, where the integrand has decreased by the factor
-exp(-36), and Gauss-Legendre quadrature gives the integral between them. Priors may be bounded. The equations are on the
-page ``docs/theory/likelihood.rst``.
+under its prior p. The evidence and the posterior of the structural parameters are the same; the standard deviations are
+drawn afterwards. In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood
+dominates. A refined grid finds it, bisection finds where the integrand has decreased by exp(-36), and Gauss-Legendre
+quadrature gives the integral in between. Priors may be bounded. See ``docs/theory/likelihood.rst``.
 """
 
 import math

@@ -1,9 +1,8 @@
 """Rows of cells in CSV files, as loggers and spreadsheets write them, and in Excel workbooks.
 
-Cells are separated by semicolons, tabs, commas or blanks, whichever splits most of the last lines into numbers. Decimal
-commas are read if commas do not separate cells. Separators of thousands are removed if a number shows that they are
-such: ``1,234.5``, ``1.234,5``, ``1'234``. Text before the header line is left out. A line with numbers and words
-counts as such text only if a header line follows it.
+Semicolons, tabs, commas or blanks separate cells, whichever splits most of the last lines into numbers. Decimal commas
+are read if commas do not separate cells; separators of thousands go if a number shows them: ``1,234.5``, ``1.234,5``,
+``1'234``. Text before the header line is left out, as are lines of numbers and words that a header line follows.
 """
 
 import csv
