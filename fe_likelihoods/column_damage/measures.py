@@ -106,7 +106,7 @@ class DamageMeasures:
         """Measures (n_events, n_measures + 4 n_sections) of a response (n_channels, n_steps) [SI].
 
         First the measures of the whole structure, then, for every section from the base up, the largest tensile strain
-        of the bar and compressive strain of the surface at the negative side, and the same at the positive side.
+        of the bar and compressive strain of the surface at the negative side, and the same at the positive side. Raises
         ValueError if the response and the model for which the measures were made differ in length.
         """
         if response.shape[-1] != self.n_steps:

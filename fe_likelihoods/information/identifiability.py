@@ -180,7 +180,7 @@ def compare_covariances(
     """Compare a posterior covariance (n, n) of coordinates of variance 1 with the prior correlation (the identity).
 
     `slopes` and `logarithmic` (n,) are as in `Identifiability`; by default parameters are the coordinates themselves.
-    ValueError if a covariance is not symmetric, finite and positive definite, or has another shape.
+    Raises ValueError if a covariance is not symmetric, finite and positive definite, or has another shape.
     """
     n = len(names)
     posterior, prior = np.asarray(posterior, dtype=float), np.eye(n) if prior is None else np.asarray(prior, float)

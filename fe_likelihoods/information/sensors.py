@@ -164,8 +164,8 @@ def slopes_at(
     """Derivatives of responses at standard normal coordinates (m, d), from d + 1 simulations for each of them.
 
     They are forward differences by `steps` (m, d); a model with ``jacobian`` takes one simulation and one call of it
-    for each point. `target` maps a response (n_channels, n_steps) [SI] to a number. ValueError if it is not one number,
-    or ``jacobian`` fails (`fe_likelihoods.simulation.model.derivatives_batch`).
+    for each point. `target` maps a response (n_channels, n_steps) [SI] to a number. Raises ValueError if it is not one
+    number, or ``jacobian`` fails (`fe_likelihoods.simulation.model.derivatives_batch`).
     """
     m, d = coords.shape
     n_channels, n_steps = len(model.channels), model.n_steps

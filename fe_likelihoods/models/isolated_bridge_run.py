@@ -63,7 +63,7 @@ def prepare_bridge(model: Any) -> PreparedBridge:
 def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> BridgeRun:
     """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
 
-    SimulationFailed if the parameters describe no structure, or the solution does not converge.
+    Raises SimulationFailed if the parameters describe no structure, or the solution does not converge.
     """
     v = model.physical_values(theta)
     check_values(v, _MAY_BE_ZERO)

@@ -73,7 +73,7 @@ class StructureResponse(NamedTuple):
 def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -> np.ndarray:
     """Damping matrix (n, n) of modal damping ratios (n,): C = M Phi diag(2 zeta omega) Phi^T M.
 
-    Mass and stiffness are symmetric; Phi are the undamped modes, lowest frequency first. SimulationFailed if the
+    Mass and stiffness are symmetric; Phi are the undamped modes, lowest frequency first. Raises SimulationFailed if the
     stiffness is not positive definite.
     """
     squares, modes = eigh(stiffness, mass)
@@ -87,8 +87,8 @@ def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -
 def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> StructureResponse:
     """Exact response, from rest, to support accelerations (n_supports, n_steps) [m/s²] that are linear between samples.
 
-    SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly critical
-    damping, or without stiffness), or if the mass is singular.
+    Raises SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly
+    critical damping, or without stiffness), or if the mass is singular.
     """
     modes = complex_modes(system)
     n, n_steps = len(system.mass), support_acceleration.shape[1]

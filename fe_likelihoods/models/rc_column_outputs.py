@@ -274,7 +274,7 @@ def _add(total: np.ndarray, weights: np.ndarray, values: np.ndarray) -> None:
 def parse_outputs(names: object, sections: Sections, at_top: Sequence[str]) -> tuple[Output, ...]:
     """Resolve names of outputs, each once; `at_top` are the outputs at the top that the type of loading has.
 
-    ValueError if a name is unknown or repeated, or a place is outside the column.
+    Raises ValueError if a name is unknown or repeated, or a place is outside the column.
     """
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise invalid("outputs as a tuple of names", names, _ADVICE)

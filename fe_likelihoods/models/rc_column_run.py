@@ -61,7 +61,8 @@ def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
 def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> ColumnRun:
     """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
 
-    SimulationFailed if the parameters describe no structure, the column collapses, or the solution does not converge.
+    Raises SimulationFailed if the parameters describe no structure, the column collapses, or the solution does not
+    converge.
     """
     values = model.physical_values(theta)
     check_physical_values(values, model.steel)

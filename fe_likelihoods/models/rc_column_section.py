@@ -19,7 +19,7 @@ __all__ = ["ReinforcedSection"]
 class ReinforcedSection:
     """Circular section with a confined core, cover concrete and one circle of bars.
 
-    ValueError if the reinforcement does not fit into the section, or the mesh is not strips or `Patches`.
+    Raises ValueError if the reinforcement does not fit into the section, or the mesh is not strips or `Patches`.
     """
 
     diameter: float  # outer [m]

@@ -36,7 +36,8 @@ class ExternalModel(StructuralModel):
 
     A subclass defines `_respond`, which may raise any exception and return anything. `depends_on` are files (a Path:
     the content of a file or of all files in a folder) and values that affect the response, as part of the fingerprint.
-    ValueError: names missing, repeated or not text, `dt` [s] or `n_steps` not positive, or `depends_on` cannot be used.
+    Raises ValueError if names are missing, repeated or not text, if `dt` [s] or `n_steps` is not positive, or if
+    `depends_on` cannot be used.
     """
 
     fingerprint = ""
@@ -87,10 +88,11 @@ class ExternalModel(StructuralModel):
     def simulate(self, theta: ArrayLike) -> np.ndarray:
         """Response [SI] (n_channels, n_steps) for one set of parameters (n_parameters,), of which the code gets a copy.
 
-        SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex or is
-        not finite; the reason ends with the duration. It is a `TransientReason` if the cause is not the model (see
-        `fe_likelihoods.simulation.faults`). ValueError if `theta` has another shape. KeyboardInterrupt and SystemExit
-        of the code in this process, even as the cause of another exception, are no failed simulation: they end the run.
+        Raises SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex
+        or is not finite; the reason ends with the duration. It is a `TransientReason` if the cause is not the model
+        (see `fe_likelihoods.simulation.faults`). Raises ValueError if `theta` has another shape. KeyboardInterrupt and
+        SystemExit of the code in this process, even as the cause of another exception, are no failed simulation: they
+        end the run.
         """
         theta = check_theta(theta, self.parameter_names).copy()
         start, before = time.perf_counter(), sys.exception()

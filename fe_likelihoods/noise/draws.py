@@ -65,7 +65,7 @@ def sample_noise(
 
     A level that depends on the response needs its time step `dt` [s]; without it, ``noise.standard_deviations`` of the
     measurements are used. `at_samples`: responses are given at the measured samples, for a noise that knows the sample
-    times. ValueError if the noise cannot be drawn from, or has impossible standard deviations or correlations.
+    times. Raises ValueError if the noise cannot be drawn from, or has impossible standard deviations or correlations.
     """
     if not hasattr(noise, "standard_deviations"):
         raise ValueError(

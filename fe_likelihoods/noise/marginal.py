@@ -37,7 +37,7 @@ class MarginalNoise:
     """White noise without parameters: the parameters of a `GaussianNoise` are integrated out under their priors.
 
     Its levels are in SI units, per channel or for all channels; effective samples are allowed, known sensor noise is
-    not: ValueError. `priors` are of exactly the noise's parameters.
+    not. `priors` are of exactly the noise's parameters. Raises ValueError for any other noise or priors.
 
     If the integrand has one maximum, the likelihood is accurate to eight digits for a hundred samples or more and to
     six digits for ten. Half-normal, uniform and lognormal priors make the integrand log-concave in log sigma, so it has
@@ -96,8 +96,8 @@ class MarginalNoise:
     def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, uniform: np.ndarray) -> np.ndarray:
         """Parameters (n, n_noise) of `noise` from their conditional posterior, one row per misfit (n, n_channels).
 
-        `uniform` (n, n_noise) are independent random numbers in [0, 1). ValueError for a misfit that is not finite and
-        positive.
+        `uniform` (n, n_noise) are independent random numbers in [0, 1). Raises ValueError for a misfit that is not
+        finite and positive.
         """
         misfit = np.asarray(misfit, dtype=float)
         good = (np.isfinite(misfit) & (misfit > 0.0)).all(axis=1)

@@ -146,8 +146,8 @@ def autocorrelation(residuals: np.ndarray) -> np.ndarray:
     """sum_t r_t r_{t+k} / sum_t r_t^2 of residuals (n_channels, n_steps) at lags k = 0, 1, ..., about a mean of zero
     (the mean of an error); one at lag zero.
 
-    Where samples are missing (NaN), products are averaged over the complete pairs; zero at lags without a pair.
-    ValueError: another shape, fewer than two samples, infinite values, or only zeros in a channel.
+    Where samples are missing (NaN), products are averaged over the complete pairs; zero at lags without a pair. Raises
+    ValueError for another shape, fewer than two samples, infinite values, or only zeros in a channel.
     """
     residuals = _checked(residuals)
     missing = np.isnan(residuals)

@@ -111,8 +111,8 @@ class ShiftedNoise:
 def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: float) -> Noise:
     """A likelihood's noise with largest unknown time shifts of channels [s]; None keeps the shifts that the noise has.
 
-    `dt` is the step of the response [s]. ValueError: noise that is not white or not in SI units, an unknown channel, or
-    a shift that is not positive.
+    `dt` is the step of the response [s]. Raises ValueError for a noise that is not white or not in SI units, an unknown
+    channel, or a shift that is not positive.
     """
     if isinstance(noise, ShiftedNoise):
         noise, time_shifts = noise.noise, noise.time_shifts if time_shifts is None else time_shifts

@@ -188,7 +188,7 @@ class FrozenDistribution(Distribution):
 class FrozenMultivariate(MultivariateDistribution):
     """A frozen multivariate distribution of `scipy.stats` with ``logpdf`` and ``rvs``, such as ``multivariate_t``.
 
-    Its density is defined for all real numbers. ValueError if its draws have another dimension than `dim`.
+    Its density is defined for all real numbers. Raises ValueError if its draws have another dimension than `dim`.
     """
 
     def __init__(self, frozen: Any, dim: int) -> None:

@@ -14,8 +14,8 @@ def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
     """One point (ndim,) or several (n, ndim) as an array, from an array_like or a mapping with a value, or n values,
     per name.
 
-    emcee passes mappings with ``parameter_names=``, nautilus with its own prior. ValueError if the number of values or
-    the names are wrong.
+    emcee passes mappings with ``parameter_names=``, nautilus with its own prior. Raises ValueError if the number of
+    values or the names are wrong.
     """
     if isinstance(x, Mapping):
         if set(x) != set(names):

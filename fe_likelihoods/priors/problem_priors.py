@@ -34,7 +34,7 @@ def bridge_column_prior(
 
     Assumed: a shared ``sigma`` in root mean squares of the channels, and the levels of further channels in their root
     mean squares `measured` [SI], are half-normal with scale 0.3; correlations ``rho_...`` are uniform between -1 and 1.
-    ValueError if there is no default prior for a noise parameter.
+    Raises ValueError if there is no default prior for a noise parameter.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
     scales = {f"sigma_{name}": _NOISE_SCALE * value for name, value in measured.items()} | {

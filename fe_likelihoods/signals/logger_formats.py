@@ -20,8 +20,8 @@ _Line = tuple[int, list[str]]
 def logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
     """Return numbered lines of a table with header line and line of units, and what comments would state (a step).
 
-    Lines in another format are returned as they are. ValueError: a LabVIEW file with several segments, or without time
-    on its axis.
+    Lines in another format are returned as they are. Raises ValueError for a LabVIEW file with several segments, or
+    without time on its axis.
     """
     first = lines[0][1][0] if lines and lines[0][1] else ""
     if first == "TOA5" and len(lines) > 3:

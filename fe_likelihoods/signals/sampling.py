@@ -88,8 +88,8 @@ def same_sampling(dt: float, n_steps: int, other_dt: float, other_n_steps: int) 
 def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float | None) -> slice:
     """Return the slice of the samples between `start` and `stop` [s], both included; None is the end of the series.
 
-    The first sample is at time zero. ValueError: times out of order or outside of the series, or fewer than two
-    samples.
+    The first sample is at time zero. Raises ValueError if times are out of order or outside of the series, or fewer
+    than two samples remain.
     """
     duration = (n_steps - 1) * dt
     stop = duration if stop is None else stop

@@ -52,7 +52,8 @@ def read_rows(path: str | Path, skip: int | None = None, along_rows: bool = Fals
     """Read the rows of a text file, or of the first sheet of an Excel workbook (``.xlsx``, needs openpyxl).
 
     `skip` lines are above the table; None finds them. With `along_rows` the numbers are one column, row after row, and
-    the last row may be shorter. ValueError: unreadable, no rows of numbers, or rows of different length.
+    the last row may be shorter. Raises ValueError if the file cannot be read, has no rows of numbers, or has rows of
+    different length.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")

@@ -51,8 +51,9 @@ def read_table(
 
     Separators are commas, semicolons, tabs or blanks; text above the table (`skip` lines, None finds them), a header
     line and a line of units are optional; lines with ``#`` are comments. `time` is the name or number of the column of
-    times, by default found; with `time_unit`, the first column of a file without a header line has them. ValueError:
-    unreadable, no rows, rows of different length, a cell that is no finite number, or another stated number of samples.
+    times, by default found; with `time_unit`, the first column of a file without a header line has them. Raises
+    ValueError if the file cannot be read, has no rows or rows of different length, has a cell that is no finite number,
+    or states another number of samples.
     """
     file, rows = str(path), read_rows(path, skip, along_rows)
     width = len(rows.cells[0][1])

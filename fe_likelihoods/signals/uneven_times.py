@@ -59,9 +59,9 @@ class UniformTimes(NamedTuple):
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
     """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
-    The default step is a whole number of samples per second within 5 % of the usual step, else the usual step.
-    ValueError: times do not increase, more than half of the samples are missing, or the step differs from the usual one
-    by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
+    The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
+    ValueError if times do not increase, more than half of the samples are missing, or the step differs from the usual
+    one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
     """
     step = None if step is None else check_step(step, f"resample of {where}")
     increments = np.diff(times)
