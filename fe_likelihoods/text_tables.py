@@ -7,16 +7,8 @@ __all__ = ["NamedResults", "listed", "number", "text_table"]
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
-    """Cells as aligned text, without spaces at the ends of lines.
+    """Cells as aligned text, without spaces at the ends of lines; header first, the first column aligned to the left.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        Rows of the same number of cells, the header first. The first column is aligned to the left, others to the
-        right.
-
-    Examples
-    --------
     >>> print(text_table([("channel", "RMS"), ("deck", "1.2")]))
     channel  RMS
     deck     1.2
@@ -46,14 +38,6 @@ class NamedResults(dict[str, Any]):
     """Results by name, a dict; ``print`` gives one table with a row per name.
 
     Each value has a property `cells`: texts by the headings of their columns, the same for all values.
-
-    Examples
-    --------
-    >>> class Peak:
-    ...     cells = {"peak [g]": "0.31"}
-    >>> print(NamedResults(first=Peak()))
-    event  peak [g]
-    first      0.31
     """
 
     def __str__(self) -> str:

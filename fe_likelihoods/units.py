@@ -1,10 +1,8 @@
 """Units: a table from the name of a unit to its SI factor and its dimension.
 
-All numbers inside the library are in SI units. They are converted in two places only: where files are read (`to_si`),
-and where labels and figures are made (`from_si`). A unit that is unknown or has another dimension than the quantity
-raises ValueError, because a wrong unit gives results that look right.
-
-The factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, standard gravity 9.80665 m/s².
+All numbers inside the library are in SI units; they are converted only where files are read (`to_si`), and where labels
+and figures are made (`from_si`). An unknown unit, or one of another dimension, raises ValueError, because a wrong unit
+gives results that look right. Factors are exact by definition: 1 in = 25.4 mm, 1 lb = 0.45359237 kg, g = 9.80665 m/s².
 """
 
 from __future__ import annotations
@@ -26,21 +24,11 @@ POUND_FORCE = 0.45359237 * G0
 
 
 class Unit(NamedTuple):
-    """A unit of measurement.
+    """A unit of measurement."""
 
-    Attributes
-    ----------
-    name : str
-        Canonical name.
-    factor : float
-        Size of the unit in the SI unit of its dimension.
-    dimension : str
-        Dimension, a key of `DIMENSIONS`.
-    """
-
-    name: str
-    factor: float
-    dimension: str
+    name: str  # canonical
+    factor: float  # size in the SI unit of its dimension
+    dimension: str  # a key of `DIMENSIONS`
 
 
 _FACTORS = {
@@ -97,29 +85,12 @@ _MICROSTRAIN = {"ue", *(f"{mu}{each}" for mu in _MICRO for each in ("\N{GREEK SM
 
 
 def find_unit(name: str, dimension: str | None = None) -> Unit:
-    """Return the unit with a name.
+    """Return the unit with a name; ValueError lists the known units if it is unknown or has another dimension.
 
-    The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are
-    all ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
+    The spellings of common file formats are understood: ``cm/sec/sec``, ``cm/sec2``, ``cm/s^2`` and ``cm_s2`` are all
+    ``cm/s2``; ``kN-m``, ``kN*m``, ``kN.m``, ``kN_m`` and ``kNm`` are ``kN m``; ``seconds`` is ``s``; ``ue`` is
     ``microstrain``, ``mg`` a thousandth of g. Letter case is ignored, because file headers are often in capitals,
     except for the prefix of ``MN`` and ``MPa``: ``mN`` would be smaller by a factor of 10⁹.
-
-    Parameters
-    ----------
-    name : str
-        Name of the unit.
-    dimension : str, optional
-        Required dimension of the unit, a key of `DIMENSIONS`.
-
-    Returns
-    -------
-    Unit
-        The unit.
-
-    Raises
-    ------
-    ValueError
-        If the unit is unknown or has another dimension. The message lists the known units.
     """
     if dimension is not None and dimension not in DIMENSIONS:
         raise ValueError(f"unknown dimension {dimension!r}; known dimensions: {', '.join(DIMENSIONS)}")

@@ -29,15 +29,7 @@ _TOLERANCE = 1e-7
 
 
 class BilbyProblem(NamedTuple):
-    """The first two arguments of `bilby.run_sampler`.
-
-    Attributes
-    ----------
-    likelihood : bilby.Likelihood
-        Log-likelihood of named parameters; it can be pickled.
-    priors : bilby.core.prior.PriorDict
-        Priors in the order of the parameters.
-    """
+    """The first two arguments of `bilby.run_sampler`: a likelihood (can be pickled) and priors in parameter order."""
 
     likelihood: bilby.Likelihood
     priors: bilby.core.prior.PriorDict

@@ -1,10 +1,9 @@
 """Server of UM-Bridge for posteriors and models, so that clients in other languages and processes can evaluate them.
 
-Requests that wait are evaluated together, as one batch. Posteriors and models are therefore never called by two threads
-at once, and their pools or compiled batch methods work on all points that wait. Numbers are sent with all their digits.
-
-The server of the package umbridge accepts connections from all networks, and its answers are not JSON where an output
-is infinite or the model raises an exception. This one is based on the standard library.
+Requests that wait are evaluated together, as one batch, so posteriors and models are never called by two threads at
+once. Numbers are sent with all their digits. The server of the package umbridge accepts connections from all networks,
+and its answers are not JSON where an output is infinite or the model raises an exception. This one is based on the
+standard library.
 """
 
 from __future__ import annotations
@@ -109,13 +108,7 @@ def serve(
 
 
 class UMBridgeServer:
-    """A running server; see `serve` for the parameters.
-
-    Attributes
-    ----------
-    url : str
-        Its address, as in ``"http://127.0.0.1:4242"``.
-    """
+    """A running server; see `serve` for the parameters. `url` is its address, as in ``"http://127.0.0.1:4242"``."""
 
     def __init__(self, served: Mapping[str, Any], host: str, port: int, pool: Any) -> None:
         if not served:
@@ -156,24 +149,12 @@ class _Error(Exception):
 
 
 class _Evaluator(NamedTuple):
-    """How a posterior or model is evaluated.
+    """How a posterior or model is evaluated."""
 
-    Attributes
-    ----------
-    input_size : int
-        Number of parameters.
-    output_sizes : list of int
-        Lengths of the output vectors.
-    densities : tuple of str
-        Values that ``"density"`` may have in the configuration, the default first; empty for a model.
-    evaluate : callable
-        Function of points (n, input_size) and a density that returns for each point the output, or an `_Error`.
-    """
-
-    input_size: int
-    output_sizes: list[int]
-    densities: tuple[str, ...]
-    evaluate: Callable[[np.ndarray, str], list]
+    input_size: int  # number of parameters
+    output_sizes: list[int]  # lengths of the output vectors
+    densities: tuple[str, ...]  # of the configuration, the default first; empty for a model
+    evaluate: Callable[[np.ndarray, str], list]  # (n, input_size) and a density -> output or `_Error` per point
 
     def density_of(self, config: Any) -> str:
         """The density that a configuration names, empty for a model; `_Error` for another configuration."""

@@ -49,24 +49,13 @@ _NEEDED = {
 
 
 class Sensors(NamedTuple):
-    """Channels that the measures need.
+    """Channels that the measures need; an empty text for a channel that does not exist."""
 
-    Attributes
-    ----------
-    displacement, force, acceleration : str
-        Displacement relative to the base [m], restoring force that belongs to it [N] and absolute acceleration [m/s²];
-        an empty text for a channel that does not exist.
-    heights : ndarray, shape (n_sections,)
-        Section heights at which strains are known [m].
-    strains : tuple of tuple of str
-        For each section from the base up: bar and surface at the negative side, bar and surface at the positive side.
-    """
-
-    displacement: str
-    force: str
-    acceleration: str
-    heights: np.ndarray
-    strains: tuple[tuple[str, ...], ...]
+    displacement: str  # relative to the base [m]
+    force: str  # restoring force that belongs to it [N]
+    acceleration: str  # absolute [m/s²]
+    heights: np.ndarray  # (n_sections,) at which strains are known [m]
+    strains: tuple[tuple[str, ...], ...]  # per section from the base: bar, surface at the negative, then positive side
 
 
 class _Window(NamedTuple):
@@ -114,23 +103,11 @@ class DamageMeasures:
     dt: float
 
     def __call__(self, response: np.ndarray) -> np.ndarray:
-        """Evaluate the measures.
+        """Measures (n_events, n_measures + 4 n_sections) of a response (n_channels, n_steps) [SI].
 
-        Parameters
-        ----------
-        response : ndarray, shape (n_channels, n_steps)
-            Response of the model [SI].
-
-        Returns
-        -------
-        ndarray, shape (n_events, n_measures + 4 n_sections)
-            The measures of the whole structure, then, for every section from the base up, the largest tensile strain of
-            the bar and compressive strain of the surface at the negative side, and the same at the positive side.
-
-        Raises
-        ------
-        ValueError
-            If the response and the model for which the measures were made differ in length.
+        First the measures of the whole structure, then, for every section from the base up, the largest tensile strain
+        of the bar and compressive strain of the surface at the negative side, and the same at the positive side. Raises
+        ValueError if the response and the model for which the measures were made differ in length.
         """
         if response.shape[-1] != self.n_steps:
             raise ValueError(

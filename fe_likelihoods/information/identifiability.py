@@ -177,27 +177,10 @@ def compare_covariances(
     slopes: np.ndarray | None = None,
     logarithmic: np.ndarray | None = None,
 ) -> Identifiability:
-    """Compare a posterior covariance with the prior covariance.
+    """Compare a posterior covariance (n, n) of coordinates of variance 1 with the prior correlation (the identity).
 
-    Parameters
-    ----------
-    posterior : (n, n) float
-        Posterior covariance of coordinates with a prior variance of 1.
-    names : sequence of n str
-        Names of the parameters.
-    prior : (n, n) float, optional
-        Prior correlation of the coordinates. Default: the identity.
-    slopes, logarithmic : (n,) float, (n,) bool, optional
-        As in `Identifiability`. Default: parameters that are the coordinates themselves, and no logarithms.
-
-    Returns
-    -------
-    Identifiability
-
-    Raises
-    ------
-    ValueError
-        If a covariance is not symmetric, finite and positive definite, or has another shape.
+    `slopes` and `logarithmic` (n,) are as in `Identifiability`; by default parameters are the coordinates themselves.
+    Raises ValueError if a covariance is not symmetric, finite and positive definite, or has another shape.
     """
     n = len(names)
     posterior, prior = np.asarray(posterior, dtype=float), np.eye(n) if prior is None else np.asarray(prior, float)

@@ -42,21 +42,11 @@ FEWEST = 10  # samples for each parameter
 
 
 class Slopes(NamedTuple):
-    """Derivatives of responses by standard normal coordinates at m points; NaN where a simulation failed.
+    """Derivatives of responses by standard normal coordinates at m points; NaN where a simulation failed."""
 
-    Attributes
-    ----------
-    products : (m, n_channels, d, d) float
-        Sums over the samples of the products of two derivatives [SI²], per channel.
-    mean_squares : (m, n_channels) float
-        Mean squares of the responses [SI²].
-    gradients : (m, d) float
-        Derivatives of the target [SI]; zero without one.
-    """
-
-    products: np.ndarray
-    mean_squares: np.ndarray
-    gradients: np.ndarray
+    products: np.ndarray  # (m, n_channels, d, d) sums over samples of products of two derivatives [SI²]
+    mean_squares: np.ndarray  # (m, n_channels) of the responses [SI²]
+    gradients: np.ndarray  # (m, d) of the target [SI]; zero without one
 
 
 class SensorRanking(NamedTuple):
@@ -152,18 +142,8 @@ def _with_error(value: float, error: float) -> str:
 
 
 def information_of(precision: np.ndarray, products: np.ndarray) -> np.ndarray:
-    """Information [nat] that measurements add to what is known.
-
-    Parameters
-    ----------
-    precision : (..., d, d) float
-        Precision of what is known already.
-    products : (..., d, d) float
-        Weighted products of derivatives J^T W J of the measurements.
-
-    Returns
-    -------
-    (...) float
+    """Information (...) [nat] that measurements with weighted products J^T W J (..., d, d) add to a precision (..., d,
+    d).
     """
     return 0.5 * (np.linalg.slogdet(precision + products)[1] - np.linalg.slogdet(precision)[1])
 
@@ -181,30 +161,11 @@ def slopes_at(
     target: Callable[[np.ndarray], Any] | None = None,
     pool: Any = None,
 ) -> Slopes:
-    """Derivatives of responses at points, from d + 1 simulations for each of them.
+    """Derivatives of responses at standard normal coordinates (m, d), from d + 1 simulations for each of them.
 
-    They are forward differences; a model with ``jacobian`` takes one simulation and one call of it for each point.
-
-    Parameters
-    ----------
-    model : Model
-    prior : Prior
-        Prior of its parameters, in their order.
-    coords, steps : (m, d) float
-        Standard normal coordinates, and steps of the differences.
-    target : callable, optional
-        Function of the response (n_channels, n_steps) [SI] that returns a number.
-    pool : object with ``map(function, items)``, optional
-        Runs the simulations.
-
-    Returns
-    -------
-    Slopes
-
-    Raises
-    ------
-    ValueError
-        If the target is not one number, or ``jacobian`` fails (`fe_likelihoods.simulation.model.derivatives_batch`).
+    They are forward differences by `steps` (m, d); a model with ``jacobian`` takes one simulation and one call of it
+    for each point. `target` maps a response (n_channels, n_steps) [SI] to a number. Raises ValueError if it is not one
+    number, or ``jacobian`` fails (`fe_likelihoods.simulation.model.derivatives_batch`).
     """
     m, d = coords.shape
     n_channels, n_steps = len(model.channels), model.n_steps

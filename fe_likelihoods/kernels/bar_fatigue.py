@@ -70,13 +70,9 @@ def constants(cf, alpha, cd, out):
 
 @kernel
 def half_cycle_damage(dx, ds, c, f):
-    """Return the damage of a half cycle with the natural strain `dx` and stress `ds` from its start.
+    """Return the damage of a half cycle with the natural strain `dx` and stress `ds` from its start, and its slope.
 
-    Returns
-    -------
-    damage : float
-    slope : float
-        Derivative of the damage with respect to the plastic strain.
+    The slope is the derivative of the damage with respect to the plastic strain.
     """
     plastic = abs(dx) - abs(ds) / c[E0]
     if plastic <= 0.0:

@@ -51,29 +51,14 @@ MAX_RISES = 3
 
 
 class Elements(NamedTuple):
-    """Constants and state of all elements in a column.
+    """Constants and state of all elements in a column."""
 
-    Attributes
-    ----------
-    points : ndarray (n_points,)
-        Gauss-Lobatto points on [0, 1].
-    tributary : ndarray (n_elements, n_points)
-        Length that each section represents: its weight times the element length [m].
-    initial_flexibility : ndarray (3,)
-        f11, f12, f22 of the virgin section.
-    tolerance : float
-        Largest work of the last compatibility correction [J].
-    state : ndarray (n_elements, HEAD + PER_SECTION n_points)
-    work : ndarray (2, HEAD + PER_SECTION n_points)
-        Scratch.
-    """
-
-    points: np.ndarray
-    tributary: np.ndarray
-    initial_flexibility: np.ndarray
-    tolerance: float
-    state: np.ndarray
-    work: np.ndarray
+    points: np.ndarray  # (n_points,) Gauss-Lobatto points on [0, 1]
+    tributary: np.ndarray  # (n_elements, n_points) length of each section: its weight times the element length [m]
+    initial_flexibility: np.ndarray  # (3,) f11, f12, f22 of the virgin section
+    tolerance: float  # largest work of the last compatibility correction [J]
+    state: np.ndarray  # (n_elements, HEAD + PER_SECTION n_points)
+    work: np.ndarray  # (2, HEAD + PER_SECTION n_points) scratch
 
 
 @kernel
@@ -115,21 +100,10 @@ def initialise(element, elements):
 
 @kernel(inline=True)
 def advance(v1, v2, v3, element, elements, sections):
-    """Bring one element to the basic deformations (v1, v2, v3), in place.
+    """Bring row `element` of the state to the basic deformations (v1, v2, v3), in place; return whether it converged.
 
-    Parameters
-    ----------
-    v1, v2, v3 : float
-        Elongation [m] and rotations of the two ends against the chord [rad].
-    element : int
-        Row of the state.
-    elements : Elements
-    sections : fiber_section.Sections
-
-    Returns
-    -------
-    bool
-        True if it converged. On failure the row is unchanged.
+    v1 is the elongation [m], v2 and v3 are rotations of the two ends against the chord [rad]. On failure the row is
+    unchanged.
     """
     points, tributary, state, work = elements.points, elements.tributary, elements.state, elements.work
     initial_flexibility = elements.initial_flexibility

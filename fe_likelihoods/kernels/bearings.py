@@ -54,37 +54,18 @@ COULOMB = 1
 
 
 class Slider(NamedTuple):
-    """Constants of one sliding bearing.
+    """Constants of one sliding bearing."""
 
-    Attributes
-    ----------
-    f_min, df : float
-        Friction coefficient at rest, and its increase at high velocity.
-    a : float
-        Rate of this increase [s/m].
-    yield_displacement : float
-        Y [m].
-    """
-
-    f_min: float
-    df: float
-    a: float
-    yield_displacement: float
+    f_min: float  # friction coefficient at rest
+    df: float  # its increase at high velocity
+    a: float  # rate of this increase [s/m]
+    yield_displacement: float  # Y [m]
 
 
 class RubberLaw(NamedTuple):
     """Constants of a rubber device, without the linear term of its skeleton.
 
-    Attributes
-    ----------
-    a3, a5, a7, a9, a11 : float
-        Coefficients of the skeleton [N].
-    b0, b2, b4 : float
-        Coefficients of half the distance between the branches [N].
-    scale : float
-        s_u [m].
-    limit : float
-        s_max.
+    a3 ... a11 are coefficients of the skeleton [N], b0, b2 and b4 of half the distance between the branches [N].
     """
 
     a3: float
@@ -95,8 +76,8 @@ class RubberLaw(NamedTuple):
     b0: float
     b2: float
     b4: float
-    scale: float
-    limit: float
+    scale: float  # s_u [m]
+    limit: float  # s_max
 
 
 @kernel(inline=True)

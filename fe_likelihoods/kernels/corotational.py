@@ -30,37 +30,20 @@ __all__ = ["BasicForces", "Chord", "deformations", "add_to_stiffness"]
 
 
 class Chord(NamedTuple):
-    """Deformations and chord of one element.
+    """Deformations and chord of one element."""
 
-    Attributes
-    ----------
-    elongation : float
-        [m]
-    theta_i, theta_j : float
-        Rotations of the ends against the chord [rad].
-    c, s : float
-        Direction cosines of the chord against +Y.
-    length : float
-        Length of the deformed chord, or of the undeformed chord in the linear variant [m].
-    """
-
-    elongation: float
-    theta_i: float
-    theta_j: float
-    c: float
+    elongation: float  # [m]
+    theta_i: float  # rotation of an end against the chord [rad]
+    theta_j: float  # [rad]
+    c: float  # direction cosines of the chord against +Y
     s: float
-    length: float
+    length: float  # of the deformed chord, or of the undeformed chord in the linear variant [m]
 
 
 class BasicForces(NamedTuple):
-    """Basic forces of one element and the upper half of its basic stiffness.
+    """Basic forces of one element (axial force [N] and end moments [N m]) and the upper half of its basic stiffness.
 
-    Attributes
-    ----------
-    q1, q2, q3 : float
-        Axial force [N] and end moments [N m].
-    k11, k12, k13, k22, k23, k33 : float
-        Derivatives of q with respect to the elongation [m] and the rotations [rad].
+    The k are derivatives of q with respect to the elongation [m] and the rotations [rad].
     """
 
     q1: float
@@ -103,18 +86,11 @@ def deformations(dux, duy, theta_i, theta_j, length, corotational):
 
 @kernel(inline=True)
 def add_to_stiffness(first, basic, direction, corotational, force, stiffness):
-    """Add the end forces and the tangent of one element to the forces and the tangent of the structure, in place.
+    """Add the end forces and the tangent of one element to `force` (n,) and `stiffness` (n, n) of the structure, in
+    place.
 
-    Parameters
-    ----------
-    first : int
-        Number of the degree of freedom ux at end I; -3 at the fixed base, where only end J is free.
-    basic : BasicForces
-    direction : Chord
-    corotational : bool
-        Whether to add the geometric stiffness.
-    force : ndarray (n,)
-    stiffness : ndarray (n, n)
+    `first` is the number of the degree of freedom ux at end I; -3 at the fixed base, where only end J is free. The
+    geometric stiffness is added if `corotational`.
     """
     q1, q2, q3 = basic.q1, basic.q2, basic.q3
     k11, k12, k13, k22, k23, k33 = basic.k11, basic.k12, basic.k13, basic.k22, basic.k23, basic.k33

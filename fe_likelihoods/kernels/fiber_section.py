@@ -54,42 +54,21 @@ _EC = concrete04.EC
 class Sections(NamedTuple):
     """Fibers of a section, and the memory of all sections with these fibers.
 
-    Attributes
-    ----------
-    core_count : int
-        The first `core_count` concrete fibers belong to the core, the others to the cover.
-    y, area : ndarray (n_concrete,)
-        Position [m] and area [m²] of the concrete fibers, with empty fibers appended.
-    bar_y, bar_area : ndarray (n_bars or more,)
-        Position [m] and area [m²] of the bars, with empty fibers appended.
-    concrete : ndarray (2, concrete04.N_CONSTANTS)
-        Constants of core and cover.
-    steel : ndarray (reinforcing_steel.N_CONSTANTS,)
-        Constants of the bars.
-    failure : ndarray (bar_fatigue.N_FAILURE,) or (0,)
-        Constants of bar fatigue; empty for bars that do not fail.
-    concrete_memory : ndarray (n_sections, 5, n_concrete)
-        eps_min, eps_max, eps_end, slope and tension slope of each fiber.
-    steel_memory : ndarray (n_sections, n_bars, reinforcing_steel.N_STATE or bar_fatigue.N_STATE)
-    virgin : ndarray (n_sections,)
-        1 while no bar of the section has been committed beyond yield, else 0. The bar memory of a virgin section is not
-        kept up to date.
-    trial : ndarray (reinforcing_steel.N_STATE or bar_fatigue.N_STATE,)
-        Scratch.
+    Arrays of fibers have empty fibers appended. The bar memory of a virgin section is not kept up to date.
     """
 
-    core_count: int
-    y: np.ndarray
-    area: np.ndarray
-    bar_y: np.ndarray
-    bar_area: np.ndarray
-    concrete: np.ndarray
-    steel: np.ndarray
-    failure: np.ndarray
-    concrete_memory: np.ndarray
-    steel_memory: np.ndarray
-    virgin: np.ndarray
-    trial: np.ndarray
+    core_count: int  # the first concrete fibers belong to the core, the others to the cover
+    y: np.ndarray  # (n_concrete,) [m]
+    area: np.ndarray  # (n_concrete,) [m²]
+    bar_y: np.ndarray  # (n_bars or more,) [m]
+    bar_area: np.ndarray  # (n_bars or more,) [m²]
+    concrete: np.ndarray  # (2, concrete04.N_CONSTANTS) of core and cover
+    steel: np.ndarray  # (reinforcing_steel.N_CONSTANTS,)
+    failure: np.ndarray  # (bar_fatigue.N_FAILURE,), or (0,) for bars that do not fail
+    concrete_memory: np.ndarray  # (n_sections, 5, n_concrete) eps_min, eps_max, eps_end, slope, tension slope
+    steel_memory: np.ndarray  # (n_sections, n_bars, N_STATE of reinforcing_steel or bar_fatigue)
+    virgin: np.ndarray  # (n_sections,) 1 while no bar has been committed beyond yield, else 0
+    trial: np.ndarray  # (N_STATE,) scratch
 
 
 @kernel
@@ -157,22 +136,10 @@ def _sum_bars(e0, kappa, j, bar_y, bar_area, steel, failure, steel_memory, virgi
 
 @kernel(inline=True, fastmath=SUM_REORDERING)
 def forces(e0, kappa, j, sections):
-    """Return the forces and the tangent of section `j` at a trial strain.
+    """Return N [N], M [N m] and the tangent of section `j` at a trial strain.
 
-    Parameters
-    ----------
-    e0, kappa : float
-        Axial strain at y = 0, and curvature [1/m].
-    j : int
-        Number of the section.
-    sections : Sections
-
-    Returns
-    -------
-    n_force, moment : float
-        [N], [N m].
-    k_axial, k_coupling, k_bending : float
-        Tangent: dN/de0 [N], dN/dkappa = dM/de0 [N m], dM/dkappa [N m²].
+    The strain is `e0` at y = 0 with the curvature `kappa` [1/m]; the tangent is dN/de0 [N], dN/dkappa = dM/de0 [N m]
+    and dM/dkappa [N m²].
     """
     y, area, concrete_memory = sections.y, sections.area, sections.concrete_memory
     bar_y, bar_area, steel = sections.bar_y, sections.bar_area, sections.steel
@@ -312,19 +279,13 @@ def commit(e0, kappa, j, sections):
 
 @kernel
 def cross_jumps(e0, kappa, j, sections):
-    """Take the fibers of section `j` that are next to a stress jump across the jump, in place.
+    """Take the fibers of section `j` that are next to a stress jump across it, in place; return how many were moved.
 
     The laws have jumps. Concrete loses its stress at once at eps_cu and at eps_tu, and a bar whose two backbones have
     different origins changes from one to the other at zero stress (`reinforcing_steel.switch_backbone`). If the jump
     drives the fiber back, there is equilibrium neither before nor after the jump, however small the step is. A bar that
-    fractures (`bar_fatigue`) loses its stress over a small strain, which acts like a jump if the column
-    springs back by more than this strain. None of the four jumps can be undone, so a fiber next to a jump is taken
-    across it.
-
-    Returns
-    -------
-    int
-        Number of fibers that were moved.
+    fractures (`bar_fatigue`) loses its stress over a small strain, which acts like a jump if the column springs back by
+    more than this strain. None of the four jumps can be undone, so a fiber next to a jump is taken across it.
     """
     y, concrete, concrete_memory = sections.y, sections.concrete, sections.concrete_memory
     count = 0

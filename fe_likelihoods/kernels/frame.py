@@ -38,54 +38,27 @@ N_MATRICES = 5
 
 
 class Column(NamedTuple):
-    """Constants and memory of one column, in any consistent units; the kernels change the arrays in place.
+    """Constants and memory of one column, in any consistent units; the kernels change the arrays in place."""
 
-    Attributes
-    ----------
-    length : float
-        Length of one element [m].
-    corotational : bool
-        False for linear geometry.
-    sections : fiber_section.Sections
-        Fibers and their memory.
-    elements : beam_column.Elements
-        Elements and their state.
-    state_before : ndarray
-        Scratch with the shape of ``elements.state``.
-    vectors : ndarray (N_VECTORS, n_dof)
-        Scratch.
-    matrices : ndarray (N_MATRICES, n_dof, n_dof)
-        Scratch.
-    """
-
-    length: float
-    corotational: bool
-    sections: Sections
-    elements: Elements
-    state_before: np.ndarray
-    vectors: np.ndarray
-    matrices: np.ndarray
+    length: float  # of one element [m]
+    corotational: bool  # False for linear geometry
+    sections: Sections  # fibers and their memory
+    elements: Elements  # elements and their state
+    state_before: np.ndarray  # scratch like elements.state
+    vectors: np.ndarray  # (N_VECTORS, n_dof) scratch
+    matrices: np.ndarray  # (N_MATRICES, n_dof, n_dof) scratch
 
 
 class Recorder(NamedTuple):
     """What an analysis writes at its samples besides its history; arrays without samples (0, ...) are not written.
 
-    Attributes
-    ----------
-    sections : ndarray (n_recorded, n_sections, 2)
-        Axial strain and curvature [1/m] of every section, from the base up.
-    motion : ndarray (n_recorded, 1 or 3, n_dof)
-        Displacements [m and rad] and, in dynamic analyses, velocities and accelerations relative to the base.
-    stresses : ndarray (n_recorded, n_fibers)
-        Stresses of fibers [Pa].
-    fibers : ndarray (n_fibers, 2) of int
-        Section and number of each of these fibers: from 0 the concrete fibers, from -1 downwards the bars.
+    Motions are displacements [m and rad] and, in dynamic analyses, velocities and accelerations relative to the base.
     """
 
-    sections: np.ndarray
-    motion: np.ndarray
-    stresses: np.ndarray
-    fibers: np.ndarray
+    sections: np.ndarray  # (n_recorded, n_sections, 2) axial strain and curvature [1/m], from the base up
+    motion: np.ndarray  # (n_recorded, 1 or 3, n_dof)
+    stresses: np.ndarray  # (n_recorded, n_fibers) [Pa]
+    fibers: np.ndarray  # (n_fibers, 2) int, section and number: from 0 concrete fibers, from -1 downwards bars
 
 
 def recorder(
@@ -205,15 +178,10 @@ def initialise_column(column):
 
 @kernel(inline=True)
 def assemble(u, column, force, stiffness):
-    """Write the restoring forces (n,) and the tangent (n, n) at the displacements `u` (n,).
+    """Write the restoring forces (n,) and the tangent (n, n) at the displacements `u` (n,); False if an element fails.
 
     An element that has become a fifth longer or shorter counts as failed, whatever its force. Without this limit a
     crushed column could reach equilibrium on its bars alone at half its length.
-
-    Returns
-    -------
-    bool
-        False if an element fails.
     """
     n = u.shape[0]
     state = column.elements.state

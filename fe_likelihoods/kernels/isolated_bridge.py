@@ -43,41 +43,21 @@ class StepMatrices(NamedTuple):
 
     One kind is the step h with F linear in time. Several kinds are those of Coulomb's law: for each of the steps h,
     h/2, h/4 and so on four kinds, with F constant at both bearings, linear at the first, linear at the second, and
-    linear at both.
-
-    Attributes
-    ----------
-    transposed : ndarray (n_kinds, 16, 16)
-        T transposed: row j holds the contribution of input j of (r, a_n, a_{n+1}, F) to r and Q r.
-    end : ndarray (n_kinds, 12, 2)
-        H1.
-    compliance : ndarray (n_kinds, 4, 2)
-        Q H1, bearing displacements and velocities under F_{n+1}.
+    linear at both. Row j of T transposed holds the contribution of input j of (r, a_n, a_{n+1}, F) to r and Q r.
     """
 
-    transposed: np.ndarray
-    end: np.ndarray
-    compliance: np.ndarray
+    transposed: np.ndarray  # (n_kinds, 16, 16)
+    end: np.ndarray  # (n_kinds, 12, 2) H1
+    compliance: np.ndarray  # (n_kinds, 4, 2) Q H1, bearing displacements and velocities under F_{n+1}
 
 
 class Isolators(NamedTuple):
-    """Nonlinear laws of the isolators at the two piers.
-
-    Attributes
-    ----------
-    sliders : pair of bearings.Slider
-    rubber : bearings.RubberLaw
-        The same at both piers.
-    c : float
-        sqrt(gamma - beta) of the Bouc-Wen law.
-    form : int
-        `BOUC_WEN` or `COULOMB`.
-    """
+    """Nonlinear laws of the isolators at the two piers."""
 
     sliders: tuple[Slider, Slider]
-    rubber: RubberLaw
-    c: float
-    form: int
+    rubber: RubberLaw  # the same at both piers
+    c: float  # sqrt(gamma - beta) of the Bouc-Wen law
+    form: int  # `BOUC_WEN` or `COULOMB`
 
 
 @kernel(inline=True)

@@ -82,13 +82,9 @@ def _private_folder(path: str) -> str:
 
 
 def _find_cache_folder() -> str | None:
-    """Create a private folder for compiled kernels.
-
-    Returns
-    -------
-    str or None
-        A folder below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache or the temporary folder: the first in which it
-        can be created. None, with a warning, if this fails everywhere: kernels are then compiled in every process.
+    """Create a private folder for compiled kernels below $FE_LIKELIHOODS_CACHE, $XDG_CACHE_HOME, ~/.cache or the
+    temporary folder, the first in which that is possible; else None, with a warning: kernels are then compiled in every
+    process.
     """
     user = f"fe_likelihoods-{os.getuid()}" if hasattr(os, "getuid") else "fe_likelihoods"
     shared = os.path.join(tempfile.gettempdir(), user)
@@ -201,27 +197,14 @@ def _compile_in_one_process(kernel: numba.core.dispatcher.Dispatcher) -> None:
 def kernel(
     function: Callable | None = None, *, inline: bool = False, fastmath: set[str] | bool = False, cache: bool = True
 ) -> Callable:
-    """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation, cached on disk.
+    """Compile a kernel: no Python objects, no GIL, IEEE division, no allocation; ``.py_func`` stays plain Python.
 
     Kernels are compiled without numba's reference counting: the caller provides every array, and an allocation is a
     compile error. Reference counting took 110 of the 180 ns of one evaluation of a section.
 
-    Parameters
-    ----------
-    function : callable
-        The kernel in plain Python; it stays available as ``.py_func``.
-    inline : bool
-        Merge the body into every caller. This is for functions in the inner loop that take arrays, because a call
-        passes about eight scalars per array.
-    fastmath : set of str
-        LLVM flags; this library uses `SUM_REORDERING` only.
-    cache : bool
-        Keep the machine code on disk, compiled by one process at a time. Inlined functions are never cached separately.
-
-    Returns
-    -------
-    callable
-        The compiled function, or a decorator if `function` is omitted.
+    `inline` merges the body into every caller: for functions in the inner loop that take arrays, because a call passes
+    about eight scalars per array. Of `fastmath`, LLVM flags, this library uses `SUM_REORDERING` only. With `cache` the
+    machine code is kept on disk, compiled by one process at a time; inlined functions are never cached separately.
     """
     if function is None:
         return lambda f: kernel(f, inline=inline, fastmath=fastmath, cache=cache)

@@ -35,13 +35,7 @@ N_CURVE = 9
 
 
 class End(NamedTuple):
-    """End of a curve.
-
-    Attributes
-    ----------
-    x, s, e : float
-        Natural strain, natural stress [Pa] and slope [Pa].
-    """
+    """End of a curve: natural strain, natural stress [Pa] and slope [Pa]."""
 
     x: float
     s: float

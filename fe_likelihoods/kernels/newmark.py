@@ -58,28 +58,14 @@ HISTORY_ROWS = (
 
 
 class Dynamics(NamedTuple):
-    """Loads, inertia and damping of a column.
+    """Loads, inertia and damping of a column."""
 
-    Attributes
-    ----------
-    gravity : ndarray (n_dof,)
-        Static load [N and N m].
-    mass : ndarray (n_dof,)
-        Diagonal of the mass matrix [kg and kg m²].
-    a0, a1 : float
-        Rayleigh damping: factors of the mass [1/s] and of the committed tangent stiffness [s].
-    velocity : float
-        Initial velocity of the top along x [m/s].
-    collapse : float
-        Lateral displacement of the top beyond which the column has collapsed, and the analysis ends [m].
-    """
-
-    gravity: np.ndarray
-    mass: np.ndarray
-    a0: float
-    a1: float
-    velocity: float
-    collapse: float = math.inf
+    gravity: np.ndarray  # (n_dof,) static load [N and N m]
+    mass: np.ndarray  # (n_dof,) diagonal of the mass matrix [kg and kg m²]
+    a0: float  # Rayleigh damping: factor of the mass [1/s]
+    a1: float  # factor of the committed tangent stiffness [s]
+    velocity: float  # initial, of the top along x [m/s]
+    collapse: float = math.inf  # lateral displacement of the top [m] beyond which the analysis ends
 
 
 @kernel(inline=True)

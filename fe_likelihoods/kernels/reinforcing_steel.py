@@ -210,24 +210,10 @@ def _returning_curve(xc, state, c, curve):
 
 @kernel
 def _step(x, tension, state, c):
-    """Make one transition of an odd branch at the natural strain `x`.
+    """Make one transition of an odd branch at the natural strain `x`; `state` (N_STATE,) changes in place.
 
-    Parameters
-    ----------
-    x : float
-        Trial strain.
-    tension : bool
-        False for an even branch, which is processed as a mirrored odd branch. One rule holds in tension only.
-    state : ndarray (N_STATE,)
-        Memory, changed in place.
-    c : ndarray (N_CONSTANTS,)
-
-    Returns
-    -------
-    done : bool
-        False if another transition has to follow.
-    stress, modulus : float
-        Natural stress and modulus, valid if `done`.
+    Returns whether no other transition has to follow and, valid only then, natural stress and modulus. `tension` is
+    False for an even branch, which is processed as a mirrored odd branch; one rule holds in tension only.
     """
     b = int(state[BRANCH])
     xc, sc = state[XC], state[SC]
@@ -398,15 +384,10 @@ def stress_tangent(eps, state, c, trial):
 
 @kernel
 def switch_backbone(state, c):
-    """Move a bar that is at the origin of its backbone to the other backbone, in place.
+    """Move a bar at the origin of its backbone to the other backbone, in place; return 1 if it has moved, else 0.
 
     After small yielding the backbones in tension and compression have different origins. The law jumps to the other
     backbone when the stress on the present backbone passes zero.
-
-    Returns
-    -------
-    int
-        1 if the bar was at the origin and has been moved, else 0.
     """
     b = int(state[BRANCH])
     if b != 1 and b != 2 or state[OP] == state[ON]:

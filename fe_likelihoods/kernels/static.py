@@ -49,38 +49,19 @@ MAX_LOWERINGS = 1000
 
 
 class Iteration(NamedTuple):
-    """Settings of Newton's method.
+    """Settings of Newton's method."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Norm of the last correction [m and rad].
-    max_iterations : int
-        Iterations of one attempt.
-    halvings : int
-        How often a step may be halved.
-    """
-
-    tolerance: float
-    max_iterations: int
-    halvings: int
+    tolerance: float  # norm of the last correction [m and rad]
+    max_iterations: int  # of one attempt
+    halvings: int  # how often a step may be halved
 
 
 class Position(NamedTuple):
-    """Displacements of the structure, with their forces and tangent.
+    """Displacements of the structure, with their forces and tangent."""
 
-    Attributes
-    ----------
-    u : ndarray (n,)
-        Displacements [m and rad].
-    force : ndarray (n,)
-        Restoring forces [N and N m].
-    stiffness : ndarray (n, n)
-    """
-
-    u: np.ndarray
-    force: np.ndarray
-    stiffness: np.ndarray
+    u: np.ndarray  # (n,) [m and rad]
+    force: np.ndarray  # (n,) restoring [N and N m]
+    stiffness: np.ndarray  # (n, n)
 
 
 @kernel
@@ -161,14 +142,8 @@ def lower(column, position, load, imposed, iteration):
     """Lower the top until the column carries the axial load again, in place; the imposed displacement is held.
 
     Each position on the way is an equilibrium with a smaller axial load, and the fibers are committed there. The load
-    comes down slowly, without the inertia of a fall.
-
-    Returns
-    -------
-    bool
-        True if the column carries the load again. False if no bar has fractured, if the first lowered position carries
-        the load (which was not lost then), or if the load is never carried again. On failure the column stays where it
-        is.
+    comes down slowly, without the inertia of a fall. False if no bar has fractured, if the first lowered position
+    carries the load (which was not lost then), or if it is never carried again: the column then stays where it is.
     """
     vertical = imposed + 1
     if load[vertical] == 0.0 or not bars_have_fractured(column):
@@ -190,12 +165,7 @@ def lower(column, position, load, imposed, iteration):
 def _advance_to(column, position, load, total, share, imposed, increment, iteration):
     """Add `share` of the load `total` and an imposed displacement, in halved steps if they do not converge.
 
-    Returns
-    -------
-    retries : int
-        Number of retries, or -1 on failure.
-    lowerings : int
-        How often the top was lowered until the axial load was carried again.
+    Returns the retries, -1 on failure, and how often the top was lowered until the axial load was carried again.
     """
     done, part, retries, crossings, lowerings = 0.0, 1.0, 0, 0, 0
     smallest = 0.5**iteration.halvings
@@ -231,20 +201,10 @@ def _advance_to(column, position, load, total, share, imposed, increment, iterat
 
 @kernel
 def apply_gravity(column, position, gravity, iteration):
-    """Make the column virgin and apply the load `gravity` (n,) [N and N m] in ten equal steps.
+    """Make the column virgin and apply the load `gravity` (n,) [N and N m] in ten equal steps; `position` is
+    overwritten.
 
-    Parameters
-    ----------
-    column : Column
-    position : Position
-        Overwritten.
-    gravity : ndarray (n,)
-    iteration : Iteration
-
-    Returns
-    -------
-    int
-        Number of retries, or -1 on failure.
+    Returns the number of retries, or -1 on failure.
     """
     initialise_column(column)
     load = column.vectors[3]

@@ -35,18 +35,10 @@ def digest(*parts: str) -> str:
 
 @dataclass(frozen=True)
 class History:
-    """Named time histories of one simulation, for plots and checks.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the rows; ``history[name]`` returns one row.
-    values : ndarray[n_rows, n_steps]
-        The histories [SI].
-    """
+    """Named time histories of one simulation, for plots and checks; ``history[name]`` returns one row."""
 
     names: tuple[str, ...]
-    values: np.ndarray
+    values: np.ndarray  # (n_rows, n_steps) [SI]
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.names:
@@ -57,10 +49,8 @@ class History:
 class StructuralModel:
     """Base class for all models of this package; a subclass defines `_respond`.
 
-    Attributes
-    ----------
-    path_dependent : bool
-        Whether a response depends on earlier excitations. False for linear structures, whose free vibration decays.
+    `path_dependent`: whether a response depends on earlier excitations. False for linear structures, whose free
+    vibration decays.
     """
 
     parameter_names: tuple[str, ...]

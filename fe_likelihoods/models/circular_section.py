@@ -38,19 +38,10 @@ def _slice_moments(radius: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def circular_strips(radius: float, core_radius: float, n_strips: int) -> tuple[np.ndarray, np.ndarray]:
-    """Make core and cover fibers from strips with equal heights.
+    """Make core and cover fibers, each ndarray[n, 2] of position y [m] and area [m²], from strips with equal heights.
 
-    Parameters
-    ----------
-    radius, core_radius : float
-        Radius of the section and of the confined core [m].
-    n_strips : int
-        Number of strips; even, so that no strip crosses the axis of bending.
-
-    Returns
-    -------
-    core, cover : ndarray[n, 2]
-        Position y [m] and area [m²] of each fiber. Strips outside the core have no core fiber.
+    The number of strips is even, so that no strip crosses the axis of bending. Strips outside the core have no core
+    fiber.
     """
     edges = np.linspace(-radius, radius, n_strips + 1)
     core_area, core_second = (np.diff(m) for m in _slice_moments(core_radius, edges))
@@ -67,21 +58,8 @@ def circular_strips(radius: float, core_radius: float, n_strips: int) -> tuple[n
 def circular_patches(
     radius: float, core_radius: float, n_wedges: int, n_core_rings: int, n_cover_rings: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Make core and cover fibers at the centroids of cells between rings and wedges; mirrored cells are merged.
-
-    Parameters
-    ----------
-    radius, core_radius : float
-        Radius of the section and of the confined core [m].
-    n_wedges : int
-        Number of wedges.
-    n_core_rings, n_cover_rings : int
-        Number of rings in the core and in the cover.
-
-    Returns
-    -------
-    core, cover : ndarray[n, 2]
-        Position y [m] and area [m²] of each fiber.
+    """Make core and cover fibers, each ndarray[n, 2] of position y [m] and area [m²], at the centroids of cells between
+    rings and wedges; mirrored cells are merged.
     """
     a = math.pi / n_wedges
     angles = a + 2.0 * a * np.arange(n_wedges)
@@ -97,23 +75,9 @@ def circular_patches(
 
 
 def bar_circle(radius: float, n_bars: int, area: float, first_angle: float = 0.0) -> np.ndarray:
-    """Make the fibers of bars that are evenly spaced on a circle; bars with the same position y are merged.
+    """Make fibers, ndarray[n, 2] of position y [m] and area [m²], of bars that are evenly spaced on a circle.
 
-    Parameters
-    ----------
-    radius : float
-        Radius of the circle [m].
-    n_bars : int
-        Number of bars.
-    area : float
-        Area of one bar [m²].
-    first_angle : float
-        Angle between the y axis and the first bar [rad].
-
-    Returns
-    -------
-    ndarray[n, 2]
-        Position y [m] and area [m²] of each fiber.
+    The first bar is at `first_angle` [rad] from the y axis; bars with the same position y are merged.
     """
     y = radius * np.cos(first_angle + 2.0 * math.pi * np.arange(n_bars) / n_bars)
     return _merge(y, np.full(n_bars, area), radius)
@@ -126,27 +90,13 @@ def _merge(y: np.ndarray, area: np.ndarray, scale: float) -> np.ndarray:
 
 
 class Confinement(NamedTuple):
-    """Properties of confined concrete.
+    """Properties of confined concrete."""
 
-    Attributes
-    ----------
-    effectiveness : float
-        Confinement effectiveness ke.
-    lateral_pressure : float
-        Effective lateral pressure fl' [Pa].
-    strength_ratio : float
-        Confined strength divided by the unconfined strength, fcc/fc.
-    strain_ratio : float
-        Strain at the confined strength divided by the strain at the unconfined strength, eps_cc/eps_c0.
-    ultimate_strain : float
-        Compressive strain at the fracture of the hoops.
-    """
-
-    effectiveness: float
-    lateral_pressure: float
-    strength_ratio: float
-    strain_ratio: float
-    ultimate_strain: float
+    effectiveness: float  # ke
+    lateral_pressure: float  # effective, fl' [Pa]
+    strength_ratio: float  # confined / unconfined strength, fcc/fc
+    strain_ratio: float  # strains at these strengths, eps_cc/eps_c0
+    ultimate_strain: float  # compressive strain at the fracture of the hoops
 
 
 def mander_confinement(
@@ -161,26 +111,10 @@ def mander_confinement(
     ultimate_hoop_strain: float,
     spiral: bool,
 ) -> Confinement:
-    """Compute the confinement by circular hoops or a spiral after Mander et al. (1988).
+    """Confinement by circular hoops or a spiral after Mander et al. (1988); lengths [m], areas [m²], strengths [Pa].
 
-    Parameters
-    ----------
-    fc : float
-        Strength of the unconfined concrete, positive [Pa].
-    core_diameter : float
-        Diameter of the core, between the centre lines of the hoops [m].
-    steel_ratio : float
-        Area of the longitudinal bars divided by the area of the core.
-    hoop_area, spacing, clear_spacing : float
-        Area of one set of hoops [m²], distance between the centres of sets and clear distance between sets [m].
-    fyh, ultimate_hoop_strain : float
-        Yield strength [Pa] and strain at fracture of the hoops.
-    spiral : bool
-        Whether the reinforcement is a spiral, for which the arching reduction enters once; for hoops it is squared.
-
-    Returns
-    -------
-    Confinement
+    The core's diameter is between the centre lines of the hoops, `steel_ratio` is bars / core area, `spacing` is
+    between centres of sets of hoops. The arching reduction enters once for a spiral, squared for hoops.
     """
     volumetric_ratio = 4.0 * hoop_area / (core_diameter * spacing)
     arch = 1.0 - clear_spacing / (2.0 * core_diameter)

@@ -15,24 +15,10 @@ __all__ = ["Dependencies", "content_digest"]
 
 
 class Dependencies:
-    """The argument ``depends_on`` of a model.
+    """The argument ``depends_on`` of a model of class `kind`; `paths` are its files and folders.
 
-    Parameters
-    ----------
-    things : iterable of Path or of values
-        A Path stands for the content of a file, or of all files in a folder; any other object for its value.
-    kind : str
-        Name of the model's class, for messages.
-
-    Attributes
-    ----------
-    paths : tuple of Path
-        The files and folders.
-
-    Raises
-    ------
-    ValueError
-        If a file does not exist, a text is the name of a file, or a value has no digest.
+    A Path stands for the content of a file, or of all files in a folder; any other object for its value. Raises
+    ValueError if a file does not exist, a text is the name of a file, or a value has no digest.
     """
 
     def __init__(self, things: Iterable[Any], kind: str) -> None:

@@ -42,21 +42,11 @@ _OWN = ("softening", "damping_growth")
 
 
 class Settled(NamedTuple):
-    """A structure whose stiffness and damping agree with its response level.
+    """A structure whose stiffness and damping agree with its response level."""
 
-    Attributes
-    ----------
-    level : float
-        Energy-weighted root mean square of the relative displacement [m]; 0 under a motion of zeros.
-    stiffness_factor, damping_factor : float
-        Stiffness and damping ratios as multiples of their values at the reference level.
-    system : LinearSystem
-        The matrices.
-    """
-
-    level: float
-    stiffness_factor: float
-    damping_factor: float
+    level: float  # energy-weighted RMS of the relative displacement [m]; 0 under a motion of zeros
+    stiffness_factor: float  # multiple of the stiffness at the reference level
+    damping_factor: float  # multiple of the damping ratios there
     system: LinearSystem
 
 

@@ -65,22 +65,13 @@ _STATE_ROWS = (
 class BridgeHistory(History):
     """Time histories of one simulation of the bridge [SI].
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the rows; ``history[name]`` returns one row. Rows: the state (displacements and velocities relative to
-        the table, damper forces of each pier), the hysteretic variables ``Z_1`` and ``Z_2``, then all channels.
-    values : ndarray[n_rows, n_steps]
-        The histories.
-    beyond_range : ndarray[2]
-        Largest bearing displacement at each pier, divided by the displacement up to which the rubber law holds. Above
-        1, the rubber law was continued along its tangent.
-    iterations : float
-        Newton iterations per step.
+    Rows: the state (displacements and velocities relative to the table, damper forces of each pier), the hysteretic
+    variables ``Z_1`` and ``Z_2``, then all channels. Where `beyond_range` is above 1, the rubber law was continued
+    along its tangent.
     """
 
-    beyond_range: np.ndarray
-    iterations: float
+    beyond_range: np.ndarray  # (2,) largest bearing displacement / displacement up to which the rubber law holds
+    iterations: float  # of Newton's method per step
 
 
 @dataclass(frozen=True, eq=False)

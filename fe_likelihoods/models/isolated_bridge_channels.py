@@ -53,23 +53,9 @@ CHANNEL_SETS = {5: _PIER_1, 6: (*_PIER_1, "Ub_2"), 10: _PIER_1 + _PIER_2}
 
 
 def channel_matrix(matrices: BridgeMatrices, piers: Sequence[Pier], names: Sequence[str]) -> np.ndarray:
-    """Matrix that gives the channels from the state, the isolator forces F and the table acceleration.
+    """Matrix (n_channels, 15) that gives the channels; accelerations follow from the equations of motion.
 
-    Accelerations follow from the equations of motion.
-
-    Parameters
-    ----------
-    matrices : BridgeMatrices
-        Matrices of deck and piers.
-    piers : sequence of Pier
-        The two piers.
-    names : sequence of str
-        Names of the channels.
-
-    Returns
-    -------
-    ndarray[n_channels, 15]
-        The columns are 5 displacements, 5 velocities, 2 damper forces, 2 isolator forces F and the table acceleration.
+    Columns: 5 displacements, 5 velocities, 2 damper forces, 2 isolator forces F and the table acceleration.
     """
     mass, damping, stiffness, b = matrices.mass, matrices.damping, matrices.stiffness, matrices.kinematics
     q, ground = np.eye(15)[:5], np.eye(15)[14]

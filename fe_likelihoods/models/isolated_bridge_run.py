@@ -37,21 +37,11 @@ class PreparedBridge(NamedTuple):
 
 
 class BridgeRun(NamedTuple):
-    """Result of one simulation.
+    """Result of one simulation, up to the last sample of the response."""
 
-    Attributes
-    ----------
-    values : ndarray[16, n]
-        State, isolator forces F and Z at the samples of the record, up to the last sample of the response.
-    drivers : ndarray[15, n]
-        State, isolator forces F and table acceleration; the channels are linear combinations of these rows.
-    iterations : float
-        Newton iterations per step.
-    """
-
-    values: np.ndarray
-    drivers: np.ndarray
-    iterations: float
+    values: np.ndarray  # (16, n) state, isolator forces F and Z at the samples of the record
+    drivers: np.ndarray  # (15, n) state, F and table acceleration: channels are linear combinations of them
+    iterations: float  # of Newton's method per step
 
 
 def prepare_bridge(model: Any) -> PreparedBridge:
@@ -71,22 +61,9 @@ def prepare_bridge(model: Any) -> PreparedBridge:
 
 
 def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> BridgeRun:
-    """Simulate for multiples `theta` of the nominal parameters.
+    """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
 
-    Parameters
-    ----------
-    model : IsolatedBridge
-    prepared : PreparedBridge
-    theta : ndarray[n_parameters]
-
-    Returns
-    -------
-    BridgeRun
-
-    Raises
-    ------
-    SimulationFailed
-        If the parameters describe no structure, or the solution does not converge.
+    Raises SimulationFailed if the parameters describe no structure, or the solution does not converge.
     """
     v = model.physical_values(theta)
     check_values(v, _MAY_BE_ZERO)

@@ -25,23 +25,13 @@ __all__ = ["BridgeMatrices", "BridgeStateSpace"]
 
 
 class BridgeMatrices(NamedTuple):
-    """Matrices of deck and piers, which do not depend on theta.
+    """Matrices of deck and piers for the degrees of freedom q, which do not depend on theta."""
 
-    Attributes
-    ----------
-    mass, damping, stiffness : ndarray[5, 5]
-        Matrices for the degrees of freedom q [kg, N s/m, N/m and products with m].
-    kinematics : ndarray[2, 5]
-        B: bearing displacements from q, deck minus top of the block.
-    rubber_stiffness : float
-        Linear stiffness of the rubber at each pier [N/m].
-    """
-
-    mass: np.ndarray
-    damping: np.ndarray
-    stiffness: np.ndarray
-    kinematics: np.ndarray
-    rubber_stiffness: float
+    mass: np.ndarray  # (5, 5) [kg, and products with m]
+    damping: np.ndarray  # (5, 5) [N s/m, ...]
+    stiffness: np.ndarray  # (5, 5) [N/m, ...]
+    kinematics: np.ndarray  # (2, 5), B: bearing displacements from q, deck minus top of the block
+    rubber_stiffness: float  # linear, at each pier [N/m]
 
     @classmethod
     def assemble(
@@ -67,21 +57,11 @@ class BridgeMatrices(NamedTuple):
 
 
 class BridgeStateSpace(NamedTuple):
-    """State-space form x' = A x + [b, B_F] [a_g, F], with A still without the dampers.
+    """State-space form x' = A x + [b, B_F] [a_g, F], with A still without the dampers."""
 
-    Attributes
-    ----------
-    system : ndarray[12, 12]
-        A; the rows of the damper forces are zero.
-    inputs : ndarray[12, 3]
-        b and B_F.
-    kinematics : ndarray[2, 5]
-        Bearing displacements from q.
-    """
-
-    system: np.ndarray
-    inputs: np.ndarray
-    kinematics: np.ndarray
+    system: np.ndarray  # (12, 12), A; the rows of the damper forces are zero
+    inputs: np.ndarray  # (12, 3), b and B_F
+    kinematics: np.ndarray  # (2, 5) bearing displacements from q
 
     @classmethod
     def of(cls, matrices: BridgeMatrices) -> BridgeStateSpace:
@@ -98,21 +78,10 @@ class BridgeStateSpace(NamedTuple):
         return cls(a, inputs, b)
 
     def step_matrices(self, dampers: Sequence[Damper], step: float, halvings: int | None = None) -> StepMatrices:
-        """Matrices of the steps with these dampers.
+        """Matrices of the steps [s] with these dampers, one per pier.
 
-        Parameters
-        ----------
-        dampers : sequence of Damper
-            The dampers of each pier.
-        step : float
-            Integration step [s].
-        halvings : int, optional
-            How often the step of Coulomb's law is halved: kinds of steps with F constant or linear in time
-            (`StepMatrices`). A set-valued force that is linear in time would oscillate about rest. Default: one kind.
-
-        Returns
-        -------
-        StepMatrices
+        `halvings`: how often the step of Coulomb's law is halved, for kinds of steps with F constant or linear in time
+        (`StepMatrices`): a set-valued force that is linear in time would oscillate about rest. None: one kind.
         """
         if halvings is None:
             return StepMatrices(*(part[None] for part in self._of_size(dampers, step, [(True, True)])[0]))
@@ -154,17 +123,9 @@ class BridgeStateSpace(NamedTuple):
         return found
 
     def hold_stuck_bearings(self, dampers: Sequence[Damper], ground: np.ndarray, values: np.ndarray) -> None:
-        """Replace the forces of bearings that stick, in place, by the forces that keep them at rest at each sample.
-
-        The kernel computes their mean over a step.
-
-        Parameters
-        ----------
-        dampers : sequence of Damper
-        ground : ndarray[n_steps]
-            Table acceleration [m/s²].
-        values : ndarray[n_steps, 16]
-            State, F and Z (`fe_likelihoods.kernels.isolated_bridge.N_OUT`).
+        """Replace the forces of bearings that stick, in `values` (n_steps, 16), by the forces that keep them at rest at
+        each sample, under the table acceleration `ground` (n_steps,) [m/s²]. The kernel computes their mean over a
+        step.
         """
         b, inputs = self.kinematics, self.inputs[5:10]
         acceleration = values[:, :12] @ (b @ self._with_dampers(dampers)[5:10]).T + np.outer(ground, b @ inputs[:, 0])

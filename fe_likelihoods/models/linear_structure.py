@@ -40,25 +40,13 @@ _MOTIONS = ("displacement", "velocity", "relative_acceleration")
 
 
 class Sensor(NamedTuple):
-    """A channel of a `LinearStructure`.
-
-    Attributes
-    ----------
-    name, quantity : str
-        Name and quantity of the channel.
-    row : int
-        Number of the channel of the parts at its place.
-    to : int or None
-        Number of the channel of the parts that it is relative to; None: relative to the supports, or absolute.
-    motion : int or None
-        0 for a displacement, 1 for a velocity, 2 for a relative acceleration; None for an absolute acceleration.
-    """
+    """A channel of a `LinearStructure`."""
 
     name: str
     quantity: str
-    row: int
-    to: int | None = None
-    motion: int | None = None
+    row: int  # channel of the parts at its place
+    to: int | None = None  # channel of the parts that it is relative to; None: the supports, or absolute
+    motion: int | None = None  # 0 displacement, 1 velocity, 2 relative acceleration; None absolute acceleration
 
 
 def _sensors(parts: Parts, outputs: Sequence[str]) -> tuple[Sensor, ...]:

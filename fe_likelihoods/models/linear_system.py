@@ -29,24 +29,15 @@ _LARGEST_CONDITION = 1e8  # condition number of the complex modes at which half 
 class LinearSystem(NamedTuple):
     """Matrices of a linear structure with n degrees of freedom, and the positions of its sensors.
 
-    Attributes
-    ----------
-    mass, damping, stiffness : ndarray[n, n]
-        Matrices in any consistent units: only M^-1 C [1/s] and M^-1 K [1/s²] matter.
-    influence : ndarray[n, n_supports]
-        Static displacements under unit support displacements [-]; ones for a structure on a single support.
-    shape : ndarray[n_channels, n]
-        Weight in each channel of each degree of freedom's absolute acceleration [-].
-    direct : ndarray[n_channels, n_supports]
-        Weight in each channel of each support acceleration [-].
+    Units need only be consistent: M^-1 C [1/s] and M^-1 K [1/s²] matter.
     """
 
-    mass: np.ndarray
-    damping: np.ndarray
-    stiffness: np.ndarray
-    influence: np.ndarray
-    shape: np.ndarray
-    direct: np.ndarray
+    mass: np.ndarray  # (n, n)
+    damping: np.ndarray  # (n, n)
+    stiffness: np.ndarray  # (n, n)
+    influence: np.ndarray  # (n, n_supports) static displacements under unit support displacements [-]
+    shape: np.ndarray  # (n_channels, n) weight of each absolute acceleration in a channel [-]
+    direct: np.ndarray  # (n_channels, n_supports) weight of each support acceleration [-]
 
 
 class Parts(Protocol):
@@ -72,42 +63,18 @@ class Parts(Protocol):
 
 
 class StructureResponse(NamedTuple):
-    """Response at the degrees of freedom.
+    """Response at the degrees of freedom, (n, n_steps) each; displacement and velocity are relative to R g."""
 
-    Attributes
-    ----------
-    displacement : ndarray[n, n_steps]
-        Displacement relative to R g [m].
-    velocity : ndarray[n, n_steps]
-        Velocity relative to R g [m/s].
-    acceleration : ndarray[n, n_steps]
-        Absolute acceleration [m/s²].
-    """
-
-    displacement: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
+    displacement: np.ndarray  # [m]
+    velocity: np.ndarray  # [m/s]
+    acceleration: np.ndarray  # absolute [m/s²]
 
 
 def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -> np.ndarray:
-    """Compute the damping matrix from modal damping ratios: C = M Phi diag(2 zeta omega) Phi^T M.
+    """Damping matrix (n, n) of modal damping ratios (n,): C = M Phi diag(2 zeta omega) Phi^T M.
 
-    Parameters
-    ----------
-    mass, stiffness : ndarray[n, n]
-        Symmetric matrices, positive definite.
-    ratios : ndarray[n]
-        Fractions zeta of critical damping of the undamped modes Phi, lowest frequency first.
-
-    Returns
-    -------
-    ndarray[n, n]
-        Damping matrix.
-
-    Raises
-    ------
-    SimulationFailed
-        If the stiffness is not positive definite.
+    Mass and stiffness are symmetric; Phi are the undamped modes, lowest frequency first. Raises SimulationFailed if the
+    stiffness is not positive definite.
     """
     squares, modes = eigh(stiffness, mass)
     if not squares[0] > 0.0:
@@ -118,26 +85,10 @@ def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -
 
 
 def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> StructureResponse:
-    """Compute the exact response, from rest, to support accelerations that are linear between their samples.
+    """Exact response, from rest, to support accelerations (n_supports, n_steps) [m/s²] that are linear between samples.
 
-    Parameters
-    ----------
-    system : LinearSystem
-        Matrices of the structure.
-    support_acceleration : ndarray[n_supports, n_steps]
-        Absolute accelerations of the supports [m/s²].
-    dt : float
-        Time step of the samples [s].
-
-    Returns
-    -------
-    StructureResponse
-
-    Raises
-    ------
-    SimulationFailed
-        If two complex modes coincide, so that the equations do not uncouple (a mode with exactly critical damping, or
-        without stiffness), or if the mass is singular.
+    Raises SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly
+    critical damping, or without stiffness), or if the mass is singular.
     """
     modes = complex_modes(system)
     n, n_steps = len(system.mass), support_acceleration.shape[1]
@@ -147,21 +98,11 @@ def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt
 
 
 class ComplexModes(NamedTuple):
-    """Complex modes; of each conjugate pair only one is stored, with doubled shapes.
+    """Complex modes; of each conjugate pair only one is stored, with doubled shapes."""
 
-    Attributes
-    ----------
-    eigenvalues : ndarray[m]
-        Eigenvalues [1/s].
-    participation : ndarray[m, n_supports]
-        Forcing of the mode under unit support accelerations.
-    shapes : ndarray[m, 3, n]
-        Shapes in displacement, velocity and absolute acceleration.
-    """
-
-    eigenvalues: np.ndarray
-    participation: np.ndarray
-    shapes: np.ndarray
+    eigenvalues: np.ndarray  # (m,) [1/s]
+    participation: np.ndarray  # (m, n_supports) forcing of the mode under unit support accelerations
+    shapes: np.ndarray  # (m, 3, n) in displacement, velocity and absolute acceleration
 
 
 def complex_modes(system: LinearSystem) -> ComplexModes:

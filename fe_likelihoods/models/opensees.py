@@ -1,12 +1,10 @@
 """Model that is built and run in OpenSees.
 
-OpenSees holds one model per process, may end its process, and prints a lot. It therefore runs in a separate process,
-where it is wiped before each run, and is never imported into the user's process. After a run that crashes or takes too
-long, the next run starts a new process.
-
-If an analysis does not converge, OpenSees prints a message, and ``ops.analyze`` returns a code; no other function of
-openseespy 3.7.1 returns one. The model stays at the last step that converged, so the response of a script that ignores
-the code is finite and wrong. A run whose script has not handled such a code has failed (`_Codes`).
+OpenSees holds one model per process, may end its process, and prints a lot. It therefore runs in a separate process, is
+wiped before each run, and is never imported into the user's process. After a crash or a timeout, the next run starts a
+new process. If an analysis does not converge, only the code of ``ops.analyze`` says so (openseespy 3.7.1): the model
+stays at the last step that converged, so a script that ignores the code returns a finite and wrong response. A run
+whose script has not handled such a code has failed (`_Codes`).
 """
 
 from __future__ import annotations
@@ -33,8 +31,8 @@ class _Codes:
     """The codes that ``ops.analyze`` returns in one run.
 
     The run has failed if the script did not look at a code other than 0, if the last call failed, or if the script made
-    the loads constant after a call that failed. So a script may repeat a step with another algorithm or smaller steps.
-    Codes may be collected and tested later: ``any(codes)`` looks at the first failure and stands for those after it.
+    the loads constant after a call that failed. A script may repeat a step with another algorithm or smaller steps, and
+    ``any(codes)`` looks at the first failure and stands for those after it.
     """
 
     def __init__(self) -> None:

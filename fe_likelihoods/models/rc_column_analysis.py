@@ -62,102 +62,48 @@ IMPOSED_ROWS = (
 class ColumnHistory(History):
     """Time histories of one simulation of the column [SI].
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the rows; ``history[name]`` returns one row.
-    values : ndarray[n_rows, n_steps]
-        The histories.
-    retries : int
-        Number of steps that were repeated with half their size.
-    beyond_range : float
-        Largest strain of a bar in the base section, divided by the ultimate strain of the steel. Above 1, real bars
-        fracture, whereas the steel law was continued along its tangent. A warning about this is logged once per model,
-        also if simulations come from a cache on disk.
-    bar_damage : ndarray[n_bars] or None
-        Miner's sum of each bar at the last sample, in the section where it is largest; a bar has fractured above 1. The
-        bars are listed in ``model.section.fibers()[2]``: two at the same position count as one. None without fatigue.
-    lowerings : int
-        Number of times the column could not carry the axial load at an imposed displacement, and its top came down
-        until the cracks were closed (``docs/theory/time_integration.rst``). 0 under a base acceleration.
+    Above 1, `beyond_range` means that the steel law was continued along its tangent where real bars fracture; this
+    warns once per model, also for simulations from a cache on disk. `bar_damage` is Miner's sum of each bar of
+    ``model.section.fibers()[2]`` at the last sample, in its worst section: a bar has fractured above 1; two bars at the
+    same position count as one. `lowerings` counts how often the column could not carry the axial load at an imposed
+    displacement, and its top came down until the cracks were closed (``docs/theory/time_integration.rst``); 0 under a
+    base acceleration.
     """
 
-    retries: int
-    beyond_range: float
-    bar_damage: np.ndarray | None = None
+    retries: int  # steps repeated with half their size
+    beyond_range: float  # largest strain of a bar in the base section / ultimate strain of the steel
+    bar_damage: np.ndarray | None = None  # (n_bars,); None without fatigue
     lowerings: int = 0
 
 
 class ToRecord(NamedTuple):
-    """What an analysis shall record besides its rows.
+    """What an analysis shall record besides its rows."""
 
-    Attributes
-    ----------
-    sections : bool
-        The deformations of all sections.
-    motion : bool
-        The motion of all nodes.
-    fibers : tuple of (int, int)
-        Section and number of the fibers whose stresses are recorded (`fe_likelihoods.kernels.frame.Recorder`).
-    """
-
-    sections: bool = False
-    motion: bool = False
-    fibers: tuple[tuple[int, int], ...] = ()
+    sections: bool = False  # deformations of all sections
+    motion: bool = False  # motion of all nodes
+    fibers: tuple[tuple[int, int], ...] = ()  # section and number of fibers, for stresses (`Recorder`)
 
 
 class Analysis(NamedTuple):
-    """Result of one analysis.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the rows.
-    values : ndarray[n_rows, n_steps]
-        The histories.
-    retries : int
-        Number of steps that were repeated with half their size.
-    sections : ndarray[n_steps, n_sections, 2]
-        Axial strain and curvature [1/m] of every section, from the base up; (0, n_sections, 2) if not recorded.
-    motion : ndarray[n_steps, 1 or 3, n_dof]
-        Displacement, velocity and acceleration of the nodes relative to the base; (0, ...) if not recorded.
-    stresses : ndarray[n_steps, n_fibers]
-        Stresses of the recorded fibers [Pa].
-    ground : ndarray[n_steps] or None
-        Base acceleration [m/s²]; None under imposed displacement.
-    lowerings : int
-        As of `ColumnHistory`.
-    """
+    """Result of one analysis; what was not recorded has no steps, (0, ...)."""
 
     names: tuple[str, ...]
-    values: np.ndarray
-    retries: int
-    sections: np.ndarray
-    motion: np.ndarray
-    stresses: np.ndarray
-    ground: np.ndarray | None = None
-    lowerings: int = 0
+    values: np.ndarray  # (n_rows, n_steps), the rows of `names`
+    retries: int  # steps repeated with half their size
+    sections: np.ndarray  # (n_steps, n_sections, 2) axial strain and curvature [1/m], from the base up
+    motion: np.ndarray  # (n_steps, 1 or 3, n_dof) of the nodes relative to the base
+    stresses: np.ndarray  # (n_steps, n_fibers) of the recorded fibers [Pa]
+    ground: np.ndarray | None = None  # (n_steps,) base acceleration [m/s²]
+    lowerings: int = 0  # as of `ColumnHistory`
 
 
 class BaseMotion(NamedTuple):
-    """Base acceleration, interpolated to the integration steps.
+    """Base acceleration, interpolated to the integration steps."""
 
-    Attributes
-    ----------
-    acceleration : ndarray[n_substeps + 1]
-        Base acceleration at the integration steps [m/s²].
-    dt : float
-        Integration step [s].
-    substeps : int
-        Integration steps per sample of the response.
-    n_steps : int
-        Number of response samples.
-    """
-
-    acceleration: np.ndarray
-    dt: float
-    substeps: int
-    n_steps: int
+    acceleration: np.ndarray  # (n_substeps + 1,) at the integration steps [m/s²]
+    dt: float  # integration step [s]
+    substeps: int  # integration steps per sample of the response
+    n_steps: int  # response samples
 
     @classmethod
     def of(cls, record: Record, substeps: int) -> BaseMotion:
@@ -167,13 +113,7 @@ class BaseMotion(NamedTuple):
         return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
 
     def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, recorded: ToRecord) -> Analysis:
-        """Integrate the equations of motion; SimulationFailed at collapse, or if a step does not converge.
-
-        Returns
-        -------
-        Analysis
-            Rows are `HISTORY_ROWS`.
-        """
+        """Integrate the equations of motion to `HISTORY_ROWS`; SimulationFailed at collapse, or without convergence."""
         history = np.zeros((len(HISTORY_ROWS), self.n_steps))
         out = recorder(
             column, self.n_steps, sections=recorded.sections, motion=3 * recorded.motion, fibers=recorded.fibers
@@ -193,18 +133,10 @@ class BaseMotion(NamedTuple):
 
 
 class ImposedMotion(NamedTuple):
-    """Lateral displacement imposed on the top.
+    """Lateral displacement imposed on the top."""
 
-    Attributes
-    ----------
-    targets : ndarray[n_increments]
-        Displacements to be reached one after the other [m].
-    kept : ndarray[n_steps]
-        Indices of the targets that are samples of the response.
-    """
-
-    targets: np.ndarray
-    kept: np.ndarray
+    targets: np.ndarray  # (n_increments,) displacements in their order [m]
+    kept: np.ndarray  # (n_steps,) indices of the targets that are samples of the response
 
     @classmethod
     def of(cls, history: DisplacementHistory, max_increment: float) -> ImposedMotion:
@@ -213,13 +145,7 @@ class ImposedMotion(NamedTuple):
         return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
 
     def run(self, column: Column, gravity: np.ndarray, iteration: Iteration, recorded: ToRecord) -> Analysis:
-        """Solve the static equilibrium at each target; SimulationFailed if a step does not converge.
-
-        Returns
-        -------
-        Analysis
-            Rows are `IMPOSED_ROWS`.
-        """
+        """Solve the static equilibrium at each target, as `IMPOSED_ROWS`; SimulationFailed without convergence."""
         history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
         n = len(self.targets)
         out = recorder(column, n, sections=recorded.sections, motion=int(recorded.motion), fibers=recorded.fibers)

@@ -93,28 +93,14 @@ _ADVICE = (
 
 
 class Sections(NamedTuple):
-    """Places of the integration points of a column, and what can be recorded there.
+    """Places of the integration points of a column, and what can be recorded there."""
 
-    Attributes
-    ----------
-    height, radius : float
-        Height of the column and radius of its section [m].
-    n_elements : int
-        Number of elements, which have equal lengths.
-    points : ndarray[n_points]
-        Integration points of an element, on [0, 1].
-    section : ReinforcedSection, optional
-        The section, for stresses.
-    has_mass : bool
-        Whether all nodes have a mass, so that the equation of motion determines their accelerations.
-    """
-
-    height: float
-    radius: float
-    n_elements: int
-    points: np.ndarray
-    section: ReinforcedSection | None = None
-    has_mass: bool = False
+    height: float  # [m]
+    radius: float  # of the section [m]
+    n_elements: int  # of equal lengths
+    points: np.ndarray  # (n_points,) integration points of an element, on [0, 1]
+    section: ReinforcedSection | None = None  # for stresses
+    has_mass: bool = False  # of all nodes, so that the equation of motion determines their accelerations
 
     def interpolation(self, height: float) -> np.ndarray:
         """Weights (n_sections,) of the sections in the value at `height` [m]."""
@@ -217,71 +203,33 @@ class Sections(NamedTuple):
 class Recording(NamedTuple):
     """What a simulation recorded of the outputs.
 
-    Attributes
-    ----------
-    rows : mapping of str to ndarray[n_steps]
-        Rows of the history, as the kernels record them.
-    deformations : ndarray[n_steps, n_sections, 2]
-        Axial strain at the axis and curvature [1/m] of every section, in the coordinates of the element, whose second
-        axis points against the direction of loading.
-    motion : ndarray[n_steps, 1 or 3, n_dof]
-        Displacement, velocity and acceleration of the nodes relative to the base.
-    ground : ndarray[n_steps] or None
-        Base acceleration [m/s²].
-    stresses : mapping of (int, int) to ndarray[n_steps]
-        Stresses of the recorded fibers [Pa].
-    penetration : float
-        Length of strain penetration below the base [m].
-    length : float
-        Length of an element [m], infinite for linear geometry.
+    Deformations are in the coordinates of the element, whose second axis points against the direction of loading.
     """
 
-    rows: Mapping[str, np.ndarray]
-    deformations: np.ndarray
-    motion: np.ndarray
-    ground: np.ndarray | None
-    stresses: Mapping[tuple[int, int], np.ndarray]
-    penetration: float
-    length: float
+    rows: Mapping[str, np.ndarray]  # (n_steps,) each, as the kernels record them
+    deformations: np.ndarray  # (n_steps, n_sections, 2) axial strain at the axis and curvature [1/m]
+    motion: np.ndarray  # (n_steps, 1 or 3, n_dof) of the nodes relative to the base
+    ground: np.ndarray | None  # (n_steps,) base acceleration [m/s²]
+    stresses: Mapping[tuple[int, int], np.ndarray]  # (n_steps,) of each recorded fiber [Pa]
+    penetration: float  # length of strain penetration below the base [m]
+    length: float  # of an element [m], infinite for linear geometry
 
 
 class Output(NamedTuple):
-    """One output, with its name resolved.
-
-    Attributes
-    ----------
-    name, quantity, si_unit : str
-        Name of the channel, its quantity, and the SI unit of its values.
-    row : str or None
-        Row of the history with this output, or None for an output with a place.
-    factor : float
-        Factor of that row.
-    strain, curvature : ndarray[n_sections] or None
-        Weights of axial strain and curvature of the sections; with `motion`, of the deflection from the chord.
-    slip : bool
-        Whether the rotation by strain penetration below the base is added.
-    motion : int or None
-        Number of the motion, or None.
-    node : int
-        Node of the motion, from 1: the upper end of the element.
-    xi : float
-        Place of the motion in this element, 1 at the node.
-    fiber : (int, int) or None
-        Section and number of a fiber.
-    """
+    """One output, with its name resolved."""
 
     name: str
     quantity: str
     si_unit: str
-    row: str | None
-    factor: float = 1.0
-    strain: np.ndarray | None = None
-    curvature: np.ndarray | None = None
-    slip: bool = False
-    motion: int | None = None
-    node: int = 0
-    xi: float = 1.0
-    fiber: tuple[int, int] | None = None
+    row: str | None  # row of the history; None for an output with a place
+    factor: float = 1.0  # of this row
+    strain: np.ndarray | None = None  # (n_sections,) weights of the axial strains
+    curvature: np.ndarray | None = None  # of the curvatures; with `motion`, of the deflection from the chord
+    slip: bool = False  # add the rotation by strain penetration below the base
+    motion: int | None = None  # number of the motion
+    node: int = 0  # of the motion, from 1: the upper end of the element
+    xi: float = 1.0  # place in this element, 1 at the node
+    fiber: tuple[int, int] | None = None  # section and number
 
     def evaluate(self, recording: Recording) -> np.ndarray:
         """Values (n_steps,) of this output [SI]."""
@@ -324,25 +272,9 @@ def _add(total: np.ndarray, weights: np.ndarray, values: np.ndarray) -> None:
 
 
 def parse_outputs(names: object, sections: Sections, at_top: Sequence[str]) -> tuple[Output, ...]:
-    """Resolve the names of outputs.
+    """Resolve names of outputs, each once; `at_top` are the outputs at the top that the type of loading has.
 
-    Parameters
-    ----------
-    names : sequence of str
-        The names, each once.
-    sections : Sections
-        Integration points of the column.
-    at_top : sequence of str
-        Outputs at the top that the type of loading has.
-
-    Returns
-    -------
-    tuple of Output
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown or repeated, or a place is outside the column.
+    Raises ValueError if a name is unknown or repeated, or a place is outside the column.
     """
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise invalid("outputs as a tuple of names", names, _ADVICE)

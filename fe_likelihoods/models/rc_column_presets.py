@@ -11,15 +11,10 @@ __all__ = ["lhpost_arguments"]
 
 
 def lhpost_arguments() -> dict[str, Any]:
-    """Arguments of the full-scale column tested on the LHPOST shake table (UC San Diego, 2010).
+    """Arguments of `RCColumn`, without loading, for the column tested on the LHPOST shake table (UC San Diego, 2010).
 
     Height, diameter, Ec, Es, ft, damping and weight are from Ramancha et al. (2022), the other values from a published
     model of the same column.
-
-    Returns
-    -------
-    dict
-        Arguments of `fe_likelihoods.models.rc_column.RCColumn`, except for the loading.
     """
     ksi, inch = to_si(1.0, "ksi").item(), to_si(1.0, "in").item()
     weight = to_si(522.0, "kip").item()

@@ -40,18 +40,10 @@ class PreparedColumn(NamedTuple):
 
 
 class ColumnRun(NamedTuple):
-    """Result of one simulation.
+    """Result of one simulation."""
 
-    Attributes
-    ----------
-    history : ColumnHistory
-        Histories of the kernels.
-    outputs : dict of str to ndarray, shape (n_steps,)
-        Outputs of the column by their names.
-    """
-
-    history: ColumnHistory
-    outputs: dict[str, np.ndarray]
+    history: ColumnHistory  # histories of the kernels
+    outputs: dict[str, np.ndarray]  # (n_steps,) each, by name
 
 
 def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
@@ -67,22 +59,10 @@ def prepare_column(model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
 
 
 def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> ColumnRun:
-    """Simulate for multiples `theta` of the nominal parameters.
+    """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
 
-    Parameters
-    ----------
-    model : RCColumn
-    prepared : PreparedColumn
-    theta : ndarray[n_parameters]
-
-    Returns
-    -------
-    ColumnRun
-
-    Raises
-    ------
-    SimulationFailed
-        If the parameters describe no structure, the column collapses, or the solution does not converge.
+    Raises SimulationFailed if the parameters describe no structure, the column collapses, or the solution does not
+    converge.
     """
     values = model.physical_values(theta)
     check_physical_values(values, model.steel)

@@ -19,30 +19,14 @@ __all__ = ["ReinforcedSection"]
 class ReinforcedSection:
     """Circular section with a confined core, cover concrete and one circle of bars.
 
-    Attributes
-    ----------
-    diameter : float
-        Outer diameter [m].
-    cover : float
-        Clear cover, measured to the outside of the hoops [m].
-    bars : Bars
-        Longitudinal reinforcement.
-    hoops : Hoops
-        Transverse reinforcement.
-    mesh : int or Patches
-        Number of strips (even, at least 4), or rings and wedges.
-
-    Raises
-    ------
-    ValueError
-        If the reinforcement does not fit into the section, or the mesh is none of these.
+    Raises ValueError if the reinforcement does not fit into the section, or the mesh is not strips or `Patches`.
     """
 
-    diameter: float
-    cover: float
+    diameter: float  # outer [m]
+    cover: float  # clear, to the outside of the hoops [m]
     bars: Bars
     hoops: Hoops
-    mesh: int | Patches
+    mesh: int | Patches  # number of strips (even, at least 4), or rings and wedges
 
     def __post_init__(self) -> None:
         bars, hoops, radius = self.bars, self.hoops, self.bar_circle_radius

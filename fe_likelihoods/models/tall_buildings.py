@@ -270,35 +270,16 @@ class ShearFlexuralBeam:
 
 
 class BeamModes(NamedTuple):
-    """Modes of the shear-flexural beam.
+    """Modes of the shear-flexural beam."""
 
-    Attributes
-    ----------
-    frequency_ratios : ndarray[n_modes]
-        Frequencies as multiples of the first one.
-    shapes : ndarray[n_heights, n_modes]
-        Mode shapes times participation factors [-], which add to 1 over all modes.
-    """
-
-    frequency_ratios: np.ndarray
-    shapes: np.ndarray
+    frequency_ratios: np.ndarray  # (n_modes,) multiples of the first frequency
+    shapes: np.ndarray  # (n_heights, n_modes) times participation factors [-], which add to 1 over all modes
 
 
 def beam_modes(alpha: float, n_modes: int, heights: np.ndarray) -> BeamModes:
-    """Compute the modes of a uniform cantilever of shear and flexural stiffness (Miranda & Taghavi 2005, eqs. 7-13).
+    """Modes of a uniform cantilever of shear and flexural stiffness (Miranda & Taghavi 2005, eqs. 7-13).
 
-    Parameters
-    ----------
-    alpha : float
-        H sqrt(GA / EI), not negative.
-    n_modes : int
-        Number of modes.
-    heights : ndarray[n_heights]
-        Heights as shares of the building height.
-
-    Returns
-    -------
-    BeamModes
+    `alpha` is H sqrt(GA / EI) >= 0, heights (n_heights,) are shares of the building height.
     """
     from scipy.optimize import brentq  # slow to import, and not needed for other structures
 

@@ -16,50 +16,27 @@ __all__ = ["ThreadedModel"]
 
 
 class ThreadedModel(BuiltInModel):
-    """Built-in model with compiled kernels, which release the interpreter lock.
+    """Built-in model with compiled kernels, which release the interpreter lock: simulations may run at once in this
+    process.
 
     A subclass defines `_prepare`, the work that is the same for every theta, and `_respond`, which uses its result,
     `_prepared`.
-
-    Attributes
-    ----------
-    runs_on_threads : bool
-        Whether several simulations may run at once in this process.
     """
 
     runs_on_threads: ClassVar[bool] = True
 
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
-        """Simulate many sets of parameters on as many threads as numba uses.
-
-        Parameters
-        ----------
-        thetas : ndarray[n, n_parameters]
-            One set of parameters per row.
-
-        Returns
-        -------
-        SimulationBatch
-            Responses, NaN in rows that failed, and the reasons of the failures.
+        """Simulate rows of `thetas` (n, n_parameters) on as many threads as numba uses; rows that failed are NaN, with
+        reasons.
         """
         thetas = check_thetas(thetas, self.parameter_names)
         _ = self._prepared  # computed here, so that not every thread computes it
         return SimulationBatch(*map_threads(self._respond, thetas, (len(self.channels), self.n_steps)))
 
     def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
-        """Compute sums of squared residuals at many sets of parameters; responses are not stored.
+        """Sums (n, n_channels) of squared residuals to `measured` (n_channels, n_steps) [SI] at rows of `thetas`.
 
-        Parameters
-        ----------
-        thetas : ndarray[n, n_parameters]
-            One set of parameters per row.
-        measured : ndarray[n_channels, n_steps]
-            Measured response [SI].
-
-        Returns
-        -------
-        MisfitBatch
-            Sums (n, n_channels), NaN in rows that failed, and the reasons of the failures.
+        Rows that failed are NaN, with reasons; responses are not stored.
         """
         thetas = check_thetas(thetas, self.parameter_names)
         measured = check_measured(measured, self.channels, self.n_steps)

@@ -1,9 +1,7 @@
 """Base classes that validate inputs and outputs of external models: user code, programs, assembled matrices.
 
-`UserModel` adds an excitation, a `Record` that the external code receives, so that the model works under other records.
-
-The reason of a failed simulation ends with the simulation's duration, so that a report of failures shows whether runs
-fail in their first second or after an hour.
+`UserModel` adds an excitation, a `Record` that the external code receives. The reason of a failed simulation ends with
+its duration, so that a report of failures shows whether runs fail in their first second or after an hour.
 """
 
 from __future__ import annotations
@@ -36,27 +34,10 @@ __all__ = ["ExternalModel", "UserModel"]
 class ExternalModel(StructuralModel):
     """Model whose response comes from external code, and is therefore checked after each simulation.
 
-    A subclass defines `_respond`, which may raise any exception and return anything.
-
-    Parameters
-    ----------
-    parameter_names : sequence of str
-        Names of the structural parameters, in the order of theta.
-    channels : sequence of Channel
-        Channels of the response, in the order of its rows.
-    dt : float
-        Time step of the response [s].
-    n_steps : int
-        Number of response samples.
-    depends_on : sequence, optional
-        Files and values that affect the response, as part of the fingerprint: a Path stands for the content of a file
-        or of all files in a folder, any other object for its value, such as ``os.environ.get("SOLVER_MODE")``.
-
-    Raises
-    ------
-    ValueError
-        If names are missing, repeated or not text, or `dt` or `n_steps` is not positive, or `depends_on` cannot be
-        used.
+    A subclass defines `_respond`, which may raise any exception and return anything. `depends_on` are files (a Path:
+    the content of a file or of all files in a folder) and values that affect the response, as part of the fingerprint.
+    Raises ValueError if names are missing, repeated or not text, if `dt` [s] or `n_steps` is not positive, or if
+    `depends_on` cannot be used.
     """
 
     fingerprint = ""
@@ -105,29 +86,13 @@ class ExternalModel(StructuralModel):
                 )
 
     def simulate(self, theta: ArrayLike) -> np.ndarray:
-        """Simulate the structure for one set of parameters.
+        """Response [SI] (n_channels, n_steps) for one set of parameters (n_parameters,), of which the code gets a copy.
 
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            Values of `parameter_names`, in this order. The external code receives a copy.
-
-        Returns
-        -------
-        ndarray[n_channels, n_steps]
-            Response [SI].
-
-        Raises
-        ------
-        SimulationFailed
-            If the external code raises an exception, or its response has a wrong shape, is complex or is not finite.
-            The reason ends with the duration of the simulation. It is a `TransientReason` if the cause is not the model
-            (see `fe_likelihoods.simulation.faults`).
-        ValueError
-            If `theta` has another shape.
-        KeyboardInterrupt, SystemExit
-            If the code raises it in this process, even as the cause of another exception: neither is a failed
-            simulation, and a run ends.
+        Raises SimulationFailed if the external code raises an exception, or its response has a wrong shape, is complex
+        or is not finite; the reason ends with the duration. It is a `TransientReason` if the cause is not the model
+        (see `fe_likelihoods.simulation.faults`). Raises ValueError if `theta` has another shape. KeyboardInterrupt and
+        SystemExit of the code in this process, even as the cause of another exception, are no failed simulation: they
+        end the run.
         """
         theta = check_theta(theta, self.parameter_names).copy()
         start, before = time.perf_counter(), sys.exception()
@@ -159,26 +124,10 @@ class ExternalModel(StructuralModel):
 class UserModel(ExternalModel):
     """Model made of user code, which receives a `Record` if one is given.
 
-    A subclass defines `_respond`, and `_prepare`, which is called after each change of the record.
-
-    Parameters
-    ----------
-    parameter_names, channels, depends_on
-        As for `ExternalModel`.
-    dt : float or None
-        Time step of the response [s]. With a record: a whole multiple of its step, by default that step.
-    n_steps : int or None
-        Number of response samples. With a record it follows from `dt`.
-    record : Record or None
-        Excitation that the code receives. The response has a sample at the first sample of the record, and then every
-        `dt` until its end.
-    path_dependent : bool
-        Whether the response to an excitation depends on earlier excitations; False for a linear structure.
-
-    Raises
-    ------
-    ValueError
-        As `ExternalModel`, and if `dt` and `n_steps` are missing without a record, or do not fit the record.
+    A subclass defines `_respond`, and `_prepare`, which is called after each change of the record. With a record, `dt`
+    [s] is a whole multiple of its step (None: that step) and `n_steps` follows: the response has a sample at the first
+    sample of the record, and then every `dt` until its end. Without one, both are needed. `path_dependent` is False for
+    a linear structure. Errors are as for `ExternalModel`.
     """
 
     def __init__(

@@ -78,23 +78,10 @@ def check_fields(
     optional: Sequence[str] = (),
     of: str = "",
 ) -> None:
-    """Check numeric fields of a dataclass instance.
+    """Check numeric fields of a dataclass instance with the functions `positive`, `non_negative` and `finite`.
 
-    Parameters
-    ----------
-    instance : object
-        The instance.
-    positive, non_negative, finite : sequence of str
-        Names of the fields to check with the function of the same name.
-    optional : sequence of str
-        Those fields among them that may be None.
-    of : str
-        Appended to the names in messages, such as ``"of a pier"``.
-
-    Raises
-    ------
-    ValueError
-        If a field does not pass its check.
+    Fields named in `optional` may be None; `of`, such as ``"of a pier"``, is appended to the names in messages of
+    ValueError.
     """
     for check, names in ((check_positive, positive), (check_non_negative, non_negative), (check_finite, finite)):
         for name in names:

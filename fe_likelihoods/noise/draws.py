@@ -12,27 +12,17 @@ __all__ = ["SampleNoise", "sample_noise"]
 
 
 class SampleNoise(NamedTuple):
-    """Noise of every parameter sample.
+    """Noise of every parameter sample; steps outside the events have no noise.
 
-    Attributes
-    ----------
-    deviations : ndarray, shape (n, n_channels), or (n, n_events, n_channels)
-        Standard deviations [SI]; for a noise that depends on the response, its parameters (n, n_noise).
-    lag_one : ndarray, shape (n, n_channels), or None
-        Correlation of successive errors [-], None for white noise.
-    events : tuple of slice
-        Steps of each event, for standard deviations per event. Other steps have no noise.
-    of_response : callable or None
-        For a noise that depends on the response: takes the parameters (n_noise,) of one sample and its response
-        (n_channels, n_steps), returns the standard deviations (n_channels, n_steps) [SI].
-    errors_of_response : callable or None
-        For such a noise whose errors are correlated in time: takes parameters, response and standard normal numbers
-        (n_channels, n_steps), returns the errors (n_channels, n_steps) [SI].
+    A noise that depends on the response has its parameters (n, n_noise) as `deviations`. `of_response` takes the
+    parameters (n_noise,) and the response (n_channels, n_steps) of a sample and returns standard deviations of this
+    shape [SI]; `errors_of_response`, for errors correlated in time, also takes standard normal numbers of this shape
+    and returns errors [SI].
     """
 
-    deviations: np.ndarray
-    lag_one: np.ndarray | None
-    events: tuple[slice, ...] = ()
+    deviations: np.ndarray  # (n, n_channels) or (n, n_events, n_channels) [SI]
+    lag_one: np.ndarray | None  # (n, n_channels) correlation of successive errors, None for white noise
+    events: tuple[slice, ...] = ()  # steps of each event, for standard deviations per event
     of_response: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     errors_of_response: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
 
@@ -71,30 +61,11 @@ class SampleNoise(NamedTuple):
 def sample_noise(
     noise: Any, parameters: np.ndarray, n_channels: int, dt: float | None = None, at_samples: bool = False
 ) -> SampleNoise:
-    """Noise of samples, with levels for the whole measurements or levels that depend on the response.
+    """Noise of samples with parameters (n, n_noise), with levels for the whole measurements or by the response.
 
-    Parameters
-    ----------
-    noise : Noise
-        With a method ``standard_deviations``, see `fe_likelihoods.noise.protocol.Noise`.
-    parameters : (n, n_noise) float
-        Parameters of the noise.
-    n_channels : int
-        Number of channels.
-    dt : float, optional
-        Time step of the responses [s], for a noise whose level depends on the response. Without it, the standard
-        deviations of the measurements are used (``noise.standard_deviations``).
-    at_samples : bool
-        Whether responses are given at the measured samples, for a noise that knows the sample times.
-
-    Returns
-    -------
-    SampleNoise
-
-    Raises
-    ------
-    ValueError
-        If the noise cannot be drawn from, or has impossible standard deviations or correlations.
+    A level that depends on the response needs its time step `dt` [s]; without it, ``noise.standard_deviations`` of the
+    measurements are used. `at_samples`: responses are given at the measured samples, for a noise that knows the sample
+    times. Raises ValueError if the noise cannot be drawn from, or has impossible standard deviations or correlations.
     """
     if not hasattr(noise, "standard_deviations"):
         raise ValueError(

@@ -1,10 +1,9 @@
 """Squared residuals summed in groups of orthonormal coordinates: sufficient statistics of Gaussian noise.
 
-Errors are independent in the coordinates, with one variance for each group. The coordinates are the samples (groups are
-events, or parts of the time) or the coefficients of an orthonormal cosine transform (groups are frequency bands). An
-orthonormal transform preserves sums of squares and has a Jacobian of one, so the density of the coefficients is the
-density of the samples. The sufficient statistics of a group are the number of coordinates, the sum of squared residuals
-and, for a variance that depends on the response, the sum of squared response coordinates.
+Errors are independent in the coordinates, with one variance per group. Coordinates are samples (groups are events, or
+parts of the time) or coefficients of an orthonormal cosine transform (frequency bands), which preserves sums of squares
+and densities. The statistics of a group are the number of coordinates, the sum of squared residuals and, for a variance
+that depends on the response, the sum of squared response coordinates.
 """
 
 from abc import ABC, abstractmethod
@@ -22,19 +21,11 @@ _ROUND_OFF_OF_FREQUENCY = 1e-9
 
 
 class Layout(NamedTuple):
-    """Times of the measured samples, and the number of coordinates in each group.
+    """Times of the measured samples, and the number of coordinates in each group."""
 
-    Attributes
-    ----------
-    steps, starts : tuple of float
-        Time step and first sample time of each channel [s].
-    counts : tuple of tuple of int, (n_groups, n_channels)
-        Number of coordinates in each group, per channel.
-    """
-
-    steps: tuple[float, ...]
-    starts: tuple[float, ...]
-    counts: tuple[tuple[int, ...], ...]
+    steps: tuple[float, ...]  # time step per channel [s]
+    starts: tuple[float, ...]  # first sample time per channel [s]
+    counts: tuple[tuple[int, ...], ...]  # (n_groups, n_channels)
 
 
 class GroupSums(ABC):
@@ -64,15 +55,9 @@ class GroupSums(ABC):
 
 @dataclass(frozen=True)
 class EventSums(GroupSums):
-    """Groups are the samples of events.
+    """Groups are the samples of events."""
 
-    Parameters
-    ----------
-    windows : tuple of (int, int)
-        First sample of each event, and the one after its last.
-    """
-
-    windows: tuple[tuple[int, int], ...]
+    windows: tuple[tuple[int, int], ...]  # first sample of each event, and the one after its last
 
     of_response: ClassVar[bool] = False
 
@@ -88,19 +73,11 @@ class EventSums(GroupSums):
 
 @dataclass(frozen=True)
 class PartSums(GroupSums):
-    """Groups are the samples in equal parts of the time, from time zero on.
+    """Groups are the samples in equal parts of the time, from time zero on."""
 
-    Parameters
-    ----------
-    part : float
-        Length of a part [s].
-    steps, starts : tuple of float
-        Time step and first sample time of each channel [s].
-    """
-
-    part: float
-    steps: tuple[float, ...]
-    starts: tuple[float, ...]
+    part: float  # length [s]
+    steps: tuple[float, ...]  # time step per channel [s]
+    starts: tuple[float, ...]  # first sample time per channel [s]
 
     of_response: ClassVar[bool] = True
 
@@ -143,20 +120,11 @@ class BandSums(GroupSums):
 
     A stretch is a run of samples without a gap; each stretch is transformed separately. Groups are the bands of the
     first stretch from low to high, then the bands of the next one.
-
-    Parameters
-    ----------
-    edges : tuple of float
-        Frequencies between the bands [Hz].
-    steps : tuple of float
-        Time step of each channel [s].
-    of_response : bool
-        Whether the sums of the response are needed too.
     """
 
-    edges: tuple[float, ...]
-    steps: tuple[float, ...]
-    of_response: bool
+    edges: tuple[float, ...]  # frequencies between the bands [Hz]
+    steps: tuple[float, ...]  # time step per channel [s]
+    of_response: bool  # sums of the response are needed too
 
     def powers(self, histories: np.ndarray, there: np.ndarray) -> np.ndarray:
         """See `GroupSums`."""

@@ -4,13 +4,10 @@ Given the sum of squared residuals J of n samples, the likelihood is one integra
 
     L(J) = integral of (2 pi)^(-n/2) sigma^-n exp(-J / (2 sigma^2)) p(sigma) d sigma
 
-under its prior p. A sampler then searches fewer dimensions; the evidence and the posterior of the structural parameters
-are the same. The standard deviations are drawn afterwards, given the structural parameters.
-
-In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood dominates. A refined
-grid finds the maximum, bisection finds the integration limits, where the integrand has decreased by the factor
-exp(-36), and Gauss-Legendre quadrature gives the integral between them. Priors may be bounded. The equations are on the
-page ``docs/theory/likelihood.rst``.
+under its prior p. The evidence and the posterior of the structural parameters are the same; the standard deviations are
+drawn afterwards. In t = log sigma the integrand has one maximum, with a width of 1 / sqrt(2 n) where the likelihood
+dominates. A refined grid finds it, bisection finds where the integrand has decreased by exp(-36), and Gauss-Legendre
+quadrature gives the integral in between. Priors may be bounded. See ``docs/theory/likelihood.rst``.
 """
 
 import math
@@ -37,34 +34,15 @@ _CELLS = 512  # intervals of the tabulated distribution function, which is inver
 
 @dataclass(frozen=True)
 class MarginalNoise:
-    """White noise without parameters: the parameters of another noise are integrated out under their priors.
+    """White noise without parameters: the parameters of a `GaussianNoise` are integrated out under their priors.
 
-    Parameters
-    ----------
-    noise : GaussianNoise
-        With levels in SI units per channel or for all channels. Effective samples are allowed, known sensor noise is
-        not.
-    priors : mapping of str to Distribution
-        Priors of exactly the noise's parameters.
+    Its levels are in SI units, per channel or for all channels; effective samples are allowed, known sensor noise is
+    not. `priors` are of exactly the noise's parameters. Raises ValueError for any other noise or priors.
 
-    Raises
-    ------
-    ValueError
-        For any other noise, or for priors of other parameters.
-
-    Notes
-    -----
     If the integrand has one maximum, the likelihood is accurate to eight digits for a hundred samples or more and to
     six digits for ten. Half-normal, uniform and lognormal priors make the integrand log-concave in log sigma, so it has
     one maximum. It can have two if an informative `TruncatedNormal` prior is many of its standard deviations away from
     a likelihood with few effective samples; the lower maximum is then left out.
-
-    Examples
-    --------
-    >>> likelihood = FELikelihood(model, measurements).marginal({"sigma_top": HalfNormal(0.1)})
-    >>> posterior = Posterior(likelihood, prior_of_structural_parameters)
-
-    `fe_likelihoods.Posterior.marginal` does this for a posterior with all parameters.
     """
 
     noise: GaussianNoise
@@ -101,23 +79,10 @@ class MarginalNoise:
         return ()
 
     def log_likelihood(self, misfit: np.ndarray, n_samples: int | SampleCounts, parameters: Any = None) -> np.ndarray:
-        """Log-likelihood of the measurements.
+        """Log-likelihood (n,) of sums of squared residuals (n, n_channels) [SI unit of the channel, squared].
 
-        Parameters
-        ----------
-        misfit : (n, n_channels) float
-            Sums of squared residuals over the samples [SI unit of the channel, squared]; NaN where the simulation
-            failed.
-        n_samples : int or SampleCounts
-            Samples per channel; `SampleCounts` where samples are missing.
-        parameters : optional
-            Ignored; the noise has no parameters.
-
-        Returns
-        -------
-        (n,) float
-            -inf where the misfit is NaN or infinite; +inf where it is zero and the prior allows sigma = 0 (the integral
-            diverges); never NaN.
+        It is -inf where the misfit is NaN (a failed simulation) or infinite; +inf where it is zero and the prior allows
+        sigma = 0 (the integral diverges); never NaN. `parameters` is ignored: the noise has none.
         """
         misfit = np.asarray(misfit, dtype=float)
         total = np.full(len(misfit), -np.inf)
@@ -129,26 +94,10 @@ class MarginalNoise:
         return total
 
     def draw(self, misfit: np.ndarray, n_samples: int | SampleCounts, uniform: np.ndarray) -> np.ndarray:
-        """Draw standard deviations from their conditional posterior, given the misfit, one per row.
+        """Parameters (n, n_noise) of `noise` from their conditional posterior, one row per misfit (n, n_channels).
 
-        Parameters
-        ----------
-        misfit : (n, n_channels) float
-            As for `log_likelihood`; finite and positive.
-        n_samples : int or SampleCounts
-            Samples per channel; `SampleCounts` where samples are missing.
-        uniform : (n, n_noise) float
-            Independent random numbers in [0, 1).
-
-        Returns
-        -------
-        (n, n_noise) float
-            Parameters of `noise`.
-
-        Raises
-        ------
-        ValueError
-            For a misfit that is not finite and positive.
+        `uniform` (n, n_noise) are independent random numbers in [0, 1). Raises ValueError for a misfit that is not
+        finite and positive.
         """
         misfit = np.asarray(misfit, dtype=float)
         good = (np.isfinite(misfit) & (misfit > 0.0)).all(axis=1)

@@ -25,9 +25,8 @@ PerChannel = Mapping[str, float] | Sequence[float] | None
 
 
 class only_if:  # noqa: N801, a decorator
-    """Decorator: a method exists only for objects that meet a condition, so ``hasattr`` is False for other objects.
-
-    The condition is a function of the object. See also scikit-learn's `available_if`.
+    """Decorator: a method exists only for objects that meet a condition (a function of the object), so ``hasattr`` is
+    False for other objects. See also scikit-learn's `available_if`.
     """
 
     def __init__(self, condition: Callable[[Any], bool]) -> None:

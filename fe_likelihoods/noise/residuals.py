@@ -1,13 +1,11 @@
 """Checks of residuals: are they white, and how many independent samples are they worth?
 
-A residual is the measured minus the simulated response at parameters that fit. White noise treats the n samples of a
-channel as independent. Residuals of real measurements are correlated, because model errors change slowly and repeat
-from cycle to cycle. `residual_checks` measures how far they are from white noise, `effective_samples` gives the number
-of independent samples for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
-`fe_likelihoods.AutoregressiveNoise` explains the correlation::
+White noise treats the n samples of a channel as independent. Residuals of real measurements (measured minus simulated
+response) are correlated, because model errors change slowly and repeat from cycle to cycle. `residual_checks` measures
+this, `effective_samples` is for `fe_likelihoods.GaussianNoise`, and `innovations` shows whether
+`fe_likelihoods.AutoregressiveNoise` explains it::
 
     residuals = posterior.likelihood.residuals(best)
-    print(residual_checks(residuals, model.channels))
     noise = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
 
 The equations are on the page ``docs/theory/noise.rst``.
@@ -116,21 +114,12 @@ def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n
 
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
-    """Statistics of an AR(1) error: J, D and E of `fe_likelihoods.AutoregressiveNoise`.
+    """Statistics of an AR(1) error of residuals (n_channels, n_steps) [SI]: J, D and E of `AutoregressiveNoise`.
 
-    Parameters
-    ----------
-    residuals : (n_channels, n_steps) float
-        [SI unit of the channel]; NaN where a sample is missing.
-
-    Returns
-    -------
-    (3 n_channels,) float, or (2 n_channels + 3 n_gaps n_channels,) float where samples are missing
-        Each for all channels: the sum of squares, the sum of squared differences between successive residuals, and the
-        square of the first plus the square of the last residual [SI unit of the channel, squared]. Where samples are
-        missing, each for all channels: the sum of squares and the square of the first residual; then, for each distance
-        in `SampleCounts.gaps`, three sums over the neighbouring pairs at this distance: squared later residuals,
-        squared earlier residuals, and squared differences.
+    Each for all channels [SI unit, squared]: the sum of squares, the sum of squared differences of successive
+    residuals, and first squared plus last squared. With missing samples (NaN): the sum of squares and the square of the
+    first residual; then, for each distance in `SampleCounts.gaps`, sums over the neighbouring pairs at this distance of
+    squared later residuals, squared earlier residuals, and squared differences.
     """
     if np.isnan(residuals).any():
         return _sums_with_gaps(residuals)
@@ -154,23 +143,11 @@ def _sums_with_gaps(residuals: np.ndarray) -> np.ndarray:
 
 
 def autocorrelation(residuals: np.ndarray) -> np.ndarray:
-    """Autocorrelation at lags of 0, 1, ... samples, about a mean of zero (the mean of an error).
+    """sum_t r_t r_{t+k} / sum_t r_t^2 of residuals (n_channels, n_steps) at lags k = 0, 1, ..., about a mean of zero
+    (the mean of an error); one at lag zero.
 
-    Parameters
-    ----------
-    residuals : (n_channels, n_steps) float
-        Any unit; NaN where a sample is missing.
-
-    Returns
-    -------
-    (n_channels, n_steps) float
-        sum_t r_t r_{t+k} / sum_t r_t^2; one at lag zero. Where samples are missing, products are averaged over the
-        complete pairs; zero at lags without a pair.
-
-    Raises
-    ------
-    ValueError
-        If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel.
+    Where samples are missing (NaN), products are averaged over the complete pairs; zero at lags without a pair. Raises
+    ValueError for another shape, fewer than two samples, infinite values, or only zeros in a channel.
     """
     residuals = _checked(residuals)
     missing = np.isnan(residuals)

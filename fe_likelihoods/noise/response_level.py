@@ -35,24 +35,10 @@ def events_of_parts(model: Any, part: float, first: int = 0) -> tuple[int, ...]:
 
 
 def squared_levels(sums: np.ndarray, counts: np.ndarray, local: float, events: tuple[int, ...]) -> np.ndarray:
-    """Squared levels of responses in each part of the time.
+    """Squared levels (n, n_parts, n_channels) [SI, squared] of n responses, from sums of squares of this shape.
 
-    Parameters
-    ----------
-    sums : (n, n_parts, n_channels) float
-        Sums of squared samples, for n responses [SI unit of the channel, squared].
-    counts : (n_parts, n_channels) int
-        Number of samples.
-    local : float
-        Weight w of the squared envelope, which is the mean square of a part and its two neighbours; 1 - w is the weight
-        of the event's mean square.
-    events : tuple of int
-        As of `events_of_parts`.
-
-    Returns
-    -------
-    (n, n_parts, n_channels) float
-        [SI unit of the channel, squared].
+    `counts` (n_parts, n_channels) are numbers of samples. `local` is the weight w of the squared envelope, the mean
+    square of a part and its two neighbours; 1 - w is the weight of the event's mean square (`events_of_parts`).
     """
     n_parts, whole = len(counts), np.empty(sums.shape)
     numbers = np.array(events or (0,))[np.minimum(np.arange(n_parts), len(events or (0,)) - 1)]
@@ -73,19 +59,9 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def local_level(response: np.ndarray, steps: float | None) -> np.ndarray:
-    """Root mean square of histories within a window around each step.
+    """Root mean square of histories (n_channels, n_steps) within a window around each step, cut at the ends.
 
-    Parameters
-    ----------
-    response : (n_channels, n_steps) float
-        Histories.
-    steps : float or None
-        Length of the window in steps, rounded to an odd number; None for all steps. The window is cut at the ends of
-        the histories.
-
-    Returns
-    -------
-    (n_channels, n_steps) float
+    The window has `steps` steps, rounded to an odd number; None: all steps.
     """
     squares = np.square(response)
     n = squares.shape[1]

@@ -9,37 +9,15 @@ __all__ = ["SampleCounts", "count_samples", "distinct_gaps", "samples_per_channe
 
 
 class SampleCounts(NamedTuple):
-    """Numbers of samples and of the distances between them, for measurements with missing samples.
+    """Numbers of samples and of the distances between them, for measurements with missing samples."""
 
-    Attributes
-    ----------
-    samples : ndarray of int, shape (n_channels,)
-        Number of samples per channel, without missing ones.
-    gaps : ndarray of int, shape (n_gaps,)
-        Distances from one sample to the next, in steps: one if no sample is missing between them. The distinct
-        distances in all channels, ascending.
-    transitions : ndarray of int, shape (n_gaps, n_channels)
-        How often each distance occurs in each channel.
-    """
-
-    samples: np.ndarray
-    gaps: np.ndarray
-    transitions: np.ndarray
+    samples: np.ndarray  # (n_channels,) without missing ones
+    gaps: np.ndarray  # (n_gaps,) distinct distances between samples in all channels, ascending [steps]; 1: none missing
+    transitions: np.ndarray  # (n_gaps, n_channels), how often each distance occurs
 
 
 def count_samples(values: np.ndarray) -> int | SampleCounts:
-    """Count the samples of measurements.
-
-    Parameters
-    ----------
-    values : (n_channels, n_steps) float
-        The samples, NaN where one is missing.
-
-    Returns
-    -------
-    int or SampleCounts
-        The number of steps if no sample is missing, else `SampleCounts`.
-    """
+    """Count samples (n_channels, n_steps): the number of steps if no sample is missing (NaN), else `SampleCounts`."""
     if not np.isnan(values).any():
         return values.shape[1]
     places = [np.flatnonzero(there) for there in ~np.isnan(values)]

@@ -25,31 +25,19 @@ class ShiftedNoise:
     """White noise with unknown time shifts of channels, as ``FELikelihood(..., time_shifts=)`` makes it.
 
     A sample at the time t is compared with the response at t - shift: with a positive shift, the measurement is later
-    than the response.
+    than the response. The levels of the noise are in SI units per channel or for all channels.
 
-    Parameters
-    ----------
-    noise : GaussianNoise
-        The noise of the samples, with levels in SI units per channel or for all channels.
-    shifts : tuple of (str, float)
-        Channels and their largest shifts in both directions [s].
-    dt : float
-        Time step of the model's response [s].
-
-    Notes
-    -----
     A changed shift needs no simulation: the statistics of a simulation are sums over all lags of interest. With the
     residuals e_k at a lag of k steps, the residual at a shift between two lags is sum_i w_i e_(k+i), with the weights
-    w_i of fifth-degree interpolation between six lags. Its sum of squares is sum_ij w_i w_j G_(k+i, k+j) with
-    G_kl = sum_t e_k e_l. The sums G of neighbouring lags are sufficient.
-
-    Every shift must compare the same samples. The shifted channels therefore leave out all samples nearer to an end of
-    the response than the largest shift in any channel plus three steps.
+    w_i of fifth-degree interpolation between six lags. Its sum of squares is sum_ij w_i w_j G_(k+i, k+j) with G_kl =
+    sum_t e_k e_l. The sums G of neighbouring lags are sufficient. Every shift must compare the same samples, so shifted
+    channels leave out all samples nearer to an end of the response than the largest shift in any channel plus three
+    steps.
     """
 
     noise: GaussianNoise
-    shifts: tuple[tuple[str, float], ...]
-    dt: float
+    shifts: tuple[tuple[str, float], ...]  # channels and largest shifts in both directions [s]
+    dt: float  # time step of the model's response [s]
 
     @property
     def title(self) -> str:
@@ -89,23 +77,11 @@ class ShiftedNoise:
     def log_likelihood(
         self, statistics: np.ndarray, n_samples: int | SampleCounts, parameters: np.ndarray
     ) -> np.ndarray:
-        """Log-likelihood of the measurements.
+        """Log-likelihood (n,), -inf also where a shift exceeds its limit.
 
-        Parameters
-        ----------
-        statistics : (n, n_numbers) float
-            Sums of squared residuals at a shift of zero (n_channels), then
-            `fe_likelihoods.signals.comparison.Lags.sums` [SI unit of the channel, squared]; NaN where the simulation
-            failed.
-        n_samples : int or SampleCounts
-            Samples per channel.
-        parameters : (n, n_noise) float
-            Parameters of the noise, then the shifts [s].
-
-        Returns
-        -------
-        (n,) float
-            Log-likelihood of the noise; -inf also where a shift exceeds its limit.
+        `statistics` (n, n_numbers) are sums of squared residuals at a shift of zero (n_channels), then `Lags.sums` [SI
+        unit of the channel, squared], NaN where the simulation failed; `parameters` are those of the noise, then the
+        shifts [s].
         """
         parameters = np.asarray(parameters, dtype=float)
         largest = np.array([shift for _, shift in self.shifts])
@@ -133,20 +109,10 @@ class ShiftedNoise:
 
 
 def with_time_shifts(noise: Noise, time_shifts: Mapping[str, float] | None, dt: float) -> Noise:
-    """A likelihood's noise with unknown time shifts of channels.
+    """A likelihood's noise with largest unknown time shifts of channels [s]; None keeps the shifts that the noise has.
 
-    Parameters
-    ----------
-    noise : Noise
-    time_shifts : mapping of str to float, or None
-        Largest shifts in both directions [s] by channel name; None keeps the shifts that the noise already has.
-    dt : float
-        Time step of the model's response [s].
-
-    Raises
-    ------
-    ValueError
-        For a noise that is not white or not in SI units, an unknown channel, or a largest shift that is not positive.
+    `dt` is the step of the response [s]. Raises ValueError for a noise that is not white or not in SI units, an unknown
+    channel, or a shift that is not positive.
     """
     if isinstance(noise, ShiftedNoise):
         noise, time_shifts = noise.noise, noise.time_shifts if time_shifts is None else time_shifts

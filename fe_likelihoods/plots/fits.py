@@ -169,16 +169,8 @@ def _set_limits(
 
 
 def strongest_window(times: np.ndarray, values: np.ndarray, length: float) -> tuple[float, float]:
-    """Begin and end [s] of the part with the largest sum of squares.
-
-    Parameters
-    ----------
-    times : (n,) float
-        Times of the samples [s], with equal steps.
-    values : (n,) float
-        Any unit; NaN where a sample is missing.
-    length : float
-        Length of the part [s].
+    """Begin and end [s] of the part of this length [s] with the largest sum of squares; `values` (n,) are NaN where
+    missing, `times` (n,) [s] have equal steps.
     """
     step = times[1] - times[0]
     size = min(len(times), max(1, round(length / step)))

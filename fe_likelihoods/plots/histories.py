@@ -217,21 +217,8 @@ def plot_histories(
 def plot_loop(
     x: np.ndarray, y: np.ndarray, axes: Axes | None = None, *, x_label: str = "", y_label: str = "", title: str = ""
 ) -> Axes:
-    """Plot a hysteresis loop, such as force against displacement. A dot marks its end.
-
-    Parameters
-    ----------
-    x, y : ndarray, shape (n_steps,)
-        Coordinates, in the units of the labels.
-    axes : matplotlib Axes, optional
-        Where to draw. Default: a new figure.
-    x_label, y_label, title : str
-        Labels of the axes, with units, and the title.
-
-    Returns
-    -------
-    matplotlib Axes
-        The axes with the figure.
+    """Plot a hysteresis loop, such as force (n_steps,) against displacement, in new axes by default. A dot marks its
+    end.
     """
     axes = new_axes(axes, (5.0, 4.0))
     for line in (axes.axhline, axes.axvline):

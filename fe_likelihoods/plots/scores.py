@@ -1,9 +1,8 @@
 """Figure of prediction scores: calibration, coverage with its error, and sharpness beside it.
 
-A single share of samples in a band says little. The figure shows where the measured values are in the predicted
+A single share of samples in a band says little. The figure shows where measured values are in the predicted
 distributions (histogram of the probability integral transform, PIT), whether weak and strong response are covered
-alike, and what the coverage costs: the width of the band, and the interval score, which adds a penalty for every value
-outside it.
+alike, and the cost: the band's width, and the interval score, which adds a penalty for every value outside it.
 """
 
 from __future__ import annotations

@@ -275,21 +275,9 @@ def _column_loops(column: RCColumn, history: History) -> Figure:
 
 
 def plot_bridge(bridge: IsolatedBridge, axes: Axes | None = None) -> Axes:
-    """Plot the scheme of the isolated bridge with its channels: deck, bearings, blocks, piers and table.
+    """Plot the isolated bridge with its channels: deck, bearings, blocks, piers and table.
 
-    Widths are not to scale; heights are.
-
-    Parameters
-    ----------
-    bridge : IsolatedBridge
-        The bridge, such as `fe_likelihoods.IsolatedBridge`.
-    axes : matplotlib Axes, optional
-        Where to draw. Default: a new figure.
-
-    Returns
-    -------
-    matplotlib Axes
-        The axes with the figure; heights in metres.
+    Widths are not to scale; heights [m] are.
     """
     from matplotlib.patches import Rectangle
 

@@ -1,16 +1,11 @@
 """Distributions of one parameter: normalised densities in closed form, finite or -inf everywhere.
 
-A distribution is a frozen dataclass with the logarithm of its density inside its support, its quantile function, and
-its bounds. The base class derives the rest: the density is zero outside the bounds and at NaN, and draws are quantiles
-of uniform numbers, so `rvs` and the unit cube of nested samplers use the same map.
-
-`from_normal` maps a standard normal variable z to the parameter x, and `to_normal` maps it back: F(x) = Phi(z), with
-the distribution function F. Where z > 0, both maps use the probabilities above x and z, because probabilities near one
-are rounded to one: the maps are as accurate in the upper tail as in the lower one.
-
-Normalising constants are computed once, when a distribution is made. The frozen distributions of `scipy.stats` agree
-with these to round-off but take tens of times longer per call, which matters where the simulation is cheap. The
-densities are on the page ``docs/theory/likelihood.rst``.
+A distribution is a frozen dataclass with its log-density inside its support, its quantile function and its bounds; the
+base class derives the rest. Draws are quantiles of uniform numbers, so `rvs` and the unit cube of nested samplers use
+the same map. `from_normal` maps a standard normal z to x by F(x) = Phi(z), and `to_normal` maps it back; where z > 0
+both use the probabilities above, because probabilities near one are rounded to one. Normalising constants are computed
+once; `scipy.stats` agrees to round-off but takes tens of times longer per call. Densities:
+``docs/theory/likelihood.rst``.
 """
 
 import math

@@ -153,14 +153,8 @@ class MultivariateNormal(MultivariateDistribution):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrozenDistribution(Distribution):
-    """A frozen continuous distribution of `scipy.stats`, such as ``scipy.stats.gamma(2.0)``.
-
-    `Prior` accepts the scipy object itself. The distributions of this package are faster.
-
-    Parameters
-    ----------
-    frozen : scipy.stats.rv_frozen
-        The distribution.
+    """A frozen continuous distribution of `scipy.stats`, such as ``scipy.stats.gamma(2.0)``, which `Prior` accepts
+    itself; the distributions of this package are faster.
     """
 
     frozen: Any
@@ -194,17 +188,7 @@ class FrozenDistribution(Distribution):
 class FrozenMultivariate(MultivariateDistribution):
     """A frozen multivariate distribution of `scipy.stats` with ``logpdf`` and ``rvs``, such as ``multivariate_t``.
 
-    Parameters
-    ----------
-    frozen : frozen distribution of scipy.stats
-        The distribution, whose density is defined for all real numbers.
-    dim : int
-        Number of parameters.
-
-    Raises
-    ------
-    ValueError
-        If its draws have another dimension.
+    Its density is defined for all real numbers. Raises ValueError if its draws have another dimension than `dim`.
     """
 
     def __init__(self, frozen: Any, dim: int) -> None:

@@ -11,24 +11,11 @@ __all__ = ["as_points", "as_rows", "complete_repr"]
 
 
 def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
-    """One point or several points as an array.
+    """One point (ndim,) or several (n, ndim) as an array, from an array_like or a mapping with a value, or n values,
+    per name.
 
-    Parameters
-    ----------
-    x : array_like (ndim,) or (n, ndim), or mapping
-        A mapping has a value, or n values, for every name. emcee passes mappings with ``parameter_names=``, nautilus
-        with its own prior.
-    names : sequence of str
-        Names of the ndim parameters, in order.
-
-    Returns
-    -------
-    ndarray[ndim] or ndarray[n, ndim]
-
-    Raises
-    ------
-    ValueError
-        If the number of values or the names are wrong.
+    emcee passes mappings with ``parameter_names=``, nautilus with its own prior. Raises ValueError if the number of
+    values or the names are wrong.
     """
     if isinstance(x, Mapping):
         if set(x) != set(names):

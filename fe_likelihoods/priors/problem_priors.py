@@ -32,25 +32,9 @@ def bridge_column_prior(
     whether they are scales or standard deviations of the half-normal distributions; the latter would give scales that
     are 1.66 times as large.
 
-    Parameters
-    ----------
-    noise_parameters : sequence of str
-        Noise parameters. For a noise that differs from the paper's noise: a shared ``sigma`` in root mean squares of
-        the measured channels is half-normal with scale 0.3, correlations ``rho_...`` are uniform between -1 and 1 (both
-        assumed).
-    measured : mapping of str to float
-        Root mean squares [SI] of further measured channels, such as strains, by their names. Their noise levels are
-        half-normal with a scale of 0.3 times this value (assumed).
-
-    Returns
-    -------
-    Prior
-        The prior of structural parameters and noise.
-
-    Raises
-    ------
-    ValueError
-        If there is no default prior for a noise parameter.
+    Assumed: a shared ``sigma`` in root mean squares of the channels, and the levels of further channels in their root
+    mean squares `measured` [SI], are half-normal with scale 0.3; correlations ``rho_...`` are uniform between -1 and 1.
+    Raises ValueError if there is no default prior for a noise parameter.
     """
     structural = {"Ec": 0.30, "Es": 0.20, "a0": 0.60, "a1": 0.60, "ft": 0.40}
     scales = {f"sigma_{name}": _NOISE_SCALE * value for name, value in measured.items()} | {
@@ -82,20 +66,8 @@ def isolated_bridge_prior(parameter_names: Sequence[str], sigmas: Mapping[str, f
     """Make the prior of the isolated bridge (assumed).
 
     The multiples of nominal values are normal with mean 1 and standard deviation 0.5, truncated to [0.2, 2.5]. A noise
-    level with scale s is half-normal with scale 0.3 s, truncated below at 0.001 s.
-
-    Parameters
-    ----------
-    parameter_names : sequence of str
-        Structural parameters.
-    sigmas : mapping of str to float
-        Scale of each noise parameter: 1 for a shared sigma, the measured root mean square of the channel [SI] for a
-        sigma per channel.
-
-    Returns
-    -------
-    Prior
-        The prior of structural parameters and noise.
+    level with scale s is half-normal with scale 0.3 s, truncated below at 0.001 s; s is 1 for a shared sigma, the
+    measured root mean square of the channel [SI] for a sigma per channel.
     """
     structural = {name: TruncatedNormal(1.0, 0.5, 0.2, 2.5) for name in parameter_names}
     return Prior(structural | {name: TruncatedNormal(0.0, _NOISE_SCALE * s, 1e-3 * s) for name, s in sigmas.items()})

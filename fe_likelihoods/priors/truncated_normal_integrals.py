@@ -50,20 +50,8 @@ def standard_moments(a: float, b: float) -> tuple[float, float, float]:
 def quantile_of_normal(
     z: np.ndarray, mean: float, sd: float, lower: float, upper: float, log_mass: float
 ) -> np.ndarray:
-    """Truncated normal variable x with F(x) = Phi(z).
-
-    Parameters
-    ----------
-    z : ndarray of float
-        Standard normal variable, any shape.
-    mean, sd, lower, upper : float
-        Normal before truncation, and its bounds.
-    log_mass : float
-        Log probability of [lower, upper] before truncation.
-
-    Returns
-    -------
-    ndarray of the same shape
+    """Truncated normal variable x with F(x) = Phi(z), of any shape; mean and sd are of the normal before truncation,
+    `log_mass` is its log probability of [lower, upper].
     """
     x = np.empty_like(z)
     low = z <= 0.0
@@ -75,19 +63,7 @@ def quantile_of_normal(
 
 
 def score_of_quantile(x: np.ndarray, mean: float, sd: float, lower: float, upper: float, log_mass: float) -> np.ndarray:
-    """Standard normal variable z with F(x) = Phi(z), the inverse of `quantile_of_normal`.
-
-    Parameters
-    ----------
-    x : (n,) float
-        Values strictly inside the bounds.
-    mean, sd, lower, upper, log_mass : float
-        As for `quantile_of_normal`.
-
-    Returns
-    -------
-    (n,) float
-    """
+    """Standard normal variable z with F(x) = Phi(z), the inverse of `quantile_of_normal`; x (n,) inside the bounds."""
     z = _lower_score(x, mean, sd, lower, upper, log_mass)
     high = ~(z <= 0.0)
     z[high] = -_lower_score(-x[high], -mean, sd, -upper, -lower, log_mass)

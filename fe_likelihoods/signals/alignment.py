@@ -97,31 +97,17 @@ class Alignment(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """A channel and its reference.
-
-    Attributes
-    ----------
-    name : str
-        Name of the channel.
-    start, step : float
-        Time of the channel's first sample, and its step [s].
-    places : (n,) int
-        Indices of the samples that are not missing.
-    values : (n,) float
-        These samples, without their mean.
-    dt : float
-        Step of the reference [s], which begins at zero.
-    reference : (n_steps,) float
-        The reference, without its mean.
+    """A channel, its samples that are not missing (without their mean), and its reference (without its mean), which
+    begins at zero.
     """
 
     name: str
-    start: float
-    step: float
-    places: NDArray[np.intp]
-    values: NDArray[np.float64]
-    dt: float
-    reference: NDArray[np.float64]
+    start: float  # time of the channel's first sample [s]
+    step: float  # [s]
+    places: NDArray[np.intp]  # (n,) indices of the samples that are not missing
+    values: NDArray[np.float64]  # (n,)
+    dt: float  # step of the reference [s]
+    reference: NDArray[np.float64]  # (n_steps,)
 
     @property
     def times(self) -> NDArray[np.float64]:

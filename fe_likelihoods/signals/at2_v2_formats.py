@@ -105,26 +105,12 @@ _ZIP_DAMAGE = (
 
 
 class V2Channel(NamedTuple):
-    """A channel found in a V2 file.
-
-    Attributes
-    ----------
-    channel : int or None
-        Channel number of the station.
-    label : str
-        Label of the channel.
-    file : str
-        The file, and the archive that contains it.
-    first : int
-        Number of the first line of the channel in the file.
-    lines : list of str
-        The lines of the channel.
-    """
+    """A channel found in a V2 file: its number at the station, its label, and its lines."""
 
     channel: int | None
     label: str
-    file: str
-    first: int
+    file: str  # with the archive that contains it
+    first: int  # number of its first line in the file
     lines: list[str]
 
 

@@ -20,27 +20,13 @@ _HOUR, _DAY = 3600, 86400
 
 
 class ClockTime(NamedTuple):
-    """A clock time.
+    """A clock time."""
 
-    Attributes
-    ----------
-    day : int or None
-        Number of the day, None without a date.
-    seconds : float
-        Seconds since the midnight before [s].
-    decimals : int
-        Digits after the decimal point of the seconds.
-    zone : int or None
-        Time zone: minutes by which the clock is before UTC, None without one.
-    halves : bool
-        Whether the clock has hours from 1 to 12 with AM and PM.
-    """
-
-    day: int | None
-    seconds: float
-    decimals: int
-    zone: int | None
-    halves: bool = False
+    day: int | None  # number of the day, None without a date
+    seconds: float  # since the midnight before [s]
+    decimals: int  # of the seconds
+    zone: int | None  # minutes by which the clock is before UTC, None without a time zone
+    halves: bool = False  # hours from 1 to 12 with AM and PM
 
 
 def is_clock(cell: str) -> bool:
@@ -97,13 +83,9 @@ def _minutes(zone: str | None) -> int | None:
 def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
     """Return the seconds since the midnight before the first time, NaN for None.
 
-    Without dates, a time that is more than half a day earlier than the previous time belongs to the next day.
-
-    Raises
-    ------
-    ValueError
-        If some times have a date, or AM and PM, and others have none, time zones differ, or 1 o'clock follows 12
-        o'clock, as on a 12-hour clock.
+    Without dates, a time that is more than half a day earlier than the previous time belongs to the next day. Raises
+    ValueError if only some times have a date, or AM and PM, if time zones differ, or if 1 o'clock follows 12 o'clock,
+    as on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
     dates = {time.day is None for time in known}

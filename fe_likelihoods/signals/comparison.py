@@ -1,13 +1,8 @@
 """Comparison of a model response with measurements that have gaps, or other sample times than the response.
 
-Measurements with all samples of the model response need none of this: their residuals are a difference of arrays. Here
-each channel is compared at the times at which it was measured. Missing samples have residuals of NaN, so that
-statistics of the residuals can leave them out.
-
-The response is interpolated at the sample times (`fe_likelihoods.signals.interpolation`), without a filter, even for
-channels sampled more coarsely than the response. A sample is the value of the quantity at one instant, and it is
-compared with the response at the same instant. A filter of the response would remove motion that the sensor has
-measured; the noise of thinned white samples stays white.
+Each channel is compared at the times at which it was measured; missing samples have residuals of NaN. The response is
+interpolated there without a filter, even for channels sampled more coarsely: a filter would remove motion that the
+sensor has measured, and the noise of thinned white samples stays white.
 """
 
 import math
@@ -30,22 +25,11 @@ _LATEST = 1e-6  # in steps: how far a sample may be after the end of the respons
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measurements that have gaps, or other sample times than a response, prepared for this response.
+    """Measurements that have gaps, or other sample times than a response, prepared for this response."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_channels, n_samples)
-        Samples [SI], NaN where there is none.
-    places : tuple of Interpolation or None, one per channel
-        How the response is evaluated at the sample times of each channel; None if the channel and the response have the
-        same times.
-    lags : Lags or None
-        Lags at which the residuals are also formed, for unknown time shifts.
-    """
-
-    values: NDArray[np.float64]
-    places: tuple[Interpolation | None, ...]
-    lags: "Lags | None" = None
+    values: NDArray[np.float64]  # (n_channels, n_samples) [SI], NaN where there is none
+    places: tuple[Interpolation | None, ...]  # per channel; None if it has the times of the response
+    lags: "Lags | None" = None  # lags of the residuals, for unknown time shifts
 
     @property
     def interpolated(self) -> bool:
@@ -106,21 +90,11 @@ class Comparison:
 
 
 class Lags(NamedTuple):
-    """Lags of channels whose time shift is unknown.
-
-    Attributes
-    ----------
-    count : int
-        The lags are -count ... count steps of the response.
-    places : tuple of Interpolation or None, one per channel
-        How the response is evaluated at (sample, lag), lag by lag; None for channels without a shift.
-    samples : tuple of (integer ndarray or None), one per channel
-        The samples of each channel that are compared.
-    """
+    """Lags of -count ... count steps of the response, for channels whose time shift is unknown."""
 
     count: int
-    places: tuple[Interpolation | None, ...]
-    samples: tuple[NDArray[np.intp] | None, ...]
+    places: tuple[Interpolation | None, ...]  # per channel at (sample, lag), lag by lag; None without a shift
+    samples: tuple[NDArray[np.intp] | None, ...]  # per channel, the samples that are compared
 
     def sums(self, response: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return sums over products of residuals at neighbouring lags, shape ((2 count + 1) * POINTS, n_channels).
@@ -143,36 +117,11 @@ class Lags(NamedTuple):
 def compare_with(
     measurements: Measurements, dt: float, n_steps: int, time_shifts: Mapping[str, float] | None = None
 ) -> NDArray[np.float64] | Comparison:
-    """Return the measured values, or the `Comparison`, that a response is compared with.
+    """Return the measured values (n_channels, n_steps) if every response sample has one, else a `Comparison`.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        The measurements, in the order of the response's channels.
-    dt : float
-        Time step of the response [s].
-    n_steps : int
-        Number of response samples.
-    time_shifts : mapping of str to float, optional
-        Largest unknown time shift of channels [s], by their names. Samples of such a channel are left out within this
-        time, plus three steps, from either end of the response.
-
-    Returns
-    -------
-    ndarray, shape (n_channels, n_steps), or Comparison
-        The measured values if every response sample has one, else the comparison.
-
-    Raises
-    ------
-    ValueError
-        If the measurements do not end with the response, a sample is before the first response sample, or a time shift
-        leaves no sample.
-
-    Notes
-    -----
-    With the step of the response, the measurements must have as many samples, some of which may be missing (NaN). With
-    other steps or starts, they must end within one step before the end of the response, so that a wrong step is
-    noticed.
+    Measurements with the step of the response [s] need as many samples, some of them NaN; with other steps or starts
+    they must end within one step before the end of the response, so that a wrong step raises ValueError. Within a
+    channel's largest time shift [s], plus three steps, from either end of the response, its samples are left out.
     """
     end = (n_steps - 1) * dt
     _check_end(measurements, dt, n_steps)
@@ -206,21 +155,8 @@ def compare_shifted(
     n_steps: int,
     shifts: Mapping[str, float],
 ) -> Comparison:
-    """Return a comparison, as of `compare_with`, at known time shifts of some channels.
-
-    Parameters
-    ----------
-    measurements, dt, n_steps
-        As for `compare_with`.
-    compared : ndarray or Comparison
-        The result of `compare_with` without a shift.
-    shifts : mapping of str to float
-        Time by which a channel is later than the response [s], by its name.
-
-    Returns
-    -------
-    Comparison
-        Samples beyond the response are left out.
+    """Return the comparison of `compare_with` (`compared`) with channels that are later than the response by known
+    `shifts` [s]; samples beyond the response are left out.
     """
     places = list(compared.places) if isinstance(compared, Comparison) else [None] * measurements.n_channels
     values, end = np.array(measurements.values), (n_steps - 1) * dt

@@ -46,22 +46,10 @@ _EQUALLY_NEAR, _NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios 
 
 
 class Finding(NamedTuple):
-    """Something to know about a result.
-
-    Attributes
-    ----------
-    name : str
-        What was found, in a few words.
-    weight : {"remark", "care", "wrong"}
-        Whether it is good to know, limits the result, or speaks against it.
-    sentence : str
-        What it means.
-    action : str
-        What to do; may be empty.
-    """
+    """What was found about a result, how much it weighs, what it means, and what to do (may be empty)."""
 
     name: str
-    weight: str
+    weight: str  # "remark" is good to know, "care" limits the result, "wrong" speaks against it
     sentence: str
     action: str = ""
 
@@ -75,25 +63,13 @@ def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 class Fault(NamedTuple):
-    """A fault that explains the measurements better.
+    """A fault of channels, or of supports (input lag), that explains the measurements better."""
 
-    Attributes
-    ----------
-    kind : {"factor", "sign", "lag", "swap", "input lag"}
-    names : tuple of str
-        The channels, or the supports of an input lag.
-    value : float
-        Factor by which the measurements exceed the responses [-], or time by which they (or the motions of the
-        supports) are late [s]; NaN for a sign and a swap.
-    before, after : float
-        Error of these channels (RRMSE, geometric mean) of the best response, without the fault and with it.
-    """
-
-    kind: str
+    kind: str  # "factor", "sign", "lag", "swap" or "input lag"
     names: tuple[str, ...]
-    value: float
-    before: float
-    after: float
+    value: float  # measurements / responses [-], or time by which they are late [s]; NaN for a sign and a swap
+    before: float  # error of the channels for the best response (RRMSE, geometric mean)
+    after: float  # the same error with the fault
 
 
 class _Hypothesis(NamedTuple):
@@ -113,24 +89,11 @@ def find_faults(
     *,
     fitted: bool = False,
 ) -> tuple[Fault, ...]:
-    """Faults that explain measurements better than any of the responses does without them.
+    """Faults that explain measurements better than any of the responses does without them, the strongest first.
 
-    Parameters
-    ----------
-    measurements : Measurements
-        NaN where a sample is missing.
-    responses : (n, n_channels, n_samples) float
-        Responses at the times of the samples [SI], for any parameters: draws of the prior, and the best fit.
-    parts : mapping of str to (n, n_channels, n_samples) float, optional
-        Part of each response that the motion of one support causes, by the name of the support; the parts of a linear
-        structure add up to its response.
-    fitted : bool
-        Whether one of the responses is the fit. Its error is small if there is no fault, so that a smaller gain counts.
-
-    Returns
-    -------
-    tuple of Fault
-        The one that explains most first; each following one is found after those before it are corrected.
+    Responses (n, n_channels, n_samples) [SI] have any parameters; `parts` are their parts by the name of the support
+    that causes them, and add up to them. With the fit among them (`fitted`), a smaller gain counts. Each fault is found
+    after those before it are corrected.
     """
     values = np.asarray(measurements.values, dtype=float)
     there = np.isfinite(values)

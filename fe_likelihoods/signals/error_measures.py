@@ -52,24 +52,9 @@ def rrmse(
 
 
 def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:
-    """Sum of squares per measured history, the denominator of relative errors.
+    """Sums of squares of measured histories (..., n_steps), the denominators of relative errors; NaN is left out.
 
-    Parameters
-    ----------
-    measured : (..., n_steps) array_like
-        Measured values; NaN is left out.
-    names : sequence of str, optional
-        Names of the histories, for the message of an error.
-
-    Returns
-    -------
-    ndarray, shape (...,)
-        The sums [unit of the values, squared].
-
-    Raises
-    ------
-    ValueError
-        If a history has no sample or only zeros, so that no relative error exists.
+    Raises ValueError with the name of a history without a sample, or with zeros only.
     """
     squares = np.square(np.asarray(measured, dtype=float))
     sums = (np.nan_to_num(squares, nan=0.0) if np.isnan(squares).any() else squares).sum(axis=-1)

@@ -16,27 +16,7 @@ _SMALL = 2**20
 
 
 def read_values(data: Any, path: str | os.PathLike, kind: str = "<f8") -> NDArray:
-    """Return the numbers of a data set; raise ValueError if it declares more numbers than the file can contain.
-
-    Parameters
-    ----------
-    data : h5py.Dataset
-        The data set.
-    path : path
-        The file.
-    kind : str
-        Type of the numbers, as in NumPy.
-
-    Returns
-    -------
-    ndarray
-        The numbers.
-
-    Raises
-    ------
-    ValueError
-        If the data set declares more numbers than the file can contain.
-    """
+    """Return the numbers of an h5py data set; ValueError if it declares more numbers than the file can contain."""
     declared, stored = int(data.size) * np.dtype(kind).itemsize, int(data.id.get_storage_size())
     if declared > _SMALL and (declared > _LARGEST_RATIO * stored or stored > os.path.getsize(path)):
         raise ValueError(

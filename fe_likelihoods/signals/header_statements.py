@@ -55,21 +55,11 @@ _LARGEST_ROUNDING = 0.005  # relative, of a number with three digits; with fewer
 
 
 class StatedStep(NamedTuple):
-    """A step of the samples, in the words of a file.
-
-    Attributes
-    ----------
-    text : str
-        The words.
-    steps : tuple of float
-        The step [s]; several ones if its unit is not stated.
-    rounding : float
-        Largest relative error of the printed number.
-    """
+    """A step of the samples, in the words of a file."""
 
     text: str
-    steps: tuple[float, ...]
-    rounding: float
+    steps: tuple[float, ...]  # [s]; several if the unit is not stated
+    rounding: float  # largest relative error of the printed number
 
     def fits(self, step: float, tolerance: float = 0.0) -> bool:
         """Whether a step [s] is the stated one within the printed digits, and a tolerance [s]."""
@@ -77,21 +67,11 @@ class StatedStep(NamedTuple):
 
 
 class StatedPeak(NamedTuple):
-    """Peak accelerations, in the words of a file.
-
-    Attributes
-    ----------
-    text : str
-        The words.
-    unit : str or None
-        Their unit, None if it is not stated.
-    printed : dict of str to str
-        The numbers as printed, by the name of the column, or ``""`` for a peak without name.
-    """
+    """Peak accelerations, in the words of a file."""
 
     text: str
     unit: str | None
-    printed: dict[str, str]
+    printed: dict[str, str]  # by the name of the column, "" for a peak without name
 
     def printed_of(self, names: Sequence[str], index: int) -> str | None:
         """The number for one of the columns of values: by its name, or where no name is there by its place."""
@@ -101,17 +81,7 @@ class StatedPeak(NamedTuple):
 
 
 class Statements(NamedTuple):
-    """What lines state.
-
-    Attributes
-    ----------
-    steps : tuple of StatedStep
-    counts : tuple of (str, int)
-        Words and numbers of samples.
-    units : tuple of (str, str)
-        Words and units.
-    peaks : tuple of StatedPeak
-    """
+    """What lines state: steps, and the words and values of sample counts, units and peaks."""
 
     steps: tuple[StatedStep, ...] = ()
     counts: tuple[tuple[str, int], ...] = ()
@@ -190,24 +160,8 @@ def check_peaks(
 ) -> None:
     """Raise ValueError if a stated peak is not the peak of a column, with its mean or without it.
 
-    Parameters
-    ----------
-    peaks : sequence of StatedPeak
-        What the file states.
-    names : sequence of str
-        Names of all columns of values.
-    index : int
-        Place of the column among them.
-    values : ndarray, shape (n_rows,)
-        The samples as printed, without missing ones.
-    decimals : int
-        Digits after the decimal point of the samples.
-    unit : str
-        Unit of the samples.
-    file : str
-        The file, for messages.
-    advice : str
-        What else may be done, at the end of the message.
+    The column is number `index` of `names`, with printed values (n_rows,) without missing ones; `advice` ends the
+    message.
     """
     factor = float(to_si(1.0, unit))
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]

@@ -19,36 +19,14 @@ _SAME_TIME = 1e-6  # in steps: times nearer to a sample than this are equal to t
 
 
 class Interpolation(NamedTuple):
-    """Samples and weights that give a history at other times.
+    """Samples and weights that give a history at other times."""
 
-    Attributes
-    ----------
-    first : ndarray of int, shape (n_times,)
-        Index of the first sample of each polynomial.
-    weights : ndarray, shape (n_points, n_times), or None
-        Weights of this sample and the following samples; None if all times are sample times, with weights of one.
-    """
-
-    first: NDArray[np.intp]
-    weights: NDArray[np.float64] | None
+    first: NDArray[np.intp]  # (n_times,) first sample of each polynomial
+    weights: NDArray[np.float64] | None  # (n_points, n_times) of this and the next samples; None: all are sample times
 
 
 def make_interpolation(dt: float, n_steps: int, times: NDArray[np.float64]) -> Interpolation:
-    """Return samples and weights for given times.
-
-    Parameters
-    ----------
-    dt : float
-        Time step of the history [s]. Its first sample is at time zero.
-    n_steps : int
-        Number of samples in the history.
-    times : (n_times,) float
-        Times within the history [s].
-
-    Returns
-    -------
-    Interpolation
-    """
+    """Return samples and weights for times (n_times,) [s] within a history that begins at time zero."""
     position = np.asarray(times, dtype=float) / dt
     nearest = np.clip(np.rint(position), 0, n_steps - 1)
     same = np.abs(position - nearest) <= _SAME_TIME

@@ -18,26 +18,10 @@ _Line = tuple[int, list[str]]
 
 
 def logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
-    """Return the lines of a table with its header line and line of units, and what comments would state.
+    """Return numbered lines of a table with header line and line of units, and what comments would state (a step).
 
-    Parameters
-    ----------
-    lines : list of (int, list of str)
-        Numbers and cells of the lines that are not blank.
-    file : str
-        The file, for messages.
-
-    Returns
-    -------
-    lines : list of (int, list of str)
-        The lines given, unless they are in one of the two formats.
-    comments : list of str
-        The step of a file without times.
-
-    Raises
-    ------
-    ValueError
-        If a LabVIEW file has several segments, or another quantity than time on its axis.
+    Lines in another format are returned as they are. Raises ValueError for a LabVIEW file with several segments, or
+    without time on its axis.
     """
     first = lines[0][1][0] if lines and lines[0][1] else ""
     if first == "TOA5" and len(lines) > 3:

@@ -1,12 +1,8 @@
 """Readers of ground motions: formats of strong-motion networks, CSV, and Excel workbooks.
 
-`read_record` recognises the format of a ground motion. The other readers, given a file in another format, name this
-format in their error.
-
-Every reader converts to SI units. It takes the unit and the time step from the file or from its arguments, and raises
-ValueError if neither states them or if they disagree. The formats themselves are in the modules `at2_v2_formats`,
-`smc_geonet_knet_esm_formats` and `tables` (CSV) of this folder. Measured responses have their readers in
-`fe_likelihoods.signals.measurement_readers`.
+`read_record` recognises the format; a reader given another format names it in its error. Every reader converts to SI
+units. It takes the unit and the time step from the file or from its arguments, and raises ValueError if neither states
+them or if they disagree. Measured responses have their readers in `fe_likelihoods.signals.measurement_readers`.
 """
 
 import contextlib
@@ -230,10 +226,7 @@ _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", ".xlsx", ".xlsm")
 def recognise_reader(path: str | Path) -> str | None:
     """Return the name of the function that reads a file or zip archive; None for a table (CSV, Excel).
 
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, or has a known format without a reader.
+    Raises ValueError if the file cannot be read, or has a known format without a reader.
     """
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)):

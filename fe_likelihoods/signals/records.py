@@ -1,10 +1,8 @@
 """Excitations: ground motions (`Record`) and displacements imposed in a laboratory (`DisplacementHistory`).
 
-Between two samples the ground acceleration is a straight line, as in step-by-step integration. A record is therefore
-refined by linear interpolation, which adds no motion. Before a record is coarsened, motion above the new Nyquist
-frequency is removed by a filter, because it would otherwise appear at lower frequencies (aliasing).
-
-Files are read by the functions of `fe_likelihoods.signals.readers`.
+Between two samples the ground acceleration is a straight line, as in step-by-step integration: a record is refined by
+linear interpolation, which adds no motion. Before it is coarsened, a filter removes motion above the new Nyquist
+frequency, which would otherwise appear at lower frequencies (aliasing).
 """
 
 import math
@@ -226,15 +224,7 @@ class Record:
 
 
 class SubdividedHistory(NamedTuple):
-    """A refined displacement history.
-
-    Attributes
-    ----------
-    history : DisplacementHistory
-        The history with inserted points.
-    indices : ndarray, shape (n_steps,)
-        Indices of the original points in `history`.
-    """
+    """A refined displacement history, and the indices (n_steps,) of the original points in it."""
 
     history: "DisplacementHistory"
     indices: NDArray[np.intp]

@@ -23,27 +23,7 @@ _STEP_TOLERANCE = 1e-9  # relative difference up to which two steps are equal
 
 
 def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64]:
-    """Return a read-only float64 copy of a one-dimensional array of at least two finite samples.
-
-    Parameters
-    ----------
-    values : (n_steps,) array_like
-        The samples.
-    what : str
-        The quantity, for messages.
-    name : str
-        Name of the record or test, for messages.
-
-    Returns
-    -------
-    ndarray, shape (n_steps,)
-        The copy.
-
-    Raises
-    ------
-    ValueError
-        If the array has another shape, fewer than two samples, or a sample that is not a finite number.
-    """
+    """Return a read-only float64 copy (n_steps,) of the samples, at least two finite numbers; ValueError otherwise."""
     if np.iscomplexobj(values):
         raise ValueError(f"{what} of {name!r} must be real numbers, got complex ones")
     if np.ma.is_masked(values):
@@ -83,10 +63,7 @@ def check_step(dt: float, name: str) -> float:
 def rest_samples(rest: float, dt: float) -> int:
     """Return the number of zero samples in a pause of `rest` seconds between two records with the step `dt` [s].
 
-    Raises
-    ------
-    ValueError
-        If the pause is negative, so that the events would overlap, or not a finite number.
+    Raises ValueError if the pause is negative, so that the events would overlap, or not a finite number.
     """
     try:
         seconds = float(rest)
@@ -109,28 +86,10 @@ def same_sampling(dt: float, n_steps: int, other_dt: float, other_n_steps: int) 
 
 
 def sample_window(name: str, n_steps: int, dt: float, start: float, stop: float | None) -> slice:
-    """Return the slice of the samples whose times lie between `start` and `stop` [s], both included.
+    """Return the slice of the samples between `start` and `stop` [s], both included; None is the end of the series.
 
-    Parameters
-    ----------
-    name : str
-        Name of the series, for messages.
-    n_steps : int
-        Number of samples. The first sample is at time zero.
-    dt : float
-        Time step [s].
-    start, stop : float
-        Times [s] with 0 <= start < stop <= duration. A `stop` of None is the end of the series.
-
-    Returns
-    -------
-    slice
-        The window, at least two samples long.
-
-    Raises
-    ------
-    ValueError
-        If the times are out of order or outside of the series, or fewer than two samples remain.
+    The first sample is at time zero. Raises ValueError if times are out of order or outside of the series, or fewer
+    than two samples remain.
     """
     duration = (n_steps - 1) * dt
     stop = duration if stop is None else stop

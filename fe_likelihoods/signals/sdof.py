@@ -25,37 +25,17 @@ __all__ = ["OscillatorResponse", "hold_integrals", "respond", "response_slopes"]
 
 
 class OscillatorResponse(NamedTuple):
-    """Response of an oscillator.
+    """Response of an oscillator, (n_steps,) each; displacement and velocity are relative to the base."""
 
-    Attributes
-    ----------
-    displacement : ndarray, shape (n_steps,)
-        Displacement relative to the base [m].
-    velocity : ndarray, shape (n_steps,)
-        Velocity relative to the base [m/s].
-    acceleration : ndarray, shape (n_steps,)
-        Absolute acceleration [m/s²].
-    """
-
-    displacement: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
+    displacement: np.ndarray  # [m]
+    velocity: np.ndarray  # [m/s]
+    acceleration: np.ndarray  # absolute [m/s²]
 
 
 def hold_integrals(z: complex) -> tuple[complex, complex]:
-    r"""Integrals of a first-order equation over one step, for a constant and for a linear load.
+    r"""Integrals over one step of q' = z q + load with q(0) = 0, z = :math:`\lambda \Delta t`, for the loads 1 and t.
 
-    Parameters
-    ----------
-    z : complex
-        Eigenvalue times step, :math:`\lambda \Delta t` [-].
-
-    Returns
-    -------
-    constant : complex
-        :math:`(e^z - 1) / z`, the value at t = 1 of q' = z q + 1 with q(0) = 0.
-    slope : complex
-        :math:`(e^z - 1 - z) / z^2`, the value at t = 1 of q' = z q + t with q(0) = 0.
+    They are :math:`(e^z - 1) / z` and :math:`(e^z - 1 - z) / z^2`.
     """
     if abs(z) >= 1.0:
         constant = (cmath.exp(z) - 1.0) / z
@@ -75,32 +55,11 @@ def respond(
     displacement: float = 0.0,
     velocity: float = 0.0,
 ) -> OscillatorResponse:
-    """Compute the exact response to a base acceleration that is linear between its samples.
+    """Exact response to a base acceleration (n_steps,) [m/s²] that is linear between its samples (Nigam & Jennings
+    1969).
 
-    Parameters
-    ----------
-    base_acceleration : ndarray, shape (n_steps,)
-        Base acceleration [m/s²].
-    dt : float
-        Time step of the samples [s].
-    angular_frequency : float
-        Undamped angular frequency, positive [rad/s].
-    damping_ratio : float
-        Fraction of critical damping, 0 <= damping_ratio < 1.
-    displacement : float
-        Displacement relative to the base at the first sample [m].
-    velocity : float
-        Velocity relative to the base at the first sample [m/s].
-
-    Returns
-    -------
-    OscillatorResponse
-        The response at the samples.
-
-    References
-    ----------
-    N. C. Nigam, P. C. Jennings (1969), Calculation of response spectra from strong-motion earthquake records, Bulletin
-    of the Seismological Society of America 59(2), 909-922.
+    The angular frequency [rad/s] is undamped and positive, 0 <= damping_ratio < 1; displacement [m] and velocity [m/s],
+    relative to the base, are values at the first sample.
     """
     from scipy.signal import lfilter  # imported here because scipy.signal takes longer to import than this package
 
@@ -124,20 +83,10 @@ def respond(
 def response_slopes(
     base_acceleration: np.ndarray, dt: float, angular_frequency: float, damping_ratio: float
 ) -> tuple[OscillatorResponse, OscillatorResponse]:
-    r"""Exact derivatives of the response from rest, by the angular frequency and by the damping ratio.
+    r"""Exact derivatives of the response from rest, by the angular frequency [per rad/s] and by the damping ratio.
 
     The derivative :math:`p = \partial q / \partial \lambda` satisfies :math:`\dot p = \lambda p + q`, which is
     integrated as exactly as :math:`q`.
-
-    Parameters
-    ----------
-    base_acceleration, dt, angular_frequency, damping_ratio
-        As for `respond`.
-
-    Returns
-    -------
-    tuple of OscillatorResponse
-        Derivatives by the angular frequency [per rad/s], and by the damping ratio.
     """
     from scipy.signal import lfilter
 

@@ -74,35 +74,14 @@ _READERS = {
 
 
 class GeonetComponent(NamedTuple):
-    """One component of a GeoNet file.
-
-    Attributes
-    ----------
-    component : str
-        Direction, such as ``"S16W"`` or ``"Up"``.
-    series : Series
-        The acceleration.
-    """
+    """Direction of one component of a GeoNet file, such as ``"S16W"`` or ``"Up"``, and its acceleration."""
 
     component: str
     series: Series
 
 
 def recognise(content: bytes) -> tuple[str, str | None]:
-    """Return the name of a file's format, and the name of the function that reads it.
-
-    Parameters
-    ----------
-    content : bytes
-        Content of the file.
-
-    Returns
-    -------
-    name : str
-        Name of the format; empty if it is unknown.
-    reader : str or None
-        Name of the function; None for a format that is not read.
-    """
+    """Return the name of a file's format (empty if unknown), and of the function that reads it (None if not read)."""
     text = opening_text(content)
     lines = LINE_END.sub("\n", text).splitlines()
     name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)

@@ -1,9 +1,8 @@
 """Rows of cells in CSV files, as loggers and spreadsheets write them, and in Excel workbooks.
 
-Cells are separated by semicolons, tabs, commas or blanks, whichever splits most of the last lines into numbers. Decimal
-commas are read if commas do not separate cells. Separators of thousands are removed if a number shows that they are
-such: ``1,234.5``, ``1.234,5``, ``1'234``. Text before the header line is left out. A line with numbers and words
-counts as such text only if a header line follows it.
+Semicolons, tabs, commas or blanks separate cells, whichever splits most of the last lines into numbers. Decimal commas
+are read if commas do not separate cells; separators of thousands go if a number shows them: ``1,234.5``, ``1.234,5``,
+``1'234``. Text before the header line is left out, as are lines of numbers and words that a header line follows.
 """
 
 import csv
@@ -41,49 +40,21 @@ _LARGEST_WORKBOOK, _MOST_CELLS = 256 * 2**20, 50_000_000  # bytes of the unpacke
 
 
 class Rows(NamedTuple):
-    """Rows of a table, not yet numbers.
+    """Rows of a table, not yet numbers."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Cells of the header line. Empty if there is none.
-    units : tuple of str
-        Cells in a line of units below the header line. Empty if there is none.
-    cells : list of (int, list of str)
-        Number of the line and cells, with decimal points. A missing cell is an empty string.
-    comments : list of str
-        Comment lines, without the ``#``.
-    above : list of str
-        Lines above the rows that are no comments.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    cells: list[tuple[int, list[str]]]
-    comments: list[str]
-    above: Sequence[str] = ()
+    names: tuple[str, ...]  # cells of the header line, empty without one
+    units: tuple[str, ...]  # cells of the line below it, empty without one
+    cells: list[tuple[int, list[str]]]  # line number and cells, with decimal points; "" is missing
+    comments: list[str]  # without the #
+    above: Sequence[str] = ()  # lines above the rows that are no comments
 
 
 def read_rows(path: str | Path, skip: int | None = None, along_rows: bool = False) -> Rows:
-    """Read the rows of a text file, or of the first sheet of an Excel workbook.
+    """Read the rows of a text file, or of the first sheet of an Excel workbook (``.xlsx``, needs openpyxl).
 
-    Parameters
-    ----------
-    path : str or path
-        The file. Workbooks (``.xlsx``) need the package openpyxl.
-    skip : int, optional
-        Number of lines above the table. By default they are found.
-    along_rows : bool
-        Whether the numbers of the file are one column, row after row. The last row may then be shorter.
-
-    Returns
-    -------
-    Rows
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, has no rows of numbers, or a row has another number of cells than the others.
+    `skip` lines are above the table; None finds them. With `along_rows` the numbers are one column, row after row, and
+    the last row may be shorter. Raises ValueError if the file cannot be read, has no rows of numbers, or has rows of
+    different length.
     """
     if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
         raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")

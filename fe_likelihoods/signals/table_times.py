@@ -23,34 +23,15 @@ _UNIX_SECONDS = (1e9, 4.2e9)  # seconds since 1970 of the years 2001 to 2103
 
 
 def table_step(table: Table, dt: float | None = None) -> float:
-    """Return the time step of a table: from its times, the comment ``dt = ... s`` and the argument, which must agree.
+    """Return the time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must
+    agree.
 
-    Parameters
-    ----------
-    table : Table
-        The table.
-    dt : float, optional
-        Time step [s] given by the caller.
-
-    Returns
-    -------
-    float
-        The time step [s].
-
-    Raises
-    ------
-    ValueError
-        If no step is given, the given steps differ, or the times are not uniform.
-
-    Notes
-    -----
     Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
     it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
-    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored in single
-    precision (float32) may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other
-    times, such as Unix times, must be uniform within 1e-4 of a step and the round-off of double precision. If the mean
-    step corresponds to a whole number of samples per second, within the rounding and within a relative 1e-4, this
-    number is used.
+    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored as float32
+    may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
+    within 1e-4 of a step and round-off; ValueError otherwise. A whole number of samples per second is used where the
+    mean step corresponds to it within the rounding and a relative 1e-4.
     """
     place = time_column(table)
     step, tolerance = (None, 0.0) if place is None else _uniform_step(table, place)
@@ -80,12 +61,10 @@ def table_step(table: Table, dt: float | None = None) -> float:
 
 
 def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
-    """Return the time of the first row after `zero` [s]; a file without times begins at time zero.
+    """Return the time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
 
-    For a file with clock times, `zero` may be a clock time.
-
-    A printed time is rounded by at most half a unit of its last digit. With ``zero=0``, a start within this rounding of
-    a whole number of steps is set to this number. For another `zero`, the same holds within round-off.
+    With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
+    number; for another `zero`, within round-off.
     """
     place = time_column(table)
     if isinstance(zero, str):

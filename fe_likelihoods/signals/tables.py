@@ -23,51 +23,21 @@ _LONGEST_UNIT = 100
 
 
 class Table(NamedTuple):
-    """Columns of numbers in a text file.
+    """Columns of numbers in a text file."""
 
-    Attributes
-    ----------
-    file : str
-        The file, for messages.
-    names : tuple of str
-        Names of the columns. Empty if there is no header line.
-    values : ndarray, shape (n_rows, n_columns)
-        The numbers.
-    lines : tuple of int
-        Line numbers of the rows.
-    decimals : tuple of int
-        Largest number of digits printed after the decimal point, per column.
-    comments : str
-        Text of the comment lines.
-    units : tuple of str
-        Units below the header line, an empty string per column if there are none.
-    time_unit : str or None
-        Unit of the times as given by the caller.
-    clocks : frozenset of int
-        Columns of clock times. Their values are the seconds since the midnight before the first clock time.
-    dates : frozenset of int
-        Columns of dates or of text, such as a state of the logger, which have no values.
-    clock : ClockTime or None
-        The first clock time.
-    time : int or None
-        Number of the column of times, from 0, as given by the caller.
-    stated : Statements
-        What comments and the text above the table state.
-    """
-
-    file: str
-    names: tuple[str, ...]
-    values: NDArray[np.float64]
-    lines: tuple[int, ...]
-    decimals: tuple[int, ...]
+    file: str  # for messages
+    names: tuple[str, ...]  # empty without a header line
+    values: NDArray[np.float64]  # (n_rows, n_columns)
+    lines: tuple[int, ...]  # line numbers of the rows
+    decimals: tuple[int, ...]  # most digits printed after the decimal point, per column
     comments: str
-    units: tuple[str, ...]
-    time_unit: str | None = None
-    clocks: frozenset[int] = frozenset()
-    dates: frozenset[int] = frozenset()
-    clock: ClockTime | None = None
-    time: int | None = None
-    stated: Statements = Statements()
+    units: tuple[str, ...]  # below the header line, "" per column without them
+    time_unit: str | None = None  # as given by the caller
+    clocks: frozenset[int] = frozenset()  # columns of clock times [s since the midnight before the first]
+    dates: frozenset[int] = frozenset()  # columns of dates or text, such as a logger's state, without values
+    clock: ClockTime | None = None  # the first clock time
+    time: int | None = None  # column of times, as given by the caller
+    stated: Statements = Statements()  # what comments and the text above state
 
 
 def read_table(
@@ -77,34 +47,13 @@ def read_table(
     time: int | str | None = None,
     along_rows: bool = False,
 ) -> Table:
-    """Read columns of numbers from a text file or an Excel workbook.
+    """Read columns of numbers from a text file or an Excel workbook, with NaN for missing cells.
 
-    Columns are separated by commas, semicolons, tabs or blanks, with decimal points or decimal commas. Text above the
-    table, a header line and a line of units are optional. Lines that start with ``#`` are comments.
-
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    skip : int, optional
-        Number of lines above the table. By default they are found.
-    time_unit : str, optional
-        Unit of the times, if the file does not state it. Without a header line, the first column then has the times.
-    time : str or int, optional
-        Name of the column of times, or its number in a file without a header line. By default it is found.
-    along_rows : bool
-        Whether the numbers of a file without a header line are one column, row after row.
-
-    Returns
-    -------
-    Table
-        The columns, with NaN for missing cells: empty, ``NaN``, ``NA``, ``N/A``, ``#N/A``, ``NULL``, ``-`` or ``--``.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, has no rows, has rows of different length, a cell is not a finite number, or the
-        file states another number of samples.
+    Separators are commas, semicolons, tabs or blanks; text above the table (`skip` lines, None finds them), a header
+    line and a line of units are optional; lines with ``#`` are comments. `time` is the name or number of the column of
+    times, by default found; with `time_unit`, the first column of a file without a header line has them. Raises
+    ValueError if the file cannot be read, has no rows or rows of different length, has a cell that is no finite number,
+    or states another number of samples.
     """
     file, rows = str(path), read_rows(path, skip, along_rows)
     width = len(rows.cells[0][1])

@@ -50,27 +50,13 @@ _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of do
 
 
 class Series(NamedTuple):
-    """Samples as they are in a file, before any conversion.
-
-    Attributes
-    ----------
-    title : str
-        Title in the file, or an empty string.
-    dt : float
-        Time step [s].
-    unit : str or None
-        Unit of the values as the file states it, None if it does not.
-    values : ndarray, shape (n_steps,)
-        The samples, in `unit`.
-    times : ndarray, shape (n_steps,), or None
-        Times of the samples [s], if they are uneven; `dt` is then NaN.
-    """
+    """Samples (n_steps,) as they are in a file, before any conversion; unit None if the file states none."""
 
     title: str
-    dt: float
+    dt: float  # [s], NaN with uneven times
     unit: str | None
     values: NDArray[np.float64]
-    times: NDArray[np.float64] | None = None
+    times: NDArray[np.float64] | None = None  # [s], if they are uneven
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -165,28 +151,9 @@ def _aligned(lines: list[str]) -> list[list[str]] | None:
 
 
 def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
-    """Return the canonical name of the unit that a file states, or that the caller gives.
+    """Return the canonical name of the unit that a file states or the caller gives.
 
-    Parameters
-    ----------
-    stated : str or None
-        Unit in the file.
-    given : str or None
-        Unit given by the caller.
-    dimension : str
-        Dimension of the quantity.
-    file : str or path
-        The file, for messages.
-
-    Returns
-    -------
-    str
-        The unit.
-
-    Raises
-    ------
-    ValueError
-        If both are None, the two disagree, or a unit is unknown or of another dimension.
+    Raises ValueError if both are None, they disagree, or a unit is unknown or of another dimension.
     """
     names = [name for name in (stated, given) if name is not None]
     if not names:
@@ -231,26 +198,10 @@ def parse_number(field: str, where: str) -> float:
 def fixed_width_samples(
     lines: list[str], start: int, count: int, form: tuple[int, int], file: str, first: int = 1
 ) -> NDArray[np.float64]:
-    """Return samples in Fortran columns, which may touch; raise ValueError if a line has too few or too many.
+    """Return `count` samples in Fortran columns, which may touch, from line index `start` on; `form` is (numbers per
+    line, columns per number), `first` the file's number of the first line.
 
-    Parameters
-    ----------
-    lines : list of str
-        Lines of a file, or of a part of it.
-    start : int
-        Index of the line with the first sample.
-    count : int
-        Number of samples.
-    form : (int, int)
-        Numbers per line, and columns per number.
-    file : str
-        The file, for messages.
-    first : int
-        Number of the first of the lines in the file.
-
-    Returns
-    -------
-    ndarray, shape (count,)
+    Raises ValueError if a line has too few or too many numbers.
     """
     per_line, width = form
     values: list[float] = []

@@ -16,42 +16,18 @@ _LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
 
 
 class UniformTimes(NamedTuple):
-    """Times with a uniform step in the place of uneven ones.
+    """Times with a uniform step instead of uneven ones."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (n_samples,)
-        The uneven times [s].
-    step : float
-        The uniform step [s].
-    uniform : ndarray, shape (n_steps,)
-        The uniform times, from the first uneven one on [s].
-    usual : float
-        Mean step without gaps [s].
-    gaps : ndarray, shape (n_gaps,)
-        Lengths of the gaps [s].
-    note : str
-        What is done, for the description of the data.
-    """
-
-    times: NDArray[np.float64]
-    step: float
-    uniform: NDArray[np.float64]
-    usual: float
-    gaps: NDArray[np.float64]
-    note: str
+    times: NDArray[np.float64]  # (n_samples,) uneven [s]
+    step: float  # [s]
+    uniform: NDArray[np.float64]  # (n_steps,) from the first uneven time on [s]
+    usual: float  # mean step without gaps [s]
+    gaps: NDArray[np.float64]  # (n_gaps,) lengths [s]
+    note: str  # what is done, for the description of the data
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values at the uniform times, linear between known samples and NaN in gaps and beyond the last one.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n_samples,)
-            Samples at the uneven times, with NaN for missing ones.
-
-        Returns
-        -------
-        ndarray, shape (n_steps,)
+        """Return values (n_steps,) at the uniform times, linear between known samples and NaN in gaps and beyond the
+        last.
         """
         known = np.flatnonzero(~np.isnan(values))
         if known.size == 0:
@@ -67,20 +43,8 @@ class UniformTimes(NamedTuple):
         return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
 
     def straight(self, values: NDArray[np.float64], where: str, stacklevel: int) -> NDArray[np.float64]:
-        """Return values at the uniform times, with straight lines over gaps and a warning about them.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n_samples,)
-            Samples at the uneven times, all known.
-        where : str
-            The file, for the warning.
-        stacklevel : int
-            As in `warnings.warn`, seen from the caller.
-
-        Returns
-        -------
-        ndarray, shape (n_steps,)
+        """Return values (n_steps,) at the uniform times, with straight lines over gaps and a warning about them in
+        `where`.
         """
         if self.gaps.size:
             warnings.warn(
@@ -93,27 +57,11 @@ class UniformTimes(NamedTuple):
 
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
-    """Return times with the uniform `step` from the first to the last of the given times.
+    """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
-    Parameters
-    ----------
-    times : ndarray, shape (n_samples,)
-        Times that increase [s].
-    step : float or None
-        Nominal step of the samples [s]. By default that of a whole number of samples per second, if it is within 5 % of
-        the usual step, else the usual step.
-    where : str
-        The file, for messages.
-
-    Returns
-    -------
-    UniformTimes
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, more than half of the samples are missing, or the step differs from their usual
-        step by more than 5 %: another step would need a filter (`Record.resample`, `Measurements.decimate`).
+    The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
+    ValueError if times do not increase, more than half of the samples are missing, or the step differs from the usual
+    one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
     """
     step = None if step is None else check_step(step, f"resample of {where}")
     increments = np.diff(times)
