@@ -19,21 +19,11 @@ __all__ = ["ModelError", "model_error"]
 
 
 class ModelError(NamedTuple):
-    """Model error of every sample; a prediction uses it like a `SampleNoise`.
-
-    Attributes
-    ----------
-    noise : Noise
-        The noise.
-    deviations : ndarray, shape (n, n_noise)
-        Noise parameters.
-    dt : float
-        Time step of the responses [s].
-    """
+    """Model error of every sample; a prediction uses it like a `SampleNoise`."""
 
     noise: Any
-    deviations: np.ndarray
-    dt: float
+    deviations: np.ndarray  # noise parameters (n, n_noise)
+    dt: float  # time step of the responses [s]
 
     def of_response(self, parameters: np.ndarray, response: np.ndarray) -> np.ndarray:
         """Standard deviations (n_channels, n_steps) [SI] of one sample, without the sensor noise."""
@@ -55,26 +45,11 @@ class ModelError(NamedTuple):
 
 
 def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
-    """Return the model error for samples of the noise parameters.
+    """The model error for samples (n, n_noise) of the noise parameters, at a time step of the responses [s].
 
-    Parameters
-    ----------
-    noise : Noise
-        With a method ``response_deviations``, such as `GaussianNoise` with ``level="response"``, and ``sensor``, the
-        known standard deviations of the sensors, or None.
-    parameters : (n, n_noise) float
-        Noise parameters.
-    dt : float
-        Time step of the responses [s].
-
-    Returns
-    -------
-    ModelError
-
-    Raises
-    ------
-    ValueError
-        If the noise does not follow the response: its levels do not tell the model error from sensor noise.
+    The noise needs a method ``response_deviations``, and ``sensor``, the known standard deviations of the sensors or
+    None. ValueError if the noise does not follow the response: its levels do not tell the model error from sensor
+    noise.
     """
     if not follows_response(noise):
         raise ValueError(

@@ -108,21 +108,11 @@ Quantity = None | str | ChannelQuantity | Sequence[str] | Sequence[ChannelQuanti
 
 
 class Evaluator(NamedTuple):
-    """How a quantity is computed from the response of a model.
+    """How a quantity is computed from the response of a model."""
 
-    Attributes
-    ----------
-    rows : list of int or None
-        Rows of the response whose histories are the quantity, None for another quantity.
-    function : callable or None
-        Function of the response (n_channels, n_steps) [SI], None for histories.
-    channels : tuple of Channel
-        Channels of the quantity, with its dimension and display unit; empty for a function of the whole response.
-    """
-
-    rows: list[int] | None
-    function: Callable[[np.ndarray], Any] | None
-    channels: tuple[Channel, ...]
+    rows: list[int] | None  # whose histories are the quantity, None for others
+    function: Callable[[np.ndarray], Any] | None  # of the response (n_channels, n_steps) [SI]
+    channels: tuple[Channel, ...]  # of the quantity; empty for a function of the whole response
 
 
 def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
@@ -248,24 +238,9 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
 
 
 def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
-    """Evaluate a quantity of channels for measurements.
+    """Measured values, () or (n_quantities,) [SI], of one `ChannelQuantity` or a sequence, as it was predicted.
 
-    Parameters
-    ----------
-    quantity : ChannelQuantity or sequence of ChannelQuantity
-        The quantity, as it was predicted.
-    measurements : Measurements
-        Measurements of these channels.
-
-    Returns
-    -------
-    ndarray, shape () or (n_quantities,)
-        The measured values [SI].
-
-    Raises
-    ------
-    ValueError
-        If the quantity is another one, the measurements lack a channel, or samples of it are missing.
+    ValueError for any other quantity, or if the measurements lack a channel or samples of it.
     """
     several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
     if not isinstance(several, Sequence) or not all(isinstance(each, ChannelQuantity) for each in several):
@@ -373,28 +348,10 @@ def _of_failure(channel: Channel) -> Channel:
 
 
 def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_steps: int | None = None) -> Evaluator:
-    """Return how a quantity is computed from responses.
+    """How a quantity of `propagate` is computed from responses of these channels, with the time step [s].
 
-    Parameters
-    ----------
-    quantity : Quantity
-        The quantity, as in `fe_likelihoods.prediction.propagation.propagate`.
-    channels : sequence of Channel
-        Channels of the model.
-    dt : float
-        Time step of the model [s].
-    n_steps : int, optional
-        Number of history steps, to check the arrays of a quantity before the simulations.
-
-    Returns
-    -------
-    Evaluator
-        Rows of histories, or a function of the response.
-
-    Raises
-    ------
-    ValueError
-        If this is not a quantity, it names an unknown channel, or one that has no such number.
+    With `n_steps`, the arrays of a quantity are checked before the simulations. ValueError if this is not a quantity,
+    it names an unknown channel, or one that has no such number.
     """
     channels = tuple(channels)
     names = [channel.name for channel in channels]
