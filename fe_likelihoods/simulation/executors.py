@@ -32,9 +32,9 @@ __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | PoolExecutor | None":
     """Executor for a pool, by the rule above; None for None.
 
-    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`; an item that kills every
-    process that runs it also gets an `Outcome`, if the pool survives. ValueError if `pool` is of no such kind, or its
-    workers are other processes and the model cannot be sent to them.
+    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`, also given for an item that
+    kills every process that runs it, if the pool survives. ValueError if `pool` is of no such kind, or its workers are
+    other processes and the model cannot be sent to them.
     """
     if pool is None or isinstance(pool, LocalPool | PoolExecutor):
         executor = pool

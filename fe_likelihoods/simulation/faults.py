@@ -35,7 +35,7 @@ class FailedRun(RuntimeError):
 
 
 class RunFailed(FailedRun):
-    """A run in another process failed: its `reason`, and its duration `seconds` [s] or None.
+    """A failed run in another process: its duration `seconds` [s] or None, and its `reason`.
 
     The reason is a `TransientReason` if the process was stopped, was killed or crashed.
     """
@@ -47,10 +47,7 @@ class RunFailed(FailedRun):
 
 
 class UnusableModel(ValueError):
-    """A model whose responses cannot be used at any parameters. The message says what to do.
-
-    Samplers stop (`ends_run`), since no point can be evaluated any more.
-    """
+    """A model whose responses cannot be used at any parameters, so that samplers stop (`ends_run`); says what to do."""
 
     ends_run = True
 

@@ -259,7 +259,7 @@ def _remove(process: subprocess.Popen, owner: int) -> None:
 
 
 def discard(process: int, reason: str = "") -> str:
-    """Remove the folder of a worker process that was killed; returns what to add to the reason of its simulation.
+    """Remove the folder of a killed worker process; returns what to add to the reason of its simulation.
 
     With the `reason` of a failure, the folder is kept if `KEEP` says so.
     """

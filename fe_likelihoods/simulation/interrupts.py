@@ -18,10 +18,7 @@ _EXIT = (
 
 
 def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
-    """Raise exceptions that must not become a failed simulation: `UnusableModel`, KeyboardInterrupt and SystemExit.
-
-    Arguments and causes as for `samplers.interrupts.raise_if_it_ends_the_run`.
-    """
+    """Raise what must not become a failed simulation: `UnusableModel`, and all that `samplers.interrupts` raises."""
     if isinstance(error, UnusableModel):
         raise error
     try:

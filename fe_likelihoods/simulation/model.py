@@ -81,34 +81,17 @@ def split_seconds(reason: str) -> tuple[str, float | None]:
 
 
 class SimulationBatch(NamedTuple):
-    """Responses for several parameter sets.
+    """Responses for several parameter sets."""
 
-    Attributes
-    ----------
-    response : (n, n_channels, n_steps) float
-        [SI]; NaN where the simulation failed.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded.
-    """
-
-    response: np.ndarray
-    reasons: list[str]
+    response: np.ndarray  # (n, n_channels, n_steps) [SI]; NaN where the simulation failed
+    reasons: list[str]  # of n failures; empty for successes
 
 
 class MisfitBatch(NamedTuple):
-    """Misfits for several parameter sets.
+    """Misfits for several parameter sets."""
 
-    Attributes
-    ----------
-    misfit : (n, n_channels) float
-        Sums of squared residuals [SI unit of the channel, squared], or (n, n_numbers) for another residual statistic;
-        NaN where the simulation failed.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded.
-    """
-
-    misfit: np.ndarray
-    reasons: list[str]
+    misfit: np.ndarray  # sums of squares (n, n_channels) [SI², by channel], or another statistic; NaN if failed
+    reasons: list[str]  # of n failures; empty for successes
 
 
 class Model(Protocol):
@@ -191,16 +174,9 @@ def first_part(model: Model, seconds: float) -> Model:
 
 @interrupts_end_the_run()
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
-    """Responses for many parameter sets.
+    """Responses for many parameter sets (n, n_parameters), the same for every pool to the last bit.
 
-    Parameters
-    ----------
-    model : Model
-    thetas : (n, n_parameters) float
-        Parameter sets.
-    pool : object with ``map(function, items)``, optional
-        Runs the simulations one by one, even if the model has a batch method (which would run in this process). The
-        results do not depend on the pool.
+    A pool runs the simulations one by one, even if the model has a batch method (which would run in this process).
     """
     shape = (len(model.channels), model.n_steps)
     if pool is None and getattr(model, "simulate_batch", None) is not None:
@@ -211,21 +187,9 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
 
 @interrupts_end_the_run()
 def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.ndarray:
-    """Derivatives of the responses by the structural parameters, from the model's own ``jacobian``.
+    """Derivatives (n, n_parameters, n_channels, n_steps) of the responses, from the model's own ``jacobian``.
 
-    Parameters
-    ----------
-    model, thetas, pool
-        As for `simulate_batch`.
-
-    Returns
-    -------
-    (n, n_parameters, n_channels, n_steps) float
-
-    Raises
-    ------
-    ValueError
-        If ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
+    ValueError if ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
     """
     shape = (len(model.parameter_names), len(model.channels), model.n_steps)
     values, reasons = _run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
@@ -264,14 +228,8 @@ def misfit_batch(
 ) -> MisfitBatch:
     """Sums of squared residuals, or another residual statistic, for many parameter sets; responses are not kept.
 
-    Parameters
-    ----------
-    model, thetas, pool
-        As for `simulate_batch`.
-    measured : (n_channels, n_steps) float, or Comparison
-        Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
-    statistic : Statistic, optional
-        Residual statistic, by default the sums of squares. If given, the model's own ``misfit_batch`` is not used.
+    Measured values are (n_channels, n_steps) [SI]. The model's own ``misfit_batch`` is not used with a `Comparison` or
+    a statistic; pools are as for `simulate_batch`.
     """
     shape = (statistic_width(measured, statistic),)
     own = (
@@ -334,7 +292,7 @@ def _response(model: Model, theta: np.ndarray) -> np.ndarray:
 
 
 def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """What a model returned as a response (n_channels, n_steps) of floats [SI], which may be infinite or NaN.
+    """A model's response as floats (n_channels, n_steps) [SI], which may be infinite or NaN.
 
     `SimulationFailed` if it is complex, has another shape, or is not an array of numbers.
     """

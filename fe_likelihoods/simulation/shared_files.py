@@ -58,23 +58,11 @@ def worse(path: str, other: str) -> str:
 
 
 class RunningSimulation:
-    """A simulation that runs now.
+    """A simulation that runs now, in its own folder `place` (without links; "" if it has none).
 
-    Parameters
-    ----------
-    place : str
-        Its own folder, without links in the path; "" if it has none.
-    thread : int
-        The thread that runs it; 0 if all threads of this process belong to it.
-    is_remote : bool
-        Whether it was sent by another machine.
-
-    Attributes
-    ----------
-    shared
-        The first file that it wrote and that other simulations may write too; "" if there is none.
-    has_programs
-        Whether it has started other processes.
+    `thread` runs it, 0 if all threads of this process belong to it; `is_remote` if another machine has sent it.
+    `shared` is the first file that it wrote and other simulations may write too, else ""; `has_programs` if it started
+    processes.
     """
 
     def __init__(self, place: str, thread: int, is_remote: bool) -> None:

@@ -88,23 +88,10 @@ class UMBridgeServers:
         return type(self), (self.urls, self.retries, self.retry_wait)
 
     def evaluate(self, request: dict[str, Any], time_limit: float | None = None) -> Any:
-        """Output vectors of an evaluation, as read from JSON and not checked.
+        """Output vectors of an evaluation, as read from JSON and not checked; `time_limit` [s] is for the last attempt.
 
-        Parameters
-        ----------
-        request : dict
-            Content of the request.
-        time_limit : float or None
-            Longest time until the answer [s], not counting earlier attempts.
-
-        Raises
-        ------
-        ServerError
-            If the server answers with an error.
-        ServerTimeout
-            If the server does not answer within the time limit.
-        Unavailable
-            If all attempts have failed.
+        `ServerError` if the server answers with an error, `ServerTimeout` if not in time, `Unavailable` if all attempts
+        failed.
         """
         for attempt in range(self.retries + 1):
             if attempt:
