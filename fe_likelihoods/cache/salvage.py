@@ -43,15 +43,7 @@ class Salvaged(NamedTuple):
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
-    """Copy the readable simulations and responses of a damaged cache, which is not changed.
-
-    Parameters
-    ----------
-    damaged : Path
-        The damaged file, with its log.
-    connection : sqlite3.Connection
-        Connection to the new cache.
-    """
+    """Copy the readable simulations and responses of a damaged cache, which stays as it is, to a new one."""
     with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError), _opened(damaged) as source:
         rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
         connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])
