@@ -57,23 +57,10 @@ def _restored(dtype: type, content: bytes) -> _Numbers:
 
 
 class Archive:
-    """All successful simulations of a record.
+    """All m successful simulations of a record: residuals (n_channels, n_steps), and a quadratic statistic of them.
 
-    Parameters
-    ----------
-    statistic : callable
-        Function of residuals (n_channels, n_steps) that returns (n_numbers,), quadratic in them.
-    shape : (n_channels, n_steps)
-        Shape of the residuals of a run.
-
-    Attributes
-    ----------
-    numbers : (m,) int
-        Numbers of the runs among all histories, which are residuals of runs, and derivatives of residuals.
-    coords : (m, n_structural) float
-        Structural coordinates of the runs.
-    statistics : (m, n_numbers) float
-        Statistics of their residuals.
+    `numbers` (m,) are the numbers of the runs among all histories, which are residuals of runs, and derivatives of
+    residuals; `coords` (m, n_structural) their structural coordinates, `statistics` (m, n_numbers) of their residuals.
     """
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:
