@@ -1,11 +1,9 @@
 """SQLite file of the simulation cache: how it is created, recognised, shared, and moved aside when damaged.
 
-The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a transaction whose process is
-killed has no effect. SQLite's application id identifies the file as a cache, the user version is the layout version. A
-file with another id or version is never written to. Every process has its own connection, opened when it is first
-needed and closed before the process forks, since SQLite connections must not be used after a fork.
-
-A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value with which the run continues.
+In write-ahead-log (WAL) mode readers never wait, writers take turns, and a transaction whose process is killed has no
+effect. SQLite's application id identifies a cache, the user version its layout; a file with others is never written to.
+Every process has its own connection, closed before the process forks, since SQLite connections must not be used after
+it. A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value to continue with.
 """
 
 import contextlib

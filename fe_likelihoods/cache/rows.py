@@ -73,7 +73,7 @@ MIN_STOPS = 2  # stops at a time limit before the simulation counts as too slow;
 class CachedRows(NamedTuple):
     """Stored rows for n simulations."""
 
-    misfit: np.ndarray  # (n, n_channels) sums of squares [SI²]; NaN where failed or not stored
+    misfit: np.ndarray  # (n, n_channels) sums of squares [SI unit squared]; NaN where failed or not stored
     reasons: list[str]  # of n failures; empty otherwise
     known: np.ndarray  # (n,) whether the simulation is stored
 
@@ -82,7 +82,7 @@ class StoredSimulation(NamedTuple):
     """One stored simulation."""
 
     theta: np.ndarray  # structural parameters (n_structural,)
-    misfit: np.ndarray  # (n_channels,) sums of squares [SI²]; NaN if it failed
+    misfit: np.ndarray  # (n_channels,) sums of squares [SI unit squared]; NaN if it failed
     reason: str  # of the failure
     label: int = 0  # id of the `StoredLabel` under which it was stored
 
@@ -260,7 +260,10 @@ def select_rows(
 def insert_rows(
     connection: sqlite3.Connection, statement: str, rows: list[tuple], max_rows: int, max_response_bytes: int
 ) -> tuple[int, int]:
-    """Store values and evict the oldest rows beyond the limits, in one transaction; numbers evicted of both kinds."""
+    """Store the values of a statement and evict the oldest rows beyond the limits, in one transaction.
+
+    Returns the numbers of evicted simulations and responses.
+    """
     with transaction(connection):
         connection.executemany(statement, rows)
         table = "failures" if statement is STORE_FAILURE else "simulations"

@@ -1,9 +1,9 @@
 """Copies the readable rows of a damaged cache to the new cache.
 
-A damaged page in an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Therefore
-ranges of row numbers are read, and halved where they fail, until only rows on damaged pages are left out. Each row has
-a checksum, so nothing wrong is copied. Simulations and responses are copied, and labels if they can be read (rows of an
-unknown label are verified). Remarks and the table of failures are not copied: simulations yield them again.
+A damaged page in an SQLite file makes every query fail that reads it. Therefore ranges of row numbers are read, and
+halved where they fail, until only rows on damaged pages are left out. Each row has a checksum, so nothing wrong is
+copied; rows of a label that cannot be read are verified. Remarks and the table of failures are not copied: simulations
+yield them again.
 """
 
 import contextlib

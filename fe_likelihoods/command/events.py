@@ -116,7 +116,7 @@ def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str,
 def predict_events(
     job: Job, events: tuple[Event, ...], problem: Problem, samples: np.ndarray, progress: bool
 ) -> dict[str, dict[str, Prediction] | SimulationFailed]:
-    """Predict histories and peaks at samples (n, ndim) under other base motions; with a cache, each is simulated once.
+    """Predict histories and peaks at samples (n, ndim) under other base motions; a cache serves both kinds.
 
     Peaks with a noise in shares of the response have the model error (``noise="model"`` of `propagate`), because noise
     that is independent from sample to sample makes them too large. Responses are stored in the likelihood's cache, so

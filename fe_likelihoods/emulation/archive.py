@@ -1,10 +1,9 @@
 """All runs of a record, with their residuals in a file, and bilinear forms of linear combinations of residuals.
 
-Slopes, principal components and predictions are linear combinations sum_i w_i r_i of histories r_i: residuals of runs,
-and derivatives of residuals where a model has these. They are kept as their weights w. For white noise, the statistics
-of a combination are sums over the products r_i . r_j of two histories per channel, which are computed once, when they
-are needed. With hundreds of channels, all histories have gigabytes, so histories and products are in temporary files,
-of which a part is in memory at a time.
+Slopes, principal components and predictions are linear combinations sum_i w_i r_i of histories r_i, residuals of runs
+or derivatives of residuals, and are kept as their weights w. For white noise, the statistics of a combination are sums
+over the products r_i . r_j per channel, which are computed once, when they are needed. With hundreds of channels, all
+histories have gigabytes, so histories and products are in temporary files, of which a part is in memory at a time.
 """
 
 import tempfile

@@ -3,12 +3,9 @@
 Each mode has a region with an emulator of its own. A point belongs to the region whose centre is nearest, in the
 whitened coordinates of the region; the density there is the prior times the likelihood of the emulated statistics, and
 zero beyond the reach of the emulator. A mixture of t distributions is fitted to this density by adaptive importance
-sampling in memory; a large sample of weighted points (the pool) from it gives the evidence of the emulated posterior,
-and draws after a few independence Metropolis steps.
-
-References
-----------
-Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x
+sampling in memory (Cornuet, Marin, Mira & Robert, 2012, Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x); a
+large sample of weighted points (the pool) from it gives the evidence of the emulated posterior, and draws after a few
+independence Metropolis steps.
 """
 
 from collections.abc import Callable, Sequence

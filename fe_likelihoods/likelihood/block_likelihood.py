@@ -66,8 +66,9 @@ def choose_blocks(
     """Divide the time of measurements into blocks of equal length; returns their starts and stops (n_blocks,) [s].
 
     `values` (n_channels, n_samples) are NaN where nothing is compared. The length is `seconds`, or five correlation
-    times n / n_eff (`fe_likelihoods.effective_samples`) of the residuals in the channel where these are longest, with
-    at most 100 blocks. Blocks without a sample are left out, and the first one has a sample of every channel.
+    times n / n_eff (`fe_likelihoods.effective_samples`) of the residuals at a fit, in the channel where these are
+    longest, with at most 100 blocks. Blocks without a sample are left out, and the first one has a sample of every
+    channel. ValueError if `seconds` is not a positive number.
     """
     times = np.stack([measurements.times(channel.name) for channel in measurements.channels])
     there = ~np.isnan(values)

@@ -1,10 +1,9 @@
 """The model of a simulator: whether it is still the same, and which stored simulations are its own.
 
-Results from two states of a model must not be mixed, neither in memory nor on disk, as when a value is set between two
-batches or a file is edited. So the model's label (`fe_likelihoods.simulation.label`) and fingerprint are compared
-before and after simulations, in about 1 % of the time. User code may change values itself, such as a counter or a table
-of earlier results. Therefore a difference alone is no error: the first and the latest simulation are repeated, and the
-model counts as unchanged if the results are the same.
+Results from two states of a model must not be mixed, as when a value is set between two batches or a file is edited. So
+label and fingerprint are compared before and after simulations, in about 1 % of the time. User code may change values
+itself, such as a counter. Therefore a difference alone is no error: the first and the latest simulation are repeated,
+and the model counts as unchanged if the results are the same.
 """
 
 import copy

@@ -44,11 +44,12 @@ class TooManyFailures(RuntimeError):
 class FailureLog:
     """Failed simulations of one likelihood: their number, their reasons, and the parameters of the first thousand.
 
-    `outcomes` counts simulations with a known outcome (run here, read from the disk, or recalled), `count` failures,
-    and `transient` failures whose cause is not the model, so that a later run simulates the point again. `records` has
-    ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of each of these two kinds, with
-    ``"seconds"`` where known and ``"transient": True``. `reasons` counts failures per reason; after the first 100
-    reasons by their text without numbers, and after 100 of these in two groups, the model's failures and others.
+    `max_share`, in [0, 1], is the largest share that `check` accepts. `outcomes` counts simulations with a known
+    outcome (run here, read from the disk, or recalled), `count` failures, and `transient` failures whose cause is not
+    the model, so that a later run simulates the point again. `records` has ``{"parameters": {name: value}, "reason":
+    str}`` of the first 1000 failures of each of these two kinds, with ``"seconds"`` where known and ``"transient":
+    True``. `reasons` counts failures per reason; after the first 100 reasons by their text without numbers, and after
+    100 of these in two groups, the model's failures and others.
     """
 
     def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:

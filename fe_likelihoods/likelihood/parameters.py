@@ -76,7 +76,10 @@ def _of_model(model: Model, name: str) -> Parameter:
 
 
 def channels_of_deviations(noise: Noise, default: Sequence[Channel]) -> dict[str, Channel]:
-    """Channel of each noise parameter that is a standard deviation in a channel's unit; by default a model channel."""
+    """Channel of each noise parameter that is a standard deviation in the unit of a channel, by name.
+
+    `default`: the channels of the model, for a noise that does not specify its own.
+    """
     sampled = sampled_noise(noise)
     if hasattr(sampled, "parameter_channels"):
         return sampled.parameter_channels

@@ -1,12 +1,11 @@
-r"""Model error in the response of a structure, without the sensor noise.
+r"""Model error in the response of a structure, without the sensor noise. See ``docs/theory/prediction.rst``.
 
 A noise whose standard deviation follows the response (`GaussianNoise` with ``level="measured"`` or ``"response"``) has
-two parts: the sensor noise, which is no motion of the structure, and the model error. Their variances add,
-:math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest of
-many independent errors adds to each peak, while model errors are motions of a structure and change as slowly as its
-response. A draw of the model error therefore has the Fourier amplitudes of the response, random phases, and the
-standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself (frequency bands) keeps it, and the
-white sensor noise is subtracted per frequency. See ``docs/theory/prediction.rst``.
+two parts, the sensor noise, which is no motion of the structure, and the model error: :math:`\sigma^2 = s^2 +
+\sigma_m^2`. The likelihood takes both as white, but the largest of many independent errors adds to each peak, while
+model errors change as slowly as the response. A draw of the model error therefore has the Fourier amplitudes of the
+response, random phases, and the standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself
+(frequency bands) keeps it, and the white sensor noise is subtracted per frequency.
 """
 
 from typing import Any, NamedTuple

@@ -42,35 +42,21 @@ _AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as wh
 
 @dataclass(frozen=True, eq=False)
 class ChannelQuantity:
-    """A number computed from the history of one channel, or of several.
+    """A number from the history of one channel, or of several; ``str(quantity)`` is, for example, "peak of deck".
 
-    Parameters
-    ----------
-    channel : str
-        Name of the channel.
-    function : callable
-        Function of the history (n_steps,) [SI] that returns a number [SI].
-    part : slice
-        Samples of the history that the function receives, such as the second half of a test. Default: all.
-    others : tuple of str or ndarray
-        Further arguments of the function: histories of other channels, by name, or arrays of the same number of
-        samples [SI], such as an imposed displacement. The part is taken of each.
-    timed : bool
-        Whether the last argument of the function is the time step [s].
-    describe : callable, optional
-        Function that returns a `Channel` with the number's name, dimension and display unit for the `Channel` of the
-        history, or raises ValueError for a channel that has no such number. Default: the channel itself.
-    name : str
-        What the number is, such as "peak"; ``str(quantity)`` is "peak of deck".
+    `others` are further arguments of the function: histories of other channels, by name, or arrays of the same number
+    of samples [SI], such as an imposed displacement; the part is taken of each. `describe` returns a `Channel` with the
+    number's name, dimension and display unit for the `Channel` of the history, or raises ValueError for a channel that
+    has no such number; by default it is the channel itself.
     """
 
     channel: str
-    function: Callable[..., float]
-    part: slice = field(default_factory=lambda: slice(None))
+    function: Callable[..., float]  # of the history (n_steps,) [SI], returns a number [SI]
+    part: slice = field(default_factory=lambda: slice(None))  # samples of the history that the function receives
     others: tuple[str | np.ndarray, ...] = ()
-    timed: bool = False
+    timed: bool = False  # whether the last argument is the time step [s]
     describe: Callable[[Channel], Channel] | None = None
-    name: str = "quantity"
+    name: str = "quantity"  # what the number is, such as "peak"
 
     def __str__(self) -> str:
         return f"{self.name} of {self.channel}"

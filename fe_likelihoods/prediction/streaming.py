@@ -1,16 +1,9 @@
-"""Mean, variance and quantiles of results that arrive in batches.
+"""Mean, variance and quantiles of results that arrive in batches. See ``docs/theory/prediction.rst``.
 
-Mean and variance need one pass. They are computed per batch and combined by the update of Chan, Golub & LeVeque (1983),
-which avoids the cancellation in "mean square minus squared mean". Quantiles need the results themselves, of which as
-many are retained as fit into a limit of memory. A result may stand for several samples, because resampling makes
-copies, so that every result has a count.
-
-See ``docs/theory/prediction.rst``.
-
-References
-----------
-T. F. Chan, G. H. Golub, R. J. LeVeque (1983), Algorithms for computing the sample variance: analysis and
-recommendations, The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115.
+Mean and variance need one pass. They are combined over batches by the update of T. F. Chan, G. H. Golub and R. J.
+LeVeque (1983), The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115, which avoids the
+cancellation in "mean square minus squared mean". Quantiles need the results themselves, of which as many are retained
+as fit into a limit of memory. Every result has a count, because resampling makes copies of samples.
 """
 
 from collections.abc import Sequence

@@ -94,7 +94,7 @@ class Pickled(NamedTuple):
     """A function as it is sent to workers."""
 
     payload: bytes  # digest of the library, name of the sending process, and the pickled function
-    key: bytes  # digest of the payload, also of the function's values
+    key: bytes  # digest of the payload; differs after a change of the function's values
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":

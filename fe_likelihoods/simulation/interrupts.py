@@ -18,7 +18,10 @@ _EXIT = (
 
 
 def raise_if_it_ends_the_run(error: BaseException, before: BaseException | None = None) -> None:
-    """Raise what must not become a failed simulation: `UnusableModel`, and all that `samplers.interrupts` raises."""
+    """Raise exceptions that must not become a failed simulation: `UnusableModel`, KeyboardInterrupt and SystemExit.
+
+    Arguments and causes as for `samplers.interrupts.raise_if_it_ends_the_run`.
+    """
     if isinstance(error, UnusableModel):
         raise error
     try:

@@ -179,7 +179,7 @@ def cpu_name() -> str:
 
 
 def value_digest(value: Any) -> str:
-    """Digest of a value, function or class, with all that its code names; ValueError for such as an open file."""
+    """Digest of a value, function or class with all that its code names; ValueError for an open file in it."""
     walk = _Walk()
     items = walk.items({"value": value})
     if walk.opaque:

@@ -1,13 +1,10 @@
 """Protocol of a structural model, and functions that run a batch of its simulations.
 
-A model is any object with named parameters, named channels and a method `simulate` that computes the response for one
-parameter set. It raises `SimulationFailed` if a simulation is impossible. No base class is needed.
-
-Samplers request many parameter sets at once. `simulate_batch` and `misfit_batch` use the model's own batch methods if
-it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one by
-one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
-becomes a reason in words and a row of NaN, and does not affect other rows. Ctrl-C and ``sys.exit`` are no failures
-(`fe_likelihoods.simulation.interrupts`).
+A model is any object with named parameters, named channels and a method `simulate` for one parameter set, which raises
+`SimulationFailed` if a simulation is impossible. `simulate_batch` and `misfit_batch` use the model's own batch methods
+if it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one
+by one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
+becomes a reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
 """
 
 import logging
@@ -90,7 +87,7 @@ class SimulationBatch(NamedTuple):
 class MisfitBatch(NamedTuple):
     """Misfits for several parameter sets."""
 
-    misfit: np.ndarray  # sums of squares (n, n_channels) [SI², by channel], or another statistic; NaN if failed
+    misfit: np.ndarray  # sums of squares (n, n_channels) [SI unit squared], or another statistic; NaN if failed
     reasons: list[str]  # of n failures; empty for successes
 
 

@@ -1,11 +1,10 @@
 """Files that simulations running at once may both write: simulations that write such files run one after the other.
 
-An audit hook (`sys.addaudithook`) sees what Python code is about to write. A file outside of the simulation's own
-folder, which the simulation has not made exclusively, may belong to other simulations too. Before such a write, the
-simulation waits for a lock, which all simulations of this user share on this machine, and holds it to its end.
-
-Compiled code and programs write without an event. A file that they have written by an absolute path is noticed when
-Python code reads it: it has changed since the simulation began. If that happens twice, the model is refused.
+An audit hook (`sys.addaudithook`) sees what Python code is about to write. Before it writes a file outside of its own
+folder, which it has not made exclusively, a simulation waits for a lock, which all simulations of this user share on
+this machine, and holds it to its end. Compiled code and programs write without an event: a file that they have written
+by an absolute path is noticed when Python code reads it, since it has changed since the simulation began. If that
+happens twice, the model is refused.
 """
 
 import contextlib

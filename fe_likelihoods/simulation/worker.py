@@ -1,12 +1,9 @@
 """A local process that calls a function for one item at a time, and may hang, crash or use too much memory.
 
-The process is a Python interpreter that receives the function by value (`fe_likelihoods.simulation.by_value`), so it
-does not import the user's script. It leads a new session, which is killed with it. On Linux it is also killed when the
-process that started it ends, for whatever reason (``PR_SET_PDEATHSIG``); on macOS it ends within a second, unless
-compiled code keeps the interpreter busy.
-
-It is started with `subprocess`, because pool processes, in which it must also work, often may not start processes with
-`multiprocessing`.
+The function is received by value, so that the user's script is not imported. The process leads a new session, which is
+killed with it. On Linux it is also killed when the process that started it ends, for whatever reason
+(``PR_SET_PDEATHSIG``); on macOS it ends within a second, unless compiled code keeps the interpreter busy. It is started
+with `subprocess`, because pool processes, in which it must also work, often may not use `multiprocessing`.
 """
 
 import ctypes
