@@ -45,28 +45,14 @@ ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the
 
 
 class VerifyingRun(NamedTuple):
-    """What a simulation for verification needs.
-
-    Attributes
-    ----------
-    model, pool : Model, executor or None
-        The model, and where the simulations of the likelihood run.
-    measured : (n_channels, n_steps) float, or Comparison
-        Measured response [SI].
-    statistic : Statistic or None
-        Residual statistic that is stored; None for the sums of squares.
-    n_numbers : int
-        Length of the statistic.
-    tolerance : float or None
-        As for `SimulationCache`.
-    """
+    """What a simulation for verification needs."""
 
     model: Model
-    pool: Any
-    measured: np.ndarray | Comparison
-    statistic: Statistic | None
-    n_numbers: int
-    tolerance: float | None = None
+    pool: Any  # where the simulations of the likelihood run
+    measured: np.ndarray | Comparison  # response (n_channels, n_steps) [SI]
+    statistic: Statistic | None  # that is stored; None: sums of squares
+    n_numbers: int  # length of the statistic
+    tolerance: float | None = None  # as for `SimulationCache`
 
     @property
     def n_steps(self) -> int:
@@ -75,21 +61,11 @@ class VerifyingRun(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """A simulation that was run again.
+    """A simulation that was run again."""
 
-    Attributes
-    ----------
-    misfit : (n_numbers,) float
-        Statistics; NaN if the simulation failed.
-    reason : str
-        Reason of the failure; empty if the simulation succeeded.
-    norm : (n_channels,) float
-        Response norm per channel [SI].
-    """
-
-    misfit: np.ndarray
-    reason: str
-    norm: np.ndarray
+    misfit: np.ndarray  # statistics (n_numbers,); NaN if it failed
+    reason: str  # of the failure
+    norm: np.ndarray  # (n_channels,) of the response [SI]
 
 
 # new simulations ------------------------------------------------------------------------------------------------------
@@ -126,15 +102,10 @@ def simulate_again(
 
 
 class Repetition:
-    """Runs stored simulations again, for one likelihood.
+    """Runs stored simulations again, for one likelihood; `found` are new ones in the present search or verification.
 
-    Attributes
-    ----------
-    compared, unverified, seconds
-        Numbers of rows that were compared with a new simulation, and that could not be, because it was stopped (not by
-        the model); wall time [s].
-    found : dict
-        New simulations in the present search or verification.
+    Counted are rows that were `compared`, `unverified` ones whose new simulation was stopped (not by the model), and
+    the wall time, `seconds`.
     """
 
     def __init__(self, file: CacheFile, trust: Trust) -> None:
@@ -187,9 +158,9 @@ def is_transient(reason: str) -> bool:
 def response_tolerance(model: Model) -> float:
     """Accepted relative difference between two responses of a model with the same parameters.
 
-    It is the model's attribute ``response_tolerance``: zero for the compiled models of this library, whose responses
-    are the same to the last bit on the same processor. For models without the attribute, and for user subclasses that
-    do not define it, it is 1e-9, because sums over several threads may differ in their last digits.
+    It is the model's attribute ``response_tolerance``: zero for the compiled models of this library, which repeat to
+    the last bit on the same processor. Without the attribute, and for user subclasses that do not define it, it is
+    1e-9, because sums over several threads may differ in their last digits.
     """
     cls = type(model)
     if is_of_user(cls.__module__) and "response_tolerance" not in getattr(model, "__dict__", {}):
@@ -207,31 +178,14 @@ def difference_of(stored: np.ndarray, new: Simulated, run: VerifyingRun, toleran
 def largest_difference(
     stored: np.ndarray, new: np.ndarray, norm: np.ndarray, tolerance: float, of_response: bool = False
 ) -> tuple[int, float] | None:
-    """The statistic that differs most between two simulations with the same parameters, if one differs too much.
+    """Index of the statistic that differs most between two simulations, and the relative response change behind it.
 
-    Parameters
-    ----------
-    stored, new : (n_numbers,) float
-        Residual statistics, the sums of squares (n_channels,) first; further numbers have the channel order and the
-        scale of the sums.
-    norm : (n_channels,) float
-        Norm of the new response per channel [SI].
-    tolerance : float
-        Accepted change of a channel's response, relative to its norm; zero for equal bits.
-    of_response : bool
-        Whether the further numbers contain sums of squared responses.
-
-    Returns
-    -------
-    int, float
-        Index of the number, and the response change that explains its difference, relative to the response norm; None
-        if all numbers agree.
-
-    Notes
-    -----
-    If a response with norm r changes by t r, the sum of squared residuals s^2 changes by at most 2 s t r + (t r)^2, and
-    so does a sum over products of two residuals of the channel. A sum of squared responses changes by at most
-    2 r t r + (t r)^2. Rounding errors in the sums do not count as response changes.
+    None if all agree within the `tolerance` of a response, relative to its norm (n_channels,) [SI]; zero is for equal
+    bits. Sums of squares (n_channels,) come first; further numbers have the channel order and the scale of the sums,
+    and contain sums of squared responses if `of_response`. If a response with norm r changes by t r, the sum of squared
+    residuals s^2 changes by at most 2 s t r + (t r)^2, and so does a sum over products of two residuals of the channel;
+    a sum of squared responses by at most 2 r t r + (t r)^2. Rounding errors in the sums do not count as response
+    changes.
     """
     if np.array_equal(stored, new):
         return None

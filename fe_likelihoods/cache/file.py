@@ -1,11 +1,9 @@
 """SQLite file of the simulation cache: how it is created, recognised, shared, and moved aside when damaged.
 
-The file is in write-ahead-log (WAL) mode: readers never wait, writers take turns, and a transaction whose process is
-killed has no effect. SQLite's application id identifies the file as a cache, the user version is the layout version. A
-file with another id or version is never written to. Every process has its own connection, opened when it is first
-needed and closed before the process forks, since SQLite connections must not be used after a fork.
-
-A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value with which the run continues.
+In write-ahead-log (WAL) mode readers never wait, writers take turns, and a transaction whose process is killed has no
+effect. SQLite's application id identifies a cache, the user version its layout; a file with others is never written to.
+Every process has its own connection, closed before the process forks, since SQLite connections must not be used after
+it. A cache never makes a run fail: `CacheFile.attempt` logs file errors, and returns a value to continue with.
 """
 
 import contextlib
@@ -139,20 +137,10 @@ def _reading_the_layout() -> Iterator[None]:
 
 
 class CacheFile:
-    """A file and this process's connection to it. Hold `lock` while using the connection.
+    """A file (absolute `path` without links) and this process's connection to it. Hold `lock` while using it.
 
-    `timeout` [s] is how long to wait for another writer.
-
-    Attributes
-    ----------
-    path : Path
-        Absolute path without symbolic links.
-    lock : threading.RLock
-        Lock between threads of this process.
-    writable : bool
-        False for a read-only file.
-    retry_times : dict of str to float
-        Actions that failed, with the monotonic time [s] before which they are not tried again.
+    `timeout` [s] is how long to wait for another writer. `retry_times` has the actions that failed, with the monotonic
+    time [s] before which they are not tried again.
     """
 
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
@@ -236,8 +224,7 @@ class CacheFile:
     def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
         """Result of an action on the connection; `otherwise`, with a warning, if the action fails.
 
-        After a failure, all actions with the same name `what` pause for a while. The name is a participle, such as
-        "read", which the warning contains.
+        All actions with the same name `what`, a participle such as "read" for the warning, then pause for a while.
         """
         with self.lock:
             if time.monotonic() < self.retry_times.get(what, -math.inf):

@@ -80,22 +80,11 @@ class Trust:
     """Label and generation of a model in a file, and which rows are trusted in this process.
 
     Likelihoods with the same file, model and pool share it (`shared_trust`), as do derived likelihoods and copies. In
-    other processes, where `token` identifies it, it starts without trusted rows.
-
-    Attributes
-    ----------
-    label, is_local
-        Label of the model, completed by simulations; whether these run on this machine, whose processor is known.
-    stored : StoredLabel or None
-        The label in the file; None until it is known.
-    generations : dict of str to int
-        Generation in use for the rows of a fingerprint.
-    served : Counter
-        Rows used since the last full verification, per table and fingerprint.
-    own : set of bytes
-        Keys of rows that this process has stored, which need no verification.
-    stale : tuple or None
-        Fingerprint of a row that differed, and the error.
+    other processes, where `token` identifies it, it starts without trusted rows. `is_local`: simulations run on this
+    machine, whose processor is known. `stored` is the label in the file, None until it is known; `generations` are in
+    use for the rows of a fingerprint; `served` counts rows used since the last full verification, per table and
+    fingerprint; `own` are keys of rows that this process has stored, which need no verification; `stale` is the
+    fingerprint of a row that differed, and the error.
     """
 
     def __init__(self, label: ModelLabel, is_local: bool, token: str) -> None:
@@ -126,10 +115,7 @@ class Trust:
         return cpu_name() if self.is_local else ""
 
     def find(self, file: CacheFile, model: Model) -> StoredLabel | None:
-        """The label in the file; None if it is unknown there.
-
-        It includes the present contents of files that earlier simulations have opened.
-        """
+        """The label in the file, with present contents of files that simulations opened; None if unknown there."""
         source = source_number(model.fingerprint)
         if self.stored is not None and source != self.stored.source:  # another length of the record, for example
             if source not in self._of_others:

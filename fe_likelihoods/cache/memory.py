@@ -41,20 +41,10 @@ def _as_limit(name: str, what: str, value: Any) -> int:
 
 
 class MemoryCache:
-    """Least-recently-used cache of statistics, with the bytes of the structural parameters as keys.
+    """Least-recently-used cache of statistics of at most `rows` simulations, by the bytes of the structural parameters.
 
     Failures are cached as NaN. Threads may share the cache. It is empty after unpickling, because its contents would
-    dominate the size of the pickle.
-
-    Parameters
-    ----------
-    rows : int
-        Largest number of simulations; 0 for none.
-
-    Raises
-    ------
-    ValueError
-        If `rows` is not a whole number or is negative.
+    dominate the size of the pickle. ValueError if `rows` is not a whole number or is negative.
     """
 
     def __init__(self, rows: int) -> None:
@@ -69,15 +59,7 @@ class MemoryCache:
         return len(self._misfits)
 
     def look_up(self, keys: Sequence[bytes], width: int) -> tuple[np.ndarray, list[bool]]:
-        """Cached statistics of n distinct keys.
-
-        Returns
-        -------
-        misfit : (n, width) float
-            NaN where the simulation failed or is not cached.
-        known : list of n bool
-            Whether it is cached.
-        """
+        """Cached statistics (n, width) of n distinct keys, NaN if failed or not cached, and whether each is cached."""
         found = []
         with self._lock:
             for key in keys:
@@ -110,25 +92,11 @@ class MemoryCache:
 
 
 class ResponseMemory:
-    """The most recently stored responses in double precision, and reasons of failures.
+    """The most recently stored responses in double precision, and reasons of failures, in at most `max_bytes` [bytes].
 
     Likelihoods with the same model or shortened versions of it share one. Threads may share it. It is empty after
-    unpickling, like a `MemoryCache`.
-
-    Parameters
-    ----------
-    max_bytes : int
-        Largest size [bytes]; 0 for no responses. The oldest are dropped; the first time, a message at level INFO.
-
-    Attributes
-    ----------
-    dropped : int
-        Number of simulations dropped.
-
-    Raises
-    ------
-    ValueError
-        If `max_bytes` is not a whole number or is negative.
+    unpickling, like a `MemoryCache`. The oldest are dropped (`dropped` counts them); the first time, a message at level
+    INFO. ValueError if `max_bytes` is not a whole number or is negative.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -145,10 +113,9 @@ class ResponseMemory:
         return len(self._outcomes)
 
     def look_up(self, fingerprint: str, keys: Sequence[bytes]) -> list[np.ndarray | str | None]:
-        """Stored outcomes for a model's fingerprint and keys from `distinct_keys`.
+        """Stored outcomes for a model's fingerprint and keys from `distinct_keys`; None where nothing is stored.
 
-        An outcome is the response (n_channels, n_steps) [SI], not to be changed; the reason (str) if the simulation
-        failed; None if nothing is stored.
+        An outcome is the response (n_channels, n_steps) [SI], not to be changed, or the reason of a failure.
         """
         with self._lock:
             return [self._outcomes.get((fingerprint, key)) for key in keys]

@@ -71,68 +71,32 @@ MIN_STOPS = 2  # stops at a time limit before the simulation counts as too slow;
 
 
 class CachedRows(NamedTuple):
-    """Stored rows for n simulations.
+    """Stored rows for n simulations."""
 
-    Attributes
-    ----------
-    misfit : (n, n_channels) float
-        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed or is not stored.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded or is not stored.
-    known : (n,) bool
-        Whether the simulation is stored.
-    """
-
-    misfit: np.ndarray
-    reasons: list[str]
-    known: np.ndarray
+    misfit: np.ndarray  # (n, n_channels) sums of squares [SI unit squared]; NaN where failed or not stored
+    reasons: list[str]  # of n failures; empty otherwise
+    known: np.ndarray  # (n,) whether the simulation is stored
 
 
 class StoredSimulation(NamedTuple):
-    """One stored simulation.
+    """One stored simulation."""
 
-    Attributes
-    ----------
-    theta : (n_structural,) float
-        Structural parameters.
-    misfit : (n_channels,) float
-        Sums of squared residuals [SI unit of the channel, squared]; NaN where the simulation failed.
-    reason : str
-        Reason of the failure; empty where the simulation succeeded.
-    label : int
-        Id of the `StoredLabel` under which it was stored.
-    """
-
-    theta: np.ndarray
-    misfit: np.ndarray
-    reason: str
-    label: int = 0
+    theta: np.ndarray  # structural parameters (n_structural,)
+    misfit: np.ndarray  # (n_channels,) sums of squares [SI unit squared]; NaN if it failed
+    reason: str  # of the failure
+    label: int = 0  # id of the `StoredLabel` under which it was stored
 
 
 class StoredLabel(NamedTuple):
-    """A label under which simulations of a model were stored or adopted.
+    """A label under which simulations of a model were stored or adopted."""
 
-    Attributes
-    ----------
-    id, source : int
-        Number by which rows refer to the label; source number of the model.
-    label, cpu : str
-        See `fe_likelihoods.simulation.label.ModelLabel`; name of the processor.
-    generation : int
-        Generation that the label belongs to.
-    compared : int
-        Number of rows that were compared before the rows of other labels were adopted.
-    files : tuple of str
-        Paths of the files that simulations opened.
-    """
-
-    id: int
-    source: int
-    label: str
-    cpu: str
+    id: int  # by which rows refer to the label
+    source: int  # number of the model
+    label: str  # see `fe_likelihoods.simulation.label.ModelLabel`
+    cpu: str  # name of the processor
     generation: int
-    compared: int
-    files: tuple[str, ...] = ()
+    compared: int  # rows that were compared before the rows of other labels were adopted
+    files: tuple[str, ...] = ()  # that simulations opened
 
 
 # keys and checksums ---------------------------------------------------------------------------------------------------
@@ -296,8 +260,7 @@ def select_rows(
 def insert_rows(
     connection: sqlite3.Connection, statement: str, rows: list[tuple], max_rows: int, max_response_bytes: int
 ) -> tuple[int, int]:
-    """Store the values of a statement and evict the oldest rows beyond the limits of a `SimulationCache`, in one
-    transaction.
+    """Store the values of a statement and evict the oldest rows beyond the limits, in one transaction.
 
     Returns the numbers of evicted simulations and responses.
     """

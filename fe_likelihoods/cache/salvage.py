@@ -1,9 +1,9 @@
 """Copies the readable rows of a damaged cache to the new cache.
 
-A damaged page in an SQLite file makes every query fail that reads it, so one bad page would lose all rows. Therefore
-ranges of row numbers are read, and halved where they fail, until only rows on damaged pages are left out. Each row has
-a checksum, so nothing wrong is copied. Simulations and responses are copied, and labels if they can be read (rows of an
-unknown label are verified). Remarks and the table of failures are not copied: simulations yield them again.
+A damaged page in an SQLite file makes every query fail that reads it. Therefore ranges of row numbers are read, and
+halved where they fail, until only rows on damaged pages are left out. Each row has a checksum, so nothing wrong is
+copied; rows of a label that cannot be read are verified. Remarks and the table of failures are not copied: simulations
+yield them again.
 """
 
 import contextlib
@@ -43,15 +43,7 @@ class Salvaged(NamedTuple):
 
 
 def salvage(damaged: Path, connection: sqlite3.Connection) -> Salvaged:
-    """Copy the readable simulations and responses of a damaged cache, which is not changed.
-
-    Parameters
-    ----------
-    damaged : Path
-        The damaged file, with its log.
-    connection : sqlite3.Connection
-        Connection to the new cache.
-    """
+    """Copy the readable simulations and responses of a damaged cache, which stays as it is, to a new one."""
     with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError), _opened(damaged) as source:
         rows = source.execute(f"SELECT {LABEL_COLUMNS} FROM labels").fetchall()
         connection.executemany(STORE_LABEL, [row for row in rows if is_undamaged_label(*row)])

@@ -69,29 +69,15 @@ _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this pr
 
 
 class CacheInfo(NamedTuple):
-    """State of a cache.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    simulations, failures, responses : int
-        Numbers of stored simulations, failed simulations among them, and stored responses.
-    response_bytes, file_bytes : int
-        Sizes of the responses, and of the file without its write-ahead log [bytes].
-    seconds : float
-        Wall time of the stored simulations [s].
-    hits, misses, evictions, damaged, verified : int
-        As for `SimulationCache`.
-    """
+    """State of a cache; the last five numbers as for `SimulationCache`."""
 
     path: Path
     simulations: int
-    failures: int
+    failures: int  # among the stored simulations
     responses: int
-    response_bytes: int
-    seconds: float
-    file_bytes: int
+    response_bytes: int  # of the stored responses [bytes]
+    seconds: float  # wall time of the stored simulations [s]
+    file_bytes: int  # without its write-ahead log [bytes]
     hits: int
     misses: int
     evictions: int

@@ -41,10 +41,7 @@ class StoredResponses:
         self._size = self._least
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses of distinct parameter sets (n, n_parameters), stored or new, and the reasons of failures.
-
-        `StaleCache` if a stored and a new simulation differ.
-        """
+        """Responses of distinct thetas (n, n_parameters), with reasons; `StaleCache` if a repeated one differs."""
         responses = np.full((len(thetas), len(self.model.channels), self.model.n_steps), np.nan)
         left = []
         for row, response in enumerate(self._verified.look_up_responses(thetas, self._run)):

@@ -174,10 +174,7 @@ class VerifiedCache:
     # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
-        """Rows from `SimulationCache.look_up`, some of them verified.
-
-        `StaleCache` if a stored row and a new simulation differ, although the label of the model is known.
-        """
+        """Rows of `SimulationCache.look_up`, some verified; `StaleCache` if one differs although the label is known."""
         self._notice_other_model(run)
         while True:
             generation = self._adoption.generation(fingerprint, run)

@@ -25,23 +25,9 @@ FEWEST_DRAWS, MOST_DRAWS = 5, 40
 
 
 def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: bool = False) -> None:
-    """Check a TOML file and its data, and say what a run will do.
+    """Check a TOML file and its data, `say` line by line what a run will do, and draw the prior predictive picture.
 
-    Parameters
-    ----------
-    file : Path
-        The TOML file.
-    picture : Path
-        PNG file of the prior predictive picture.
-    say : callable
-        Called with every line.
-    progress : bool
-        Whether to show progress bars.
-
-    Raises
-    ------
-    ValueError
-        If anything in the file is wrong, or the simulation at the mean of the prior fails.
+    ValueError if anything in the file is wrong, or the simulation at the mean of the prior fails.
     """
     if not picture.resolve().parent.is_dir():
         raise ValueError(f"cannot write {picture}: there is no folder {picture.parent}; give another file with --out")

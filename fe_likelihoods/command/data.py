@@ -79,10 +79,7 @@ def _one_source(job: Job, section: str) -> None:
 def read_base_motion(job: Job) -> Record | None:
     """The excitation, scaled but neither shortened nor resampled, or None without a section ``[record]``.
 
-    Raises
-    ------
-    ValueError
-        If the file does not exist or cannot be read; the message names the key.
+    ValueError, which names the key, if the file does not exist or cannot be read.
     """
     given = job.record
     if not given:
@@ -121,10 +118,7 @@ def _read_record(job: Job, path: Path) -> Record:
 def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:
     """The measurements of a model's channels, without samples before and after the record.
 
-    Raises
-    ------
-    ValueError
-        If the file does not exist, cannot be read or lacks a column; the message names the key.
+    ValueError, which names the key, if the file does not exist, cannot be read or lacks a column.
     """
     given = job.measurements
     if not given:
@@ -206,21 +200,9 @@ FEWEST_SAMPLES = 10  # of a channel, where others lie outside the record
 def within(measurements: Measurements, record: Record) -> Measurements:
     """The samples between the first and the last one of a record, with NaN where the measurements are shorter.
 
-    Parameters
-    ----------
-    measurements : Measurements
-    record : Record
-
-    Returns
-    -------
-    Measurements
-        Its description says how many samples were left out, with a caution where these are more than half of them, and
-        how much is missing at the end.
-
-    Raises
-    ------
-    ValueError
-        If a channel has no sample within the record, or fewer than `FEWEST_SAMPLES` while others were left out.
+    The description says how many samples were left out, with a caution where these are more than half of them, and how
+    much is missing at the end. ValueError if a channel has no sample within the record, or fewer than `FEWEST_SAMPLES`
+    while others were left out.
     """
     end, rows, starts, notes = record.time[-1], [], [], []
     for channel, values, step in zip(measurements.channels, measurements.values, measurements.steps, strict=True):

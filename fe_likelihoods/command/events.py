@@ -38,23 +38,12 @@ _ENDS = (0.05, 0.5, 0.95)  # quantiles that tables and scores need
 
 
 class Event(NamedTuple):
-    """An event to predict.
-
-    Attributes
-    ----------
-    name : str
-    record : Record
-        The base motion as it is used.
-    measured : Measurements or None
-        The measured response, if it is to be compared.
-    options : dict
-        State at the beginning and pause before it, for `fe_likelihoods.propagate`.
-    """
+    """An event to predict."""
 
     name: str
-    record: Record
-    measured: Measurements | None
-    options: dict[str, Any]
+    record: Record  # base motion as it is used
+    measured: Measurements | None  # response, if it is to be compared
+    options: dict[str, Any]  # state at the beginning and pause before it, for `propagate`
 
 
 def prediction_options(job: Job) -> dict[str, Any]:
@@ -69,11 +58,8 @@ def prediction_options(job: Job) -> dict[str, Any]:
 def read_events(job: Job, problem: Problem) -> tuple[Event, ...]:
     """Read the records and measurements of all events.
 
-    Raises
-    ------
-    ValueError
-        If a file, a key or a value is wrong, or the model cannot have another base motion; the message names section
-        and key.
+    ValueError, which names section and key, if a file, a key or a value is wrong, or the model cannot have another
+    motion.
     """
     return tuple(_read_event(job, problem, name) for name in job.events)
 
@@ -109,11 +95,7 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
 
 
 def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
-    """The result of `propagate`, without the warnings that the result keeps as remarks.
-
-    The command says and writes the remarks. All other warnings, such as
-    warnings by a user's model, are given after the prediction.
-    """
+    """The result of `propagate`; its warnings are remarks of the result, and other warnings are given afterwards."""
     from ..prediction.propagation import propagate
 
     kept: set[str] = set()
@@ -134,27 +116,12 @@ def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str,
 def predict_events(
     job: Job, events: tuple[Event, ...], problem: Problem, samples: np.ndarray, progress: bool
 ) -> dict[str, dict[str, Prediction] | SimulationFailed]:
-    """Predict histories and peaks under other base motions, one simulation per sample and event if there is a cache.
+    """Predict histories and peaks at samples (n, ndim) under other base motions; a cache serves both kinds.
 
     Peaks with a noise in shares of the response have the model error (``noise="model"`` of `propagate`), because noise
-    that is independent from sample to sample makes them too large.
-
-    Responses are stored in the likelihood's cache, so that an interrupted prediction continues there.
-
-    Parameters
-    ----------
-    job : Job
-    events : tuple of Event
-    problem : Problem
-    samples : (n, ndim) ndarray
-        Samples of the posterior.
-    progress : bool
-        Whether to show progress bars.
-
-    Returns
-    -------
-    dict of str to dict of str to Prediction, or to SimulationFailed
-        "histories" and "peaks" of each event by its name, or the error that says that all its simulations have failed.
+    that is independent from sample to sample makes them too large. Responses are stored in the likelihood's cache, so
+    that an interrupted prediction continues there. Returns "histories" and "peaks" of each event by its name, or the
+    error that says that all its simulations have failed.
     """
     found = {}
     for event in events if len(samples) else ():
@@ -211,13 +178,9 @@ def describe_events(
 
 
 def write_events(folder: Path, events: tuple[Event, ...], described: tuple[OtherEvent, ...]) -> tuple[str, ...]:
-    """Write tables and pictures of predicted events, which `describe_events` has described.
+    """Write ``event-NAME.txt``, ``.csv`` and ``.png`` of each event that has a prediction; returns their names.
 
-    Returns
-    -------
-    tuple of str
-        Names of the files: ``event-NAME.txt``, ``event-NAME.csv`` and ``event-NAME.png`` of each event that has a
-        prediction.
+    The events were described by `describe_events`.
     """
     files: list[str] = []
     by_name = {event.name: event for event in events}

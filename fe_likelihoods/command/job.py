@@ -14,45 +14,23 @@ __all__ = ["Job", "parse_job", "read_job"]
 
 @dataclass(frozen=True)
 class Job:
-    """Contents of a TOML file. Values are in SI units; files are relative to `folder`.
-
-    Attributes
-    ----------
-    file : Path
-        The TOML file.
-    text : str
-        Its text.
-    folder : Path
-        Folder that files in it are relative to.
-    kind : str
-        Kind of the model, one of `fe_likelihoods.command.schema.MODEL_KINDS`.
-    model, record, measurements, noise, sampler, budget, prediction : dict
-        Keys of the sections.
-    priors : dict of str to str
-        Distributions as text, by parameter.
-    events : dict of str to dict
-        Keys of the events to predict, by name.
-    event : str
-        The event to which record and measurements belong; empty for the calibration.
-    runs_code : bool
-        Whether Python files and programs that the file names may be imported and run.
-    """
+    """Contents of a TOML file, section by section. Values are in SI units; files are relative to `folder`."""
 
     file: Path
-    text: str
+    text: str  # of the file
     folder: Path
-    kind: str
+    kind: str  # of the model, one of `MODEL_KINDS`
     model: dict[str, Any]
     record: dict[str, Any]
     measurements: dict[str, Any]
-    priors: dict[str, str]
+    priors: dict[str, str]  # distributions as text, by parameter
     noise: dict[str, Any]
     sampler: dict[str, Any]
     budget: dict[str, Any]
     prediction: dict[str, Any]
-    events: dict[str, dict[str, Any]] = field(default_factory=dict)
-    event: str = ""
-    runs_code: bool = True
+    events: dict[str, dict[str, Any]] = field(default_factory=dict)  # keys of the events to predict, by name
+    event: str = ""  # to which record and measurements belong; empty for the calibration
+    runs_code: bool = True  # whether Python files and programs that the file names may run
 
     def where(self, section: str) -> str:
         """File and section, for messages."""
@@ -86,21 +64,7 @@ class Job:
 
 
 def read_job(file: str | Path) -> Job:
-    """Read a TOML file.
-
-    Parameters
-    ----------
-    file : path
-
-    Returns
-    -------
-    Job
-
-    Raises
-    ------
-    ValueError
-        If it cannot be read, or a section, a key or a value is wrong; the message names the key.
-    """
+    """Read a TOML file; ValueError, which names the key, if it is unreadable, or a section, key or value is wrong."""
     file = Path(file)
     try:
         text = file.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark

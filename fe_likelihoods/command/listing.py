@@ -35,21 +35,9 @@ class _Lines(NamedTuple):
 
 
 def describe_data(path: Path) -> str:
-    """Return what a file of data holds, and the lines of a TOML file that read it.
+    """What a file of data holds, and the lines of a TOML file that read it; ValueError if it cannot be read.
 
-    Parameters
-    ----------
-    path : Path
-        A table, a ground motion in a supported format, a zip archive of V2 files, or a data set (.h5).
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read.
+    It is a table, a ground motion in a supported format, a zip archive of V2 files, or a data set (.h5).
     """
     if path.suffix.lower() in (".h5", ".hdf5"):
         found = _dataset(path)

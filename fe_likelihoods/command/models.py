@@ -34,43 +34,16 @@ NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in ro
 
 
 class Problem(NamedTuple):
-    """What a TOML file describes.
-
-    Attributes
-    ----------
-    posterior : Posterior
-    record : Record or None
-        The excitation as it is used.
-    assumed : dict of str to Distribution
-        Priors of noise parameters that the file does not give.
-    truth : dict of str to float or None
-        Known true parameter values of bundled synthetic data.
-    """
+    """What a TOML file describes."""
 
     posterior: Posterior
-    record: Record | None
-    assumed: dict[str, Distribution]
-    truth: dict[str, float] | None = None
+    record: Record | None  # excitation as it is used
+    assumed: dict[str, Distribution]  # priors of noise parameters that the file does not give
+    truth: dict[str, float] | None = None  # parameter values of bundled synthetic data
 
 
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
-    """Read the data, make the model and the posterior.
-
-    Parameters
-    ----------
-    job : Job
-    cache : SimulationCache, optional
-        Cache of the simulations.
-
-    Returns
-    -------
-    Problem
-
-    Raises
-    ------
-    ValueError
-        If a file, a value or a combination of them is wrong; the message names section and key.
-    """
+    """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
     record = read_base_motion(job)
     sensors = _all_channels(job, record)
     measured = read_measured(job, sensors, record)
@@ -252,10 +225,7 @@ class NotRun(UserModel):
 def load_function(job: Job, text: str) -> Callable:
     """The function that ``"file.py:name"`` names, from a module that worker processes can import too.
 
-    Raises
-    ------
-    ValueError
-        If the file or the function does not exist, the file cannot be imported, or another module has its name.
+    ValueError if the file or the function does not exist, the file cannot be imported, or another module has its name.
     """
     where = f"{job.where('model')} function:"
     file, _, name = text.rpartition(":")

@@ -13,18 +13,7 @@ __all__ = ["make_noise"]
 
 
 def make_noise(job: Job, model: Model) -> Any:
-    """The noise of a file, for `FELikelihood`.
-
-    Parameters
-    ----------
-    job : Job
-    model : Model
-
-    Raises
-    ------
-    ValueError
-        If a value is wrong for the noise; the message names the key where one is to blame.
-    """
+    """The noise of a file, for `FELikelihood`; ValueError, which names the key to blame, if a value is wrong for it."""
     given = {name: value for name, value in job.noise.items() if name not in ("kind", "marginal")}
     kind = job.noise.get("kind", "gaussian")
     if kind not in ("gaussian", "autoregressive"):

@@ -19,23 +19,10 @@ _MAKE = {"normal": TruncatedNormal, "half-normal": HalfNormal, "uniform": Unifor
 
 
 def parse_prior(text: str, dimension: str | None = None) -> Distribution:
-    """Make a distribution from its text.
+    """Make a distribution from its text, such as ``half-normal(0.1 g)``; numbers without a unit are in SI units.
 
-    Parameters
-    ----------
-    text : str
-        Name and numbers, which may have units: ``half-normal(0.1 g)``. Numbers without a unit are in SI units.
-    dimension : str, optional
-        Dimension that units must have, a key of `fe_likelihoods.units.DIMENSIONS`.
-
-    Returns
-    -------
-    Distribution
-
-    Raises
-    ------
-    ValueError
-        For an unknown name, another number of arguments, or values that the distribution refuses.
+    Units must have the dimension, a key of `fe_likelihoods.units.DIMENSIONS`. ValueError for an unknown name, another
+    number of arguments, or values that the distribution refuses.
     """
     forms = "; ".join(form for form, _ in FORMS.values())
     match = re.fullmatch(r"\s*([A-Za-z-]+)\s*\(([^()]*)\)\s*", text) if isinstance(text, str) else None

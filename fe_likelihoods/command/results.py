@@ -21,18 +21,9 @@ __all__ = ["write_csv", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[str, ...]:
-    """Write the judgement, the moments of the parameters, the stages and the errors of the fit.
+    """Write judgement, moments of the parameters, stages and errors of the fit; returns the names of the files.
 
-    Parameters
-    ----------
-    folder : Path
-    run : FinishedRun
-    judgement : Judgement
-
-    Returns
-    -------
-    tuple of str
-        Names of the files; a run without tempering has no ``stages.txt``.
+    A run without tempering has no ``stages.txt``.
     """
     from samplers import ladder_table, summary
 

@@ -48,29 +48,14 @@ DRAWS = 100  # of predictions
 
 
 class Outcome(NamedTuple):
-    """What a run has left.
-
-    Attributes
-    ----------
-    folder : Path
-        Its folder.
-    sampler : object
-        The sampler.
-    problem : Problem
-    files : tuple of str
-        Names of the result files.
-    cautions : tuple of str
-        Doubts about the result and the predictions.
-    usable : bool
-        Whether the result can be used, if with care.
-    """
+    """What a run has left."""
 
     folder: Path
     sampler: Any
     problem: Problem
-    files: tuple[str, ...]
-    cautions: tuple[str, ...]
-    usable: bool
+    files: tuple[str, ...]  # names of the result files
+    cautions: tuple[str, ...]  # doubts about the result and the predictions
+    usable: bool  # whether the result can be used, if with care
 
 
 def default_folder(file: Path) -> Path:
@@ -88,30 +73,10 @@ def is_free(folder: Path) -> bool:
 def run_job(
     file: Path, folder: Path | None = None, resume: bool = False, overwrite: bool = False, progress: bool = True
 ) -> Outcome:
-    """Start or continue the run of a TOML file, and write its results.
+    """Start or continue the run of a TOML file in a folder (default: `default_folder`), and write its results.
 
-    Parameters
-    ----------
-    file : Path
-        The TOML file.
-    folder : Path, optional
-        Folder of the run. Default: `default_folder`.
-    resume : bool
-        Refuse to start a new run.
-    overwrite : bool
-        Delete the run that the folder contains.
-    progress : bool
-        Whether to show progress bars.
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    ValueError
-        If anything in the file is wrong, the folder contains the run of other settings, or a model of the user is not
-        repeatable.
+    With `resume` no new run is started; `overwrite` deletes the run that the folder contains. ValueError if anything in
+    the file is wrong, the folder contains the run of other settings, or a model of the user is not repeatable.
     """
     job = read_job(file)
     folder = folder or default_folder(file)
@@ -128,24 +93,11 @@ def run_job(
 
 
 def report_run(path: Path, runs_code: bool = False) -> Outcome:
-    """Make the tables and the report of a stored run again, without new samples.
+    """Make the tables and the report of a stored run, its folder or a file in it, again, without new samples.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of a run, or a file in it.
-    runs_code : bool
-        Whether a Python file or program that the settings name as the model may be run. Without it, a report of such a
-        run has no responses and no predictions, and is written to the folder `WITHOUT_MODEL` of the run.
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    ValueError
-        If it is not such a folder, its data are no longer there, or the run has no samples yet.
+    A user's model runs only if `runs_code`; otherwise the report of such a run has no responses and no predictions, and
+    is written to the folder `WITHOUT_MODEL` of the run. ValueError if it is not such a folder, its data are no longer
+    there, or the run has no samples yet.
     """
     folder = path if path.is_dir() else path.parent
     if not (folder / SETTINGS).is_file() or not (folder / CHAIN).is_file():

@@ -31,13 +31,7 @@ def discarded(job: Job) -> int:
 
 
 def make_sampler(job: Job, problem: Problem, backend: Any = None) -> Any:
-    """Make the sampler of a TOML file, with a backend or in memory.
-
-    Raises
-    ------
-    ValueError
-        If a setting is impossible; the message names the section.
-    """
+    """Make the sampler of a TOML file, in memory without a backend; ValueError for a setting names its section."""
     import samplers
 
     given = dict(job.sampler)

@@ -43,48 +43,25 @@ _ZERO = "time or clock time"
 class Key(NamedTuple):
     """One key of a section.
 
-    Attributes
-    ----------
-    name : str
-        The key.
-    kind : str
-        A name in `_KINDS`, a dimension of `fe_likelihoods.units.DIMENSIONS`, which stands for a text with number and
-        unit (``"1.22 m"``) or a number in SI units, or "time or clock time".
-    meaning : str
-        What it is, for the documentation.
-    required : bool
-        Whether it has no default.
+    Its kind is a name in `_KINDS`; a dimension of `fe_likelihoods.units.DIMENSIONS`, for a text with number and unit
+    (``"1.22 m"``) or a number in SI units; or "time or clock time".
     """
 
     name: str
     kind: str
-    meaning: str
-    required: bool = False
+    meaning: str  # for the documentation
+    required: bool = False  # whether it has no default
 
 
 def documented_keys(
     owner: Any, names: str = "", *, without: str = "", required: str = "", **kinds: str
 ) -> tuple[Key, ...]:
-    """Keys for the arguments of a class or function, from its docstring: names, kinds, units and meanings.
+    """Keys for the arguments of a class or function, from its numpydoc section "Parameters" or "Attributes".
 
-    Parameters
-    ----------
-    owner : class or callable
-        A class or function with a numpydoc section "Parameters" or "Attributes". A float with a unit in its
-        description, such as ``[m]``, is a quantity of this dimension.
-    names : str
-        Arguments that are keys, separated by blanks; by default all.
-    without : str
-        Arguments that are no keys.
-    required : str
-        Keys without a default.
-    **kinds : str
-        Kinds of arguments whose type does not say it.
-
-    Returns
-    -------
-    tuple of Key
-        The meaning is the first sentence of a description, and the sentence that begins with "Default".
+    A float with a unit in its description, such as ``[m]``, is a quantity of this dimension. `names` are the keys
+    (default: all), `without` are arguments that are no keys, `required` are keys without a default, all separated by
+    blanks; `kinds` has kinds that the types do not say. The meaning is the first sentence of a description, and the
+    sentence that begins with "Default".
     """
     text = inspect.getdoc(owner)
     if text is None:
@@ -346,19 +323,10 @@ def split_number(text: str) -> tuple[str, str]:
 
 
 def read_quantity(value: Any, dimension: str) -> float:
-    """A number in SI units, from such a number or a text with number and unit.
+    """A number in SI units, from such a number or a text with number and unit; `dimension` is a key of `DIMENSIONS`.
 
-    Parameters
-    ----------
-    value : int, float or str
-    dimension : str
-        A key of `fe_likelihoods.units.DIMENSIONS`.
-
-    Raises
-    ------
-    ValueError
-        If it is neither, the unit is unknown or of another dimension, or a stress without a unit is below
-        `SMALLEST_STRESS`.
+    ValueError if it is neither, the unit is unknown or of another dimension, or a stress without a unit is below
+    `SMALLEST_STRESS`.
     """
     if _is_number(value):
         if dimension == "stress" and 0.0 < abs(value) < SMALLEST_STRESS:
@@ -401,25 +369,9 @@ _EXAMPLES = {
 
 
 def read_keys(given: Mapping[str, Any], keys: Sequence[Key], where: str) -> dict[str, Any]:
-    """Check the keys of a section and convert its values.
+    """Check the keys of a section as TOML gives it and convert its values, quantities to SI units.
 
-    Parameters
-    ----------
-    given : mapping of str to object
-        The section as TOML gives it.
-    keys : sequence of Key
-    where : str
-        File and section, for messages.
-
-    Returns
-    -------
-    dict of str to object
-        The values, quantities in SI units.
-
-    Raises
-    ------
-    ValueError
-        For an unknown key, one that is missing, or a value of another kind.
+    ValueError, which names file and section (`where`), for an unknown or missing key, or a value of another kind.
     """
     known = {key.name: key for key in keys}
     for name in given:

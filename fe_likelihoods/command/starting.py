@@ -17,24 +17,9 @@ TEMPLATES = {
 
 
 def write_templates(kind: str, folder: Path) -> tuple[str, ...]:
-    """Copy the templates of a kind to a folder.
+    """Copy the templates of a kind, a key of `TEMPLATES`, to a folder, which is created; names of the files.
 
-    Parameters
-    ----------
-    kind : str
-        A key of `TEMPLATES`.
-    folder : Path
-        Created if it does not exist.
-
-    Returns
-    -------
-    tuple of str
-        Names of the files.
-
-    Raises
-    ------
-    ValueError
-        If one of the files exists.
+    ValueError if one of the files exists.
     """
     names = TEMPLATES[kind]
     if there := [name for name in names if (folder / name).exists()]:

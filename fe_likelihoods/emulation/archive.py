@@ -1,10 +1,9 @@
 """All runs of a record, with their residuals in a file, and bilinear forms of linear combinations of residuals.
 
-Slopes, principal components and predictions are linear combinations sum_i w_i r_i of histories r_i: residuals of runs,
-and derivatives of residuals where a model has these. They are kept as their weights w. For white noise, the statistics
-of a combination are sums over the products r_i . r_j of two histories per channel, which are computed once, when they
-are needed. With hundreds of channels, all histories have gigabytes, so histories and products are in temporary files,
-of which a part is in memory at a time.
+Slopes, principal components and predictions are linear combinations sum_i w_i r_i of histories r_i, residuals of runs
+or derivatives of residuals, and are kept as their weights w. For white noise, the statistics of a combination are sums
+over the products r_i . r_j per channel, which are computed once, when they are needed. With hundreds of channels, all
+histories have gigabytes, so histories and products are in temporary files, of which a part is in memory at a time.
 """
 
 import tempfile
@@ -57,23 +56,10 @@ def _restored(dtype: type, content: bytes) -> _Numbers:
 
 
 class Archive:
-    """All successful simulations of a record.
+    """All m successful simulations of a record: residuals (n_channels, n_steps), and a quadratic statistic of them.
 
-    Parameters
-    ----------
-    statistic : callable
-        Function of residuals (n_channels, n_steps) that returns (n_numbers,), quadratic in them.
-    shape : (n_channels, n_steps)
-        Shape of the residuals of a run.
-
-    Attributes
-    ----------
-    numbers : (m,) int
-        Numbers of the runs among all histories, which are residuals of runs, and derivatives of residuals.
-    coords : (m, n_structural) float
-        Structural coordinates of the runs.
-    statistics : (m, n_numbers) float
-        Statistics of their residuals.
+    `numbers` (m,) are the numbers of the runs among all histories, which are residuals of runs, and derivatives of
+    residuals; `coords` (m, n_structural) their structural coordinates, `statistics` (m, n_numbers) of their residuals.
     """
 
     def __init__(self, statistic: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> None:

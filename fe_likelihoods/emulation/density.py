@@ -3,12 +3,9 @@
 Each mode has a region with an emulator of its own. A point belongs to the region whose centre is nearest, in the
 whitened coordinates of the region; the density there is the prior times the likelihood of the emulated statistics, and
 zero beyond the reach of the emulator. A mixture of t distributions is fitted to this density by adaptive importance
-sampling in memory; a large sample of weighted points (the pool) from it gives the evidence of the emulated posterior,
-and draws after a few independence Metropolis steps.
-
-References
-----------
-Cornuet, Marin, Mira & Robert (2012), Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x
+sampling in memory (Cornuet, Marin, Mira & Robert, 2012, Scand. J. Stat. 39(4), doi:10.1111/j.1467-9469.2011.00756.x); a
+large sample of weighted points (the pool) from it gives the evidence of the emulated posterior, and draws after a few
+independence Metropolis steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,24 +46,12 @@ _STRIDE, _APART = 0.5, 0.5  # prior standard deviations beyond an end; as a shar
 
 
 class Region(NamedTuple):
-    """A part of the posterior around one mode.
+    """A part of the posterior around one mode."""
 
-    Attributes
-    ----------
-    centre : (ndim,) float
-        Mean, or the mode while the mean is not known.
-    covariance : (ndim, ndim) float
-        Covariance of the part.
-    emulator : ResponseEmulator, optional
-        Emulator of the response; None before there are enough runs.
-    log_evidence : float
-        Evidence of the part; from the Laplace approximation before there is an emulator.
-    """
-
-    centre: np.ndarray
-    covariance: np.ndarray
-    emulator: ResponseEmulator | None
-    log_evidence: float
+    centre: np.ndarray  # (ndim,) mean, or the mode while the mean is not known
+    covariance: np.ndarray  # (ndim, ndim) of the part
+    emulator: ResponseEmulator | None  # None before there are enough runs
+    log_evidence: float  # from the Laplace approximation before there is an emulator
 
 
 class KnownDensity(NamedTuple):
@@ -115,29 +100,11 @@ def _log_mean(log_weights: np.ndarray) -> float:
 
 
 class EmulatedPosterior:
-    """Density of the emulated posterior and a weighted sample of it.
+    """Density of the emulated posterior, from regions with emulators, and a weighted sample of it, the pool.
 
-    Parameters
-    ----------
-    target : ResponseTarget
-        The posterior.
-    regions : sequence of Region
-        Regions with emulators.
-    random : RandomState
-        Source of random numbers.
-
-    Attributes
-    ----------
-    log_evidence : float
-        Log of the integral over the emulated density.
-    log_evidence_error : float
-        Its standard error, from the importance sampling in memory.
-    top : float
-        Largest log-density in the pool.
-    effective_share : float
-        Effective sample size of the pool divided by its size.
-    largest_weight : float
-        Largest normalised weight of a point of the pool.
+    `log_evidence` is the log of the integral over the emulated density, with an error from the importance sampling in
+    memory; `top` is the largest log-density in the pool, `effective_share` its effective sample size divided by its
+    size, and `largest_weight` the largest normalised weight in it.
     """
 
     def __init__(self, target: ResponseTarget, regions: Sequence[Region], random: np.random.RandomState) -> None:

@@ -59,33 +59,17 @@ _ROWS = 4096  # points evaluated at once
 
 
 class TrainingSet(NamedTuple):
-    """Simulations that an emulator is fitted to.
+    """Simulations that an emulator is fitted to."""
 
-    Attributes
-    ----------
-    coords : (m, d) float
-        Structural coordinates.
-    numbers : (m,) int
-        Numbers of the runs in the archive of the target.
-    """
-
-    coords: np.ndarray
-    numbers: np.ndarray
+    coords: np.ndarray  # structural coordinates (m, d)
+    numbers: np.ndarray  # (m,) of the runs in the archive of the target
 
 
 class Whitening(NamedTuple):
-    """Linear map of parameters to inputs of about unit variance.
+    """Linear map of scaled parameters (`ResponseTarget.scaled_parameters`) to inputs of about unit variance."""
 
-    Attributes
-    ----------
-    centre : (d,) float
-        Scaled parameters that map to zero, see `ResponseTarget.scaled_parameters`.
-    matrix : (d, d) float
-        Inputs are (scaled parameters - centre) @ matrix.
-    """
-
-    centre: np.ndarray
-    matrix: np.ndarray
+    centre: np.ndarray  # (d,) maps to zero
+    matrix: np.ndarray  # (d, d): inputs are (scaled parameters - centre) @ matrix
 
 
 def fit_whitening(target: ResponseTarget, centre: np.ndarray, covariance: np.ndarray) -> Whitening:
@@ -267,26 +251,11 @@ def fit_emulator(
     slopes: np.ndarray,
     earlier: ResponseEmulator | None = None,
 ) -> ResponseEmulator:
-    """Fit an emulator to simulations.
+    """Fit an emulator to at least d + 4 simulations; the search starts at the length scales of an earlier fit.
 
-    Parameters
-    ----------
-    target : ResponseTarget
-        The posterior.
-    training : TrainingSet
-        Simulations, at least d + 4.
-    centre, covariance : (d,) float, (d, d) float
-        About the mean and covariance of the posterior in structural coordinates, for whitening.
-    scales : (n_channels,) float
-        Standard deviations of the noise [SI]; components are in these units.
-    slopes : (n_numbers,) float
-        Derivatives of the log-likelihood by the statistics at the mode.
-    earlier : ResponseEmulator, optional
-        Earlier fit, whose length scales are the start of the search.
-
-    Returns
-    -------
-    ResponseEmulator
+    Centre (d,) and covariance (d, d) are about the mean and covariance of the posterior in structural coordinates, for
+    whitening. Components are in units of `scales` (n_channels,), the standard deviations of the noise [SI]; `slopes`
+    (n_numbers,) are the derivatives of the log-likelihood by the statistics at the mode.
     """
     centred = np.eye(len(training.coords)) - 1.0 / len(training.coords)
     products = target.archive.products(training.numbers, 1.0 / np.square(scales))

@@ -42,30 +42,14 @@ class _Level(NamedTuple):
 
 
 class GaussianProcess(NamedTuple):
-    """A fitted process.
+    """A fitted process."""
 
-    Attributes
-    ----------
-    inputs : (m, d) float
-        Training inputs.
-    log_scales : (d,) float
-        Logarithms of the length scales.
-    linear : (1 + d, k) float
-        Coefficients of the linear part.
-    weights : (m, k) float
-        Coefficients of the covariances with the training inputs.
-    variances : (k,) float
-        s_k^2.
-    levels : tuple
-        Groups of outputs with equal nugget, for the variance.
-    """
-
-    inputs: np.ndarray
-    log_scales: np.ndarray
-    linear: np.ndarray
-    weights: np.ndarray
-    variances: np.ndarray
-    levels: tuple[_Level, ...]
+    inputs: np.ndarray  # (m, d) of training
+    log_scales: np.ndarray  # logarithms of the length scales (d,)
+    linear: np.ndarray  # coefficients of the linear part (1 + d, k)
+    weights: np.ndarray  # of the covariances with the training inputs (m, k)
+    variances: np.ndarray  # s_k^2 (k,)
+    levels: tuple[_Level, ...]  # groups of outputs with equal nugget, for the variance
 
 
 def _basis(inputs: np.ndarray) -> np.ndarray:
@@ -93,24 +77,10 @@ def fit_process(
     log_scales: np.ndarray | None = None,
     iterations: int = 8,
 ) -> GaussianProcess:
-    """Fit a process by restricted maximum likelihood.
+    """Fit a process to outputs (m, k) at m >= d + 3 inputs (m, d) of about unit spread, by restricted likelihood.
 
-    Parameters
-    ----------
-    inputs : (m, d) float
-        Training inputs of about unit spread, m >= d + 3.
-    outputs : (m, k) float
-        Training outputs.
-    importance : (k,) float
-        Weights of the outputs in the choice of the length scales.
-    log_scales : (d,) float, optional
-        Where the search for the length scales starts, such as the result of an earlier fit.
-    iterations : int
-        Largest number of iterations in this search; 0 to keep the start.
-
-    Returns
-    -------
-    GaussianProcess
+    `importance` (k,) weights the outputs in the search for the length scales, which starts at `log_scales` (d,), such
+    as those of an earlier fit; 0 iterations keep the start.
     """
     m, d = inputs.shape
     basis = _basis(inputs)
@@ -147,18 +117,7 @@ def fit_process(
 
 
 def predict(process: GaussianProcess, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of the outputs.
-
-    Parameters
-    ----------
-    process : GaussianProcess
-    inputs : (n, d) float
-
-    Returns
-    -------
-    mean, variance : (n, k) float
-        The variance includes the nugget and the uncertainty of the linear part.
-    """
+    """Mean and variance (n, k) of the outputs; the variance includes nugget and uncertainty of the linear part."""
     covariance, basis = _covariance(inputs, process.inputs, process.log_scales), _basis(inputs)
     mean = basis @ process.linear + covariance @ process.weights
     variance = np.empty_like(mean)

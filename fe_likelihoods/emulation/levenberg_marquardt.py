@@ -98,42 +98,18 @@ class _Point(NamedTuple):
 
 
 class Ascent(NamedTuple):
-    """Where an ascent from one start has arrived, with the log-density around it.
+    """Where an ascent from one start has arrived, with the log-density around it in standard normal coordinates."""
 
-    Attributes
-    ----------
-    coords : (n_structural,) float
-        Structural coordinates.
-    run : int
-        Its number in the archive of the target.
-    statistics : (n_numbers,) float
-        Statistics of the residuals.
-    noise : NoiseFit
-        The best noise parameters.
-    value : float
-        Log-density, in standard normal coordinates, at the best noise parameters.
-    slopes : (n_structural, n) float
-        Derivatives of the residuals by the coordinates, as weights of the first n histories in the archive.
-    weights : (n_numbers,) float
-        Derivatives of the log-likelihood by the statistics.
-    gradient : (n_structural,) float
-        Gradient of the log-density.
-    hessian : (n_structural, n_structural) float
-        Gauss-Newton Hessian of minus the log-density.
-    ended : bool
-        Whether the ascent goes no further.
-    """
-
-    coords: np.ndarray
-    run: int
-    statistics: np.ndarray
-    noise: NoiseFit
-    value: float
-    slopes: np.ndarray
-    weights: np.ndarray
-    gradient: np.ndarray
-    hessian: np.ndarray
-    ended: bool = False
+    coords: np.ndarray  # structural coordinates (n_structural,)
+    run: int  # its number in the archive of the target
+    statistics: np.ndarray  # of the residuals (n_numbers,)
+    noise: NoiseFit  # the best noise parameters
+    value: float  # log-density at the best noise parameters
+    slopes: np.ndarray  # d residuals / d coords (n_structural, n), as weights of the first n histories in the archive
+    weights: np.ndarray  # derivatives of the log-likelihood by the statistics (n_numbers,)
+    gradient: np.ndarray  # of the log-density (n_structural,)
+    hessian: np.ndarray  # Gauss-Newton, of minus the log-density (n_structural, n_structural)
+    ended: bool = False  # whether the ascent goes no further
 
     @property
     def gain_left(self) -> float:
@@ -441,42 +417,15 @@ def ascend(
     steps: np.ndarray | None = None,
     designed: bool = True,
 ) -> Generator[np.ndarray, Runs, int]:
-    """Levenberg-Marquardt from one start.
+    """Levenberg-Marquardt from one start (n_structural,), where the prior is centred at `centre`.
 
-    Parameters
-    ----------
-    target : ResponseTarget
-        The posterior.
-    jacobians : Jacobians
-        Derivatives, which ascents may share.
-    number : int
-        Number of this ascent.
-    start : (n_structural,) float
-        Start.
-    centre : (n_structural,) float
-        Where the prior is centred.
-    known : dict of int and Ascent
-        Where every ascent on this part of the record has arrived, by its number. An ascent that would end where a
-        higher one goes stops, and leaves the dict; so does one that is given up.
-    tolerance : float
-        Log-density still to gain at which to stop.
-    apart : float
-        Distance of one coordinate, in prior standard deviations, from which ends are different.
-    steps : (n_structural, n_structural) float, optional
-        Steps from the start that are simulated with it, for the first derivatives.
-    designed : bool
-        Whether a step of a standard deviation is simulated along every axis of the Laplace approximation at the end.
-
-    Yields
-    ------
-    (n, n_structural) float, or Derivatives
-        Points to simulate, and the generator is sent their `Runs`; or a point, and it is sent the model's derivatives.
-
-    Returns
-    -------
-    int
-        Number of the ascent that it joins, its own at an end of its own; -1 if the start fails, or if the ascent is
-        slow and far below another one.
+    Yields points (n, n_structural) to simulate and is sent their `Runs`, or `Derivatives` and is sent the model's
+    derivatives. Returns the number of the ascent that it joins, its own at an end of its own; -1 if the start fails, or
+    if the ascent is slow and far below another one. `known` has where every ascent on this part of the record has
+    arrived; one that would end where a higher one goes stops and leaves the dict, and so does one that is given up. It
+    stops when less than `tolerance` of log-density is still to gain. Ends are different where one coordinate differs by
+    `apart` prior standard deviations. `steps` from the start are simulated with it, for the first derivatives; if
+    `designed`, a step of a standard deviation is simulated along every axis of the Laplace approximation at the end.
     """
     climb = _Climb(target, jacobians, centre, known, apart, number, designed)
     joined = yield from climb.begin(start, steps)
@@ -554,17 +503,10 @@ def _valley(values: np.ndarray) -> float:
 
 
 class Batches:
-    """Runs generators of points side by side.
+    """Runs generators of points side by side; `remember` and `fits` as for `search_modes`.
 
-    Parameters
-    ----------
-    target : ResponseTarget
-        Simulates points.
-    remember, fits : callable
-        As for `fe_likelihoods.emulation.modes.search_modes`.
-    overlap : bool
-        Whether each generator goes on as soon as its own points have been simulated. By default all requests are
-        simulated as one batch. The order in which requests end is stored with `remember`.
+    With `overlap`, each generator goes on as soon as its own points have been simulated; otherwise all requests are
+    simulated as one batch. The order in which requests end is stored with `remember`.
     """
 
     def __init__(

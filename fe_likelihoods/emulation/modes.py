@@ -167,35 +167,18 @@ def search_modes(
     first: int | None = None,
     remaining: Callable[[], float] = lambda: np.inf,
 ) -> Generator[float, None, ModeSearch]:
-    """Search from given starts, on growing parts of the record where the model offers them.
+    """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
     Further starts follow the first ones while `unseen_share` is large (modes that one start alone led to say that
-    others may have been missed). Half as many starts follow while the ascents that have reached a mode are fewer
-    than three quarters of the first starts: ascents that are given up may have been on their way to another mode. Where
-    the data leave a direction to the prior, most are given up because they advance slowly along it: on the whole record
+    others may have been missed). Half as many starts follow while the ascents that have reached a mode are fewer than
+    three quarters of the first starts: ascents that are given up may have been on their way to another mode. Where the
+    data leave a direction to the prior, most are given up because they advance slowly along it: on the whole record
     further starts follow while fewer than five have reached a mode, and on a growing record none.
 
-    Parameters
-    ----------
-    target : ResponseTarget
-        The posterior.
-    starts : (n, n_structural) float
-        Starts, in standard normal coordinates.
-    remember : callable, optional
-        Stores responses for a resumed run.
-    fits : callable, optional
-        ``fits(n)``: whether n more simulations of the whole record fit into the budget.
-    overlap : bool
-        Whether each ascent goes on as soon as its own simulations have ended (`Batches`), and all begin together.
-    first : int, optional
-        Number of starts with which to begin; half of it follow at a time. By default all are first.
-    remaining : callable, optional
-        Returns the number of simulations left in the budget.
-
-    Yields
-    ------
-    float
-        Cost of each batch, in simulations of the whole record.
+    `first` starts begin (default: all), and half of it follow at a time. `remember` stores responses for a resumed run,
+    ``fits(n)`` says whether n more simulations of the whole record fit into the budget, and `remaining` how many are
+    left of it. With `overlap`, ascents begin together, and go on as soon as their own simulations have ended
+    (`Batches`). Yields the cost of each batch, in simulations of the whole record.
     """
     first = len(starts) if first is None else first
     shortened = [*target.shortened(_SHARES), target]

@@ -23,21 +23,9 @@ _TOLERANCE = 1e-6
 def bilinear_form(
     statistic: Callable[[np.ndarray], np.ndarray], first: np.ndarray, second: np.ndarray | None = None
 ) -> np.ndarray:
-    """The symmetric bilinear form of a quadratic statistic.
+    """The symmetric bilinear form B(first_i, second_j) (k, l, n_numbers) of a statistic that is quadratic in residuals.
 
-    Parameters
-    ----------
-    statistic : callable
-        Function of residuals (n_channels, n_steps) that returns (n_numbers,), quadratic in them.
-    first : (k, n_channels, n_steps) float
-        Histories.
-    second : (l, n_channels, n_steps) float, optional
-        Other histories; `first` by default.
-
-    Returns
-    -------
-    (k, l, n_numbers) float
-        B(first_i, second_j).
+    Histories are (k, n_channels, n_steps) and (l, n_channels, n_steps), the first ones by default.
     """
     others = first if second is None else second
     if statistic is sums_of_squares:

@@ -47,25 +47,14 @@ class _StackedModel(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """One data set.
-
-    Attributes
-    ----------
-    likelihood : FELikelihood
-    structural, noise : list of int
-        Places of its parameters among all structural parameters, and among all noise parameters.
-    channels, numbers : slice
-        Its rows among all channels, and among all statistics.
-    statistic : callable
-        Statistic of its residuals.
-    """
+    """One data set."""
 
     likelihood: Any
-    structural: list[int]
-    noise: list[int]
-    channels: slice
-    numbers: slice
-    statistic: Callable[[np.ndarray], np.ndarray]
+    structural: list[int]  # places of its parameters among all structural parameters
+    noise: list[int]  # places of its parameters among all noise parameters
+    channels: slice  # its rows among all channels
+    numbers: slice  # its rows among all statistics
+    statistic: Callable[[np.ndarray], np.ndarray]  # of its residuals
 
 
 class _StackedNoise:
@@ -90,20 +79,10 @@ class _StackedNoise:
 
 
 class StackedLikelihood:
-    """What a guide needs of a likelihood, for several data sets.
+    """What a guide needs of a likelihood, for several data sets: likelihoods, and the places of their parameters.
 
-    Parameters
-    ----------
-    joint : JointLikelihood
-        The likelihoods.
-    parts : sequence of (FELikelihood, list of int)
-        They, and the places of their parameters.
-
-    Raises
-    ------
-    ValueError
-        If a data set has missing samples, times of its own or time shifts, or a noise whose level depends on the
-        response.
+    ValueError if a data set has missing samples, times of its own or time shifts, or a noise whose level depends on the
+    response.
     """
 
     def __init__(self, joint: Any, parts: Sequence[tuple[Any, Sequence[int]]]) -> None:

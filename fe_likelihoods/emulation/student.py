@@ -9,24 +9,12 @@ __all__ = ["StudentMixture", "draw_mixture", "factor_of", "mixture_log_density"]
 
 
 class StudentMixture(NamedTuple):
-    """A mixture of t distributions.
+    """A mixture of t distributions."""
 
-    Attributes
-    ----------
-    weights : (k,) float
-        Weights with sum 1.
-    centres : (k, d) float
-        Centres.
-    factors : (k, d, d) float
-        Lower Cholesky factors of the scale matrices.
-    freedom : float
-        Degrees of freedom.
-    """
-
-    weights: np.ndarray
-    centres: np.ndarray
-    factors: np.ndarray
-    freedom: float
+    weights: np.ndarray  # (k,), with sum 1
+    centres: np.ndarray  # (k, d)
+    factors: np.ndarray  # lower Cholesky factors of the scale matrices (k, d, d)
+    freedom: float  # degrees of freedom
 
 
 def factor_of(covariance: np.ndarray) -> np.ndarray:

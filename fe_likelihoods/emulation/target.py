@@ -83,36 +83,18 @@ class _Shortened(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """Simulations at points of the structural coordinates.
+    """Simulations at n points of the structural coordinates."""
 
-    Attributes
-    ----------
-    numbers : (n,) int
-        Their numbers in the archive of the target; -1 where the simulation failed.
-    statistics : (n, n_numbers) float
-        Statistics of the residuals; NaN where the simulation failed.
-    failed : (n,) bool
-        Whether the simulation failed.
-    """
-
-    numbers: np.ndarray
-    statistics: np.ndarray
-    failed: np.ndarray
+    numbers: np.ndarray  # (n,) in the archive of the target; -1 where failed
+    statistics: np.ndarray  # (n, n_numbers) of the residuals; NaN where failed
+    failed: np.ndarray  # (n,) bool
 
 
 class NoiseFit(NamedTuple):
-    """Noise parameters that fit given statistics best.
+    """Noise parameters that fit given statistics best."""
 
-    Attributes
-    ----------
-    coords : (n_noise,) float
-        Standard normal coordinates of the noise parameters; empty if they are integrated out.
-    log_density : float
-        Log-likelihood plus the log-prior of these coordinates.
-    """
-
-    coords: np.ndarray
-    log_density: float
+    coords: np.ndarray  # (n_noise,), standard normal; empty if they are integrated out
+    log_density: float  # log-likelihood plus the log-prior of these coordinates
 
 
 def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence[np.ndarray]:
@@ -131,35 +113,13 @@ class _WithoutMissing(NamedTuple):
 
 
 class ResponseTarget:
-    """A posterior in standard normal coordinates.
+    """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations.
 
-    Parameters
-    ----------
-    posterior : Posterior
-        Its noise must use statistics that are quadratic in the residuals.
-
-    Attributes
-    ----------
-    ndim, n_structural, n_noise : int
-        Numbers of coordinates: all, structural (which come first), and noise.
-    n_steps : int
-        Steps of the measurements.
-    n_samples : int or SampleCounts
-        Samples of every channel, or of each where some are missing.
-    archive : Archive
-        The simulations run through this object.
-    differentiable : bool
-        Whether the model has a method ``jacobian``.
-    unchecked : list
-        Not empty until the model's derivatives have been compared with a difference; shared with `shortened` targets.
-    scales : (n_channels,) float
-        Standard deviations of the measured channels [SI]; 1 for a constant channel.
-
-    Raises
-    ------
-    ValueError
-        If the statistics of the noise are not quadratic in the residuals, its level depends on the response, or it has
-        time shifts.
+    ValueError if the statistics of the noise are not quadratic in the residuals, its level depends on the response, or
+    it has time shifts. `n_samples` is an int, or `SampleCounts` where some are missing; `differentiable` says whether
+    the model has a method ``jacobian``; `unchecked` is not empty until its derivatives have been compared with a
+    difference, and is shared with `shortened` targets; `scales` (n_channels,) are the standard deviations of the
+    measured channels [SI], 1 for a constant channel.
     """
 
     def __init__(self, posterior: _Posterior) -> None:
@@ -216,10 +176,7 @@ class ResponseTarget:
     def shortened(self, shares: Sequence[float]) -> list["ResponseTarget"]:
         """The same posterior for the first parts of the record, the shortest first; none if the model has no ``first``.
 
-        Parameters
-        ----------
-        shares : sequence of float
-            Shares of the Arias intensity at which the parts end.
+        The shares are of the Arias intensity, at which the parts end.
         """
         if not hasattr(self.model, "first"):
             return []
@@ -476,12 +433,8 @@ class ResponseTarget:
     def fit_noise(self, statistics: np.ndarray, start: np.ndarray | None = None) -> NoiseFit:
         """Noise parameters that fit statistics (n_numbers,) best: nothing is simulated.
 
-        Parameters
-        ----------
-        statistics : (n_numbers,) float
-            Statistics of the residuals.
-        start : (n_noise,) float, optional
-            Coordinates near the result, such as the best ones at a neighbouring point. By default a grid is searched.
+        The search begins at coordinates (n_noise,) near the result, such as the best ones of a neighbour, or with a
+        grid.
         """
         if not self.n_noise:
             return NoiseFit(np.zeros(0), float(self._noise_density(statistics, np.zeros((1, 0)))[0]))

@@ -35,58 +35,28 @@ _NORMAL = 0.5  # largest skewness and excess kurtosis of a prior that a normal d
 class ReweightingCheck(NamedTuple):
     """How well the stored samples of one test serve the hierarchical model.
 
-    Attributes
-    ----------
-    effective_samples : float
-        Effective sample size of the weights, median over the hyper-samples. NaN with common parameters, whose exact
-        value is not among the samples.
-    sample_share : float
-        Share of the marginal likelihood that is from the samples, mean over the hyper-samples. The rest is from the
-        mixture fitted to them.
-    pareto_shape : float
-        Shape of the upper tail of the inverse prior density over the posterior of the test in the hierarchy, 90 %
-        quantile over the hyper-samples. Above 0.7 this posterior reaches values that the prior of the test, and
-        therefore its samples, leave out; up to 0.8 this does no harm if the error of the means is small.
-    outside : float
-        Mean probability of the population beyond bounds of the prior that the samples reach.
-    cut_off : float
-        The same without the bounds at zero that positive parameters have.
-    error : float
-        Standard error of the log marginal likelihood, root mean square over the hyper-samples, from resampled samples.
-    shift : float
-        Largest standard error that this test causes in a hyper-parameter's mean, in posterior standard deviations.
+    Effective samples are NaN with common parameters, whose exact value is not among the samples. The Pareto shape
+    belongs to the upper tail of the inverse prior density over the posterior of the test in the hierarchy. Above 0.7
+    this posterior reaches values that the prior of the test, and therefore its samples, leave out; up to 0.8 this does
+    no harm if the error of the means is small.
     """
 
-    effective_samples: float
-    sample_share: float
-    pareto_shape: float
-    outside: float
-    cut_off: float
-    error: float
-    shift: float
+    effective_samples: float  # of the weights, median over the hyper-samples
+    sample_share: float  # of the marginal likelihood, mean; the rest is from the fitted mixture
+    pareto_shape: float  # 90 % quantile over the hyper-samples
+    outside: float  # mean probability of the population beyond prior bounds that the samples reach
+    cut_off: float  # the same without the bounds at zero that positive parameters have
+    error: float  # standard, of the log marginal likelihood: root mean square, from resampled samples
+    shift: float  # largest standard error that this test causes in a hyper-parameter's mean [posterior sd]
 
 
 class HierarchyChecks(NamedTuple):
-    """Reliability of a hierarchical result.
-
-    Attributes
-    ----------
-    tests : dict of str to ReweightingCheck
-        The checks of each test.
-    mean_errors : dict of str to float
-        Standard error of each hyper-parameter's posterior mean from the finite samples of all tests, in posterior
-        standard deviations. Errors from sampling the hyper-parameters are not included.
-    log_evidence_error : float
-        Standard error of the hierarchical model's log-evidence from the finite samples of all tests and the errors of
-        their evidences. Errors from sampling the hyper-parameters are not included.
-    messages : tuple of str
-        What is not reliable and what to do; empty if nothing was found.
-    """
+    """Reliability of a hierarchical result; errors from sampling the hyper-parameters are not included."""
 
     tests: dict[str, ReweightingCheck]
-    mean_errors: dict[str, float]
-    log_evidence_error: float
-    messages: tuple[str, ...]
+    mean_errors: dict[str, float]  # standard, from the finite samples of all tests [posterior sd]
+    log_evidence_error: float  # standard, from the finite samples and the errors of the tests' evidences
+    messages: tuple[str, ...]  # what is not reliable and what to do
 
     def __str__(self) -> str:
         rows = [("test", "effective", "of samples", "Pareto", "outside", "error", "shift")]
@@ -102,21 +72,7 @@ class HierarchyChecks(NamedTuple):
 
 
 def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, seed: int = 0) -> HierarchyChecks:
-    """Check the stored samples of every test at samples of the hyper-parameters.
-
-    Parameters
-    ----------
-    posterior : HierarchicalPosterior
-        The hierarchical model.
-    samples : (n, ndim) ndarray
-        Posterior samples of the hyper-parameters; 100 evenly spaced ones are used.
-    seed : int
-        Seed of the resampling.
-
-    Returns
-    -------
-    HierarchyChecks
-    """
+    """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""
     rng = np.random.default_rng(seed)
     used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
     center, factor = posterior.population(used)
@@ -270,21 +226,9 @@ def _messages(posterior: "HierarchicalPosterior", found: dict[str, ReweightingCh
 
 
 def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
-    """Prior bounds of a test that leave out values of common parameters which other priors permit.
+    """Prior bounds of a test that leave out values of common parameters which the other tests' priors permit.
 
-    Parameters
-    ----------
-    posterior : HierarchicalPosterior
-        Its prior permits the values.
-    name : str
-        The test.
-    others : iterable of str
-        Tests whose priors permit the values as well.
-
-    Returns
-    -------
-    dict of str to list of float
-        Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
+    Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
     """
     first = posterior.ndim - len(posterior.common)
     permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]

@@ -49,29 +49,16 @@ _FEWEST_TIMES = 10.0  # autocorrelation times in the steps that are used, the se
 class LeftOut(NamedTuple):
     """The population without one test.
 
-    Attributes
-    ----------
-    hierarchy : Hierarchy
-        Population of the other tests.
-    pareto_shape : float
-        Tail shape of the weights 1 / m_k [-].
-    effective_samples : float
-        Effective number of hyper-samples after weighting, or of the new samples.
-    sampled : bool
-        Whether the population was sampled anew, because the shape is 0.7 or more, less than half of the hyper-samples
-        are effective, or the prior of the test leaves out values of a common parameter that the others permit.
-    log_density : float
-        Log predictive density of all the test's data given the other tests, a proper score: larger is better. NaN if
-        its `StoredPosterior` has no `log_evidence`, and where no sample of the population without the test is within
-        the test's prior.
-    log_density_error : float
-        Its standard error, from the number of hyper-samples (taken as independent), the number of new samples, and the
-        error of the evidence.
+    It was sampled anew if the shape is 0.7 or more, less than half of the hyper-samples are effective, or the prior of
+    the test leaves out values of a common parameter that the others permit. The log predictive density of all the
+    test's data given the other tests is a proper score: larger is better. It is NaN if its `StoredPosterior` has no
+    `log_evidence`, and where no sample of the population without the test is within the test's prior. Its error is from
+    the number of hyper-samples (taken as independent), the number of new samples, and the error of the evidence.
     """
 
-    hierarchy: Hierarchy
-    pareto_shape: float
-    effective_samples: float
+    hierarchy: Hierarchy  # population of the other tests
+    pareto_shape: float  # of the weights 1 / m_k [-]
+    effective_samples: float  # hyper-samples after weighting, or new samples
     sampled: bool
     log_density: float
     log_density_error: float

@@ -47,53 +47,25 @@ _JITTER = 1e-12
 
 
 class PopulationMarginal(NamedTuple):
-    """Marginal likelihood of a test at several hyper-parameters.
+    """Marginal likelihood of a test at n hyper-parameters."""
 
-    Attributes
-    ----------
-    log_value : ndarray[n]
-        Logarithm of the marginal likelihood divided by the evidence.
-    sample_share : ndarray[n]
-        Share of this value that is from the samples; the rest is from the fitted mixture.
-    """
-
-    log_value: np.ndarray
-    sample_share: np.ndarray
+    log_value: np.ndarray  # (n,), logarithm of the marginal likelihood over the evidence
+    sample_share: np.ndarray  # (n,), of this value from the samples; the rest is from the fitted mixture
 
 
 class Product(NamedTuple):
-    """Product of a fitted mixture and a normal population, at n hyper-parameters.
+    """Product of a fitted mixture and a normal population, at n hyper-parameters."""
 
-    Attributes
-    ----------
-    log_masses : ndarray[n, n_components]
-        Logarithms of the integrals over each component times the population density.
-    means : ndarray[n, n_components, n_varying]
-        Means of the products.
-    factors : ndarray[n, n_components, n_varying, n_varying]
-        Matrices A with the covariances A A^T.
-    """
-
-    log_masses: np.ndarray
-    means: np.ndarray
-    factors: np.ndarray
+    log_masses: np.ndarray  # (n, n_components), log integrals of component times population
+    means: np.ndarray  # (n, n_components, n_varying)
+    factors: np.ndarray  # matrices A with covariances A A^T (n, n_components, n_varying, n_varying)
 
 
 def population_marginal(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> PopulationMarginal:
-    """Marginal likelihood of a test under normal populations of its parameters.
+    """Marginal likelihood of a test under normal populations, with n centres (n, d) of its parameters.
 
-    Parameters
-    ----------
-    described : DescribedPosterior
-        Samples of the d parameters. The first n_varying ones vary between tests, the others are common.
-    center : (n, d) ndarray
-        Means of the varying parameters, and values of the common ones, for n hyper-parameters.
-    factor : (n, n_varying, n_varying) ndarray
-        Cholesky factors of the varying parameters' covariances.
-
-    Returns
-    -------
-    PopulationMarginal
+    The first n_varying parameters vary between tests and have Cholesky factors (n, n_varying, n_varying) of
+    covariances; the others are common, and their centres are their values.
     """
     size = max(1, _CHUNK // (len(described.points) * factor.shape[-1]))
     parts = [
@@ -103,19 +75,9 @@ def population_marginal(described: DescribedPosterior, center: np.ndarray, facto
 
 
 def sample_weights(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Weights (n, m) of a test's samples under n populations, which sum to one in each row.
+    """Weights (n, m) of a test's samples under n populations, which sum to one in each row; no parameter may be common.
 
-    Parameters
-    ----------
-    described : DescribedPosterior
-        Samples of varying parameters; none may be common.
-    center, factor : ndarray
-        As of `population_marginal`.
-
-    Returns
-    -------
-    ndarray[n, m]
-        Zero in a row where no sample has a density above the smallest float.
+    They are zero in a row where no sample has a density above the smallest float.
     """
     log_weights = log_density(described.points, center, factor) + described.log_weights - described.log_prior
     largest = log_weights.max(axis=1, keepdims=True)

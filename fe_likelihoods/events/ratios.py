@@ -39,24 +39,12 @@ _REACH = 1e-9
 
 
 class RatioPopulations(NamedTuple):
-    """Posterior draws of the ratio distribution of one quantity.
+    """Posterior draws (n,) of the ratio distribution of one quantity."""
 
-    Attributes
-    ----------
-    center : ndarray, shape (n,)
-        Mean log ratio at the mean log level of the events.
-    slope : ndarray, shape (n,)
-        Change of the mean log ratio per unit of the log level.
-    sd : ndarray, shape (n,)
-        Standard deviation of log ratios between events.
-    log_level : float
-        Mean logarithm of the predicted values of the events.
-    """
-
-    center: np.ndarray
-    slope: np.ndarray
-    sd: np.ndarray
-    log_level: float
+    center: np.ndarray  # mean log ratio at the mean log level of the events
+    slope: np.ndarray  # change of the mean log ratio per unit of the log level
+    sd: np.ndarray  # of log ratios between events
+    log_level: float  # mean logarithm of the predicted values of the events
 
     def center_at(self, log_predicted: np.ndarray) -> np.ndarray:
         """Mean log ratio at logarithms of predicted values (n, ...), a row for each draw."""

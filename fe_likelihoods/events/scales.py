@@ -22,18 +22,10 @@ SCALES = ("log", "linear", "logit")
 
 
 class Scales(NamedTuple):
-    """Scales of several parameters.
+    """Scales of several parameters."""
 
-    Attributes
-    ----------
-    low : ndarray[dim]
-        Lower bounds: a for the scale "logit", 0 for "log", and -inf for "linear".
-    high : ndarray[dim]
-        Upper bounds: b for the scale "logit", and inf for the others.
-    """
-
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray  # (dim,): a for the scale "logit", 0 for "log", -inf for "linear"
+    high: np.ndarray  # (dim,): b for the scale "logit", inf for the others
 
     def first(self, n: int) -> "Scales":
         """Scales of the first n parameters."""

@@ -22,42 +22,22 @@ _CHUNK = 2**20  # values of a temporary array
 class EventSpread(NamedTuple):
     """Unknowns on which the probability of an exceedance in a new event depends.
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_samples, ...)
-        Values of the samples, before they are multiplied by a ratio.
-    weights : ndarray, shape (n_populations, n_samples), or None
-        Importance weights of the samples under each of several populations (`Hierarchy.population_weights`). None if
-        the parameters are the same in all events.
-    ratios : EventRatios or None
-        Ratios that contain the model error, None for none.
+    The weights are importance weights of the samples under each of several populations
+    (`Hierarchy.population_weights`), None if the parameters are the same in all events. Ratios contain the model error.
     """
 
-    values: np.ndarray
-    weights: np.ndarray | None = None
+    values: np.ndarray  # (n_samples, ...), not yet multiplied by a ratio
+    weights: np.ndarray | None = None  # (n_populations, n_samples)
     ratios: EventRatios | None = None
 
 
 def exceedance_of_samples(
     values: np.ndarray, limits: np.ndarray, ratios: EventRatios | None, below: bool = False
 ) -> np.ndarray:
-    """Probability of each sample that its value in a new event exceeds the limit.
+    """Probability (n, ...) of each sample that its value in a new event exceeds the limit; 0 or 1 without ratios.
 
-    Parameters
-    ----------
-    values : (n, ...) ndarray
-        Values of the samples.
-    limits : ndarray
-        Limits of the same shape; positive if there are ratios.
-    ratios : EventRatios or None
-        Ratios of one quantity.
-    below : bool
-        Whether the limit is exceeded by values below it.
-
-    Returns
-    -------
-    (n, ...) ndarray
-        Probabilities, 0 or 1 without ratios.
+    Limits have the shape of the values (n, ...), and are positive if there are ratios of the quantity. With `below`,
+    values below a limit exceed it.
     """
     if ratios is None:
         return (values < limits if below else values > limits).astype(float)
@@ -76,25 +56,10 @@ def exceedance_draws(
     failed: np.ndarray | None = None,
     exceeding: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draws of the probability that the value in a new event exceeds the limit.
+    """Draws (n_draws, ...) of the probability that the value in a new event exceeds the limit, one per population.
 
-    Parameters
-    ----------
-    values, limits, below
-        As for `exceedance_of_samples`.
-    spread : EventSpread
-        Weights and ratios; its values are not used.
-    rng : numpy.random.Generator
-        Draws of the samples and of the ratios' population. All entries of the values have the same draws.
-    failed : (n, ...) ndarray of bool, optional
-        Values that are not known, because their simulation failed. Default: none.
-    exceeding : (n, ...) ndarray of bool, optional
-        Failed values that count as exceedances. Default: none; the others are left out.
-
-    Returns
-    -------
-    (n_draws, ...) ndarray
-        Probability given each draw of the population; NaN where its sample failed and is left out.
+    Weights and ratios are those of `spread`, and all entries of the values have the same draws. Failed values (n, ...)
+    count as exceedances where `exceeding`; the others are left out, and a draw of such a sample is NaN.
     """
     failed, exceeding = (np.zeros(values.shape, dtype=bool) if each is None else each for each in (failed, exceeding))
     known = np.where(failed, np.nanmax(np.where(failed, -np.inf, values), initial=-np.inf), values)

@@ -209,43 +209,20 @@ class StoredPosterior:
 class DescribedPosterior(NamedTuple):
     """Posterior samples of some parameters on the scale of a population, and a mixture fitted to them.
 
-    Attributes
-    ----------
-    points : ndarray[n, dim]
-        Samples on the scales of the population.
-    log_weights : ndarray[n]
-        Logarithms of their weights, which sum to one.
-    log_prior : ndarray[n]
-        Logarithm of the prior density of the points.
-    prior : Prior
-        Prior of these parameters, before the change of scale.
-    scales : Scales
-        Scales of the parameters.
-    log_shares : ndarray[n_components]
-        Logarithms of the components' shares in the mixture.
-    means : ndarray[n_components, dim]
-        Means of the components.
-    covariances : ndarray[n_components, dim, dim]
-        Covariances of the components.
-    mixture : MixtureDistribution
-        The mixture in standardised coordinates.
-    effective_sample_size : float
-        Effective number of independent samples.
-    common : MixtureDistribution, optional
-        Density of the common parameters alone, fitted on the scale of their normal scores under the priors, if a sample
-        of one common parameter is near a prior bound.
+    `common` is the density of the common parameters alone, fitted on the scale of their normal scores under the priors,
+    if a sample of one common parameter is near a prior bound.
     """
 
-    points: np.ndarray
-    log_weights: np.ndarray
-    log_prior: np.ndarray
-    prior: Prior
+    points: np.ndarray  # (n, dim)
+    log_weights: np.ndarray  # (n,), of weights with sum 1
+    log_prior: np.ndarray  # (n,), of the prior density of the points
+    prior: Prior  # before the change of scale
     scales: Scales
-    log_shares: np.ndarray
-    means: np.ndarray
-    covariances: np.ndarray
-    mixture: MixtureDistribution
-    effective_sample_size: float
+    log_shares: np.ndarray  # (n_components,)
+    means: np.ndarray  # (n_components, dim)
+    covariances: np.ndarray  # (n_components, dim, dim)
+    mixture: MixtureDistribution  # in standardised coordinates
+    effective_sample_size: float  # number of independent samples
     common: MixtureDistribution | None = None
 
     def log_prior_at(self, points: np.ndarray) -> np.ndarray:
@@ -254,10 +231,7 @@ class DescribedPosterior(NamedTuple):
 
 
 def on_scale(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> tuple[Prior, np.ndarray]:
-    """Prior of some parameters, and their samples (n, dim) on their scales.
-
-    Raises ValueError as `describe`.
-    """
+    """Prior of some parameters, and their samples (n, dim) on their scales; ValueError as `describe`."""
     if missing := [name for name in names if name not in stored.prior.names]:
         raise ValueError(
             f"the stored samples have no parameters {', '.join(missing)}; they have {', '.join(stored.prior.names)}"
@@ -292,32 +266,11 @@ def describe(
     seed: int = 0,
     n_common: int = 0,
 ) -> DescribedPosterior:
-    """Describe the stored samples of some parameters.
+    """Describe the stored samples of some parameters, of which the last `n_common` have one value in all tests.
 
-    Parameters
-    ----------
-    stored : StoredPosterior
-        Samples of all parameters.
-    names : sequence of str
-        The parameters to describe.
-    scales : Scales
-        Their scales.
-    max_samples : int
-        Largest number of samples. More samples are thinned: evenly, or by systematic resampling if they have weights.
-    seed : int
-        Seed of the resampling and of the fit.
-    n_common : int
-        The last `n_common` parameters have one value in all tests.
-
-    Returns
-    -------
-    DescribedPosterior
-
-    Raises
-    ------
-    ValueError
-        If a parameter is unknown, has a joint prior with parameters that are not described, or has samples that its
-        scale does not permit; and as `fit_mixture`.
+    More than `max_samples` are thinned: evenly, or by systematic resampling if they have weights. ValueError if a
+    parameter is unknown, has a joint prior with parameters that are not described, or has samples that its scale does
+    not permit; and as `fit_mixture`.
     """
     prior, points = on_scale(stored, names, scales)
     rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)

@@ -63,29 +63,12 @@ class BlockLogLikelihood(NamedTuple):
 def choose_blocks(
     measurements: Measurements, values: np.ndarray, residuals: np.ndarray, seconds: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Divide the time of measurements into blocks of equal length.
+    """Divide the time of measurements into blocks of equal length; returns their starts and stops (n_blocks,) [s].
 
-    Parameters
-    ----------
-    measurements : Measurements
-        The measurements, for their times.
-    values : (n_channels, n_samples) float
-        The samples that are compared, NaN where there is none.
-    residuals : (n_channels, n_samples) float
-        Residuals at parameters that fit.
-    seconds : float, optional
-        Length of a block [s]. Default: five correlation times of the channel where the errors are correlated longest,
-        with the correlation time n / n_eff of `fe_likelihoods.effective_samples`, and at most 100 blocks.
-
-    Returns
-    -------
-    starts, stops : (n_blocks,) float
-        Times [s]. Blocks without a sample are left out. The first block contains a sample of every channel.
-
-    Raises
-    ------
-    ValueError
-        If `seconds` is not a positive number.
+    `values` (n_channels, n_samples) are NaN where nothing is compared. The length is `seconds`, or five correlation
+    times n / n_eff (`fe_likelihoods.effective_samples`) of the residuals at a fit, in the channel where these are
+    longest, with at most 100 blocks. Blocks without a sample are left out, and the first one has a sample of every
+    channel. ValueError if `seconds` is not a positive number.
     """
     times = np.stack([measurements.times(channel.name) for channel in measurements.channels])
     there = ~np.isnan(values)
@@ -123,26 +106,10 @@ def block_log_likelihood(
     parameters: np.ndarray,
     stops: Sequence[float],
 ) -> np.ndarray:
-    """Log-likelihood terms for blocks of time.
+    """Terms (n, n_blocks) of the log-likelihood of n samples, for blocks that end at the ascending times `stops` [s].
 
-    Parameters
-    ----------
-    noise : Noise
-        A noise whose parameters are given: one that was not integrated out, and without unknown time shifts.
-    measurements : Measurements
-        The measurements.
-    values : (n_channels, n_samples) float
-        The samples that are compared [SI], NaN where there is none.
-    residuals : (n, n_channels, n_samples) float
-        Residuals for n parameter samples [SI].
-    parameters : (n, n_noise) float
-        Noise parameters.
-    stops : (n_blocks,) float
-        Ends of the blocks [s], ascending.
-
-    Returns
-    -------
-    (n, n_blocks) float
+    Values (n_channels, n_samples) [SI], NaN where there is none, residuals (n, n_channels, n_samples) [SI] and
+    parameters (n, n_noise) belong to a noise that was not integrated out and has no unknown time shifts.
     """
     if hasattr(noise, "log_densities"):
         return _blocks_of_samples(noise, measurements, values, residuals, parameters, stops)

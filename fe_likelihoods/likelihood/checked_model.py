@@ -1,10 +1,9 @@
 """The model of a simulator: whether it is still the same, and which stored simulations are its own.
 
-Results from two states of a model must not be mixed, neither in memory nor on disk, as when a value is set between two
-batches or a file is edited. So the model's label (`fe_likelihoods.simulation.label`) and fingerprint are compared
-before and after simulations, in about 1 % of the time. User code may change values itself, such as a counter or a table
-of earlier results. Therefore a difference alone is no error: the first and the latest simulation are repeated, and the
-model counts as unchanged if the results are the same.
+Results from two states of a model must not be mixed, as when a value is set between two batches or a file is edited. So
+label and fingerprint are compared before and after simulations, in about 1 % of the time. User code may change values
+itself, such as a counter. Therefore a difference alone is no error: the first and the latest simulation are repeated,
+and the model counts as unchanged if the results are the same.
 """
 
 import copy
@@ -36,23 +35,9 @@ _ROWS_PER_REPETITION = 100  # simulations between two repetitions if only `_chan
 class CheckedModel:
     """A model's label, the comparisons that show whether the model has changed, and its rows in the cache on disk.
 
-    Parameters
-    ----------
-    model : Model
-    statistic : Statistic or None
-        Statistic of the residuals, whose code belongs to the label.
-    cache : SimulationCache or None
-    pool : executor or None
-        Where the simulations run.
-
-    Attributes
-    ----------
-    rows : VerifiedCache or None
-        Rows of the model in the cache on disk, which are verified before they are used.
-    has_results : bool
-        Whether results of the model are known in this process.
-    unchecked : list of (n, n_structural) ndarray
-        Parameters simulated since the last comparison of the model.
+    The label contains the statistic's code. `rows` are verified before they are used, `has_results` says whether
+    results are known in this process, and `unchecked` has the parameters (n, n_structural) simulated since the last
+    comparison.
     """
 
     def __init__(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
@@ -111,17 +96,8 @@ class CheckedModel:
     def before(self, run: VerifyingRun, earlier: Callable[[], list]) -> None:
         """Compare the model before simulations, unless the last comparison was too recent.
 
-        Parameters
-        ----------
-        run : VerifyingRun
-        earlier : callable
-            Returns a known simulation, parameters and statistics, that can be repeated; called if the model has run
-            none in this process, and only rows of the disk are known.
-
-        Raises
-        ------
-        ChangedModel
-            If the model has changed; the simulations at `unchecked` may be from before or after the change.
+        `earlier` returns a known simulation, parameters and statistics, to repeat if this process has run none. Raises
+        `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
         """
         self._know_more()
         if not self._points:
@@ -143,20 +119,8 @@ class CheckedModel:
     ) -> bool:
         """Compare the model after simulations, if `before` did and, with a pool, they took long; whether it compared.
 
-        Parameters
-        ----------
-        run : VerifyingRun
-        thetas, misfit, reasons
-            Parameters (n, n_structural), statistics (n, n_numbers) and reasons of failures.
-        seconds : float
-            Wall time [s]; with a pool that runs without interruption, the time since the last comparison.
-        last : bool
-            Whether no other simulations run. If others run, the model is not compared now.
-
-        Raises
-        ------
-        ChangedModel
-            As for `before`.
+        Not while others run (`last` is false). `seconds` is the wall time; with a pool that runs without interruption,
+        the time since the last comparison. Raises `ChangedModel`, as `before`.
         """
         self._know_more()
         self.unchecked.append(thetas)

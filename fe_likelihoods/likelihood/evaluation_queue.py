@@ -64,15 +64,7 @@ class EvaluationQueue:
 
     Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
     is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect` runs
-    the simulations of one `submit` in parts.
-
-    Parameters
-    ----------
-    likelihood : FELikelihood or JointLikelihood
-    prior : Prior
-        Prior of the same parameters.
-    responses : bool
-        Whether the likelihood caches the responses as well, for its method `simulate`.
+    the simulations of one `submit` in parts. With `responses`, the likelihood caches these as well, for its `simulate`.
     """
 
     def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior, responses: bool = False) -> None:
@@ -102,22 +94,10 @@ class EvaluationQueue:
         return None if None in sizes else sum(sizes)
 
     def submit(self, coords: Any) -> list[int]:
-        """Submit points (n, ndim), without waiting for them.
+        """Submit points (n, ndim) without waiting; returns n tickets, each of which `collect` returns once.
 
         Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached in
-        memory, are finished at once.
-
-        Returns
-        -------
-        list of n int
-            Tickets, each of which `collect` returns once.
-
-        Raises
-        ------
-        ValueError
-            If the array has another shape.
-        RuntimeError
-            If the queue is closed.
+        memory, are finished at once. ValueError for another shape, RuntimeError if the queue is closed.
         """
         self._require_open()
         names = self._prior.names
@@ -140,21 +120,11 @@ class EvaluationQueue:
         return [point.ticket for point in points]
 
     def collect(self) -> list[tuple[int, float]]:
-        """Wait until at least one point is finished that was not collected.
+        """Wait until a point is finished; tickets and log-probabilities in the order in which the points finished.
 
-        Returns
-        -------
-        list of (int, float)
-            Ticket and log-probability of the finished points, in the order in which they were finished: what `log_prob`
-            returns for the point alone, to the last bit.
-
-        Raises
-        ------
-        RuntimeError
-            If no point is pending, or the queue is closed.
-        TooManyFailures, StaleCache, ChangedModel, ...
-            What ends a call of the posterior as well. Points that were finished before are returned first. Simulations
-            that have ended are cached.
+        They are what `log_prob` returns for each point alone, to the last bit. RuntimeError if no point is pending or
+        the queue is closed. What ends a call of the posterior (`TooManyFailures`, `StaleCache`, `ChangedModel`) is
+        raised after the points that were finished before have been returned; simulations that have ended are cached.
         """
         self._require_open()
         if not self._pending:
@@ -182,10 +152,7 @@ class EvaluationQueue:
         return self._collected + self._finished
 
     def close(self) -> None:
-        """Stop waiting: points that the pool has not started are cancelled, those that run are cached when they end.
-
-        Without effect if the queue is closed.
-        """
+        """Cancel points that the pool has not started; running ones are cached when they end. May be called twice."""
         if self._closed:
             return
         self._closed = True

@@ -44,25 +44,12 @@ class TooManyFailures(RuntimeError):
 class FailureLog:
     """Failed simulations of one likelihood: their number, their reasons, and the parameters of the first thousand.
 
-    Parameters
-    ----------
-    parameter_names : sequence of str
-        Names of the structural parameters.
-    max_share : float
-        Largest share of failed simulations that `check` accepts, in [0, 1]; ValueError for other numbers.
-
-    Attributes
-    ----------
-    outcomes, count, transient : int
-        Simulations with a known outcome (run here, read from the disk, or recalled); failures; failures whose cause is
-        not the model.
-    records : list of dict
-        ``{"parameters": {name: value}, "reason": str}`` of the first 1000 failures of the model and of the first 1000
-        others, with ``"seconds"`` where the duration is known, and ``"transient": True`` where the cause is not the
-        model, so that a later run simulates the point again (`fe_likelihoods.simulation.faults`).
-    reasons : collections.Counter
-        Number of failures per reason. After the first 100 reasons, further ones are counted by their text without
-        numbers (`reason_without_numbers`), and after 100 of these in two groups: failures of the model and others.
+    `max_share`, in [0, 1], is the largest share that `check` accepts. `outcomes` counts simulations with a known
+    outcome (run here, read from the disk, or recalled), `count` failures, and `transient` failures whose cause is not
+    the model, so that a later run simulates the point again. `records` has ``{"parameters": {name: value}, "reason":
+    str}`` of the first 1000 failures of each of these two kinds, with ``"seconds"`` where known and ``"transient":
+    True``. `reasons` counts failures per reason; after the first 100 reasons by their text without numbers, and after
+    100 of these in two groups, the model's failures and others.
     """
 
     def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:
@@ -120,7 +107,7 @@ class FailureLog:
     def check(self, running: int = 0) -> None:
         """Raise `TooManyFailures` if too large a share of the simulations (20 or more) failed.
 
-        Simulations that are `running` count as successes, because failures often end sooner.
+        The `running` simulations count as successes, because failures often end sooner.
         """
         n_simulations = self.outcomes + running
         if n_simulations >= _MIN_SIMULATIONS and self.count > self.max_share * n_simulations:

@@ -66,13 +66,7 @@ def check_statistic(statistic: Statistic | None, measured: np.ndarray | Comparis
 
 
 def match_measurements(model: Model, measurements: Measurements) -> Measurements:
-    """Measurements in the order of the model's channels.
-
-    Raises
-    ------
-    ValueError
-        If channels or quantities of model and measurements differ.
-    """
+    """Measurements in the order of the model's channels; ValueError if channels or quantities differ."""
     expected = [channel.name for channel in model.channels]
     got = [channel.name for channel in measurements.channels]
     if sorted(expected) != sorted(got):

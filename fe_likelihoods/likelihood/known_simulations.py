@@ -20,34 +20,16 @@ __all__ = ["KnownSimulations", "Requested"]
 
 
 class Requested(NamedTuple):
-    """Distinct simulations that were requested, with arrays that are filled in.
+    """Distinct simulations that were requested, with arrays that are filled in."""
 
-    Attributes
-    ----------
-    keys : list of n bytes
-        See `distinct_keys`.
-    thetas : (n, n_structural) float
-        Structural parameters.
-    misfit : (n, n_numbers) float
-        Statistics of the residuals; NaN where they are not known.
-    known : (n,) bool
-        Whether the statistics are known, including failures.
-    reasons : list of n str
-        Reasons of failures.
-    response : (n, n_channels, n_steps) float, optional
-        Responses, if they were requested.
-    cached, on_disk : (n,) bool
-        Whether no simulation was needed, and whether the result came from the disk.
-    """
-
-    keys: list[bytes]
-    thetas: np.ndarray
-    misfit: np.ndarray
-    known: np.ndarray
-    reasons: list[str]
-    response: np.ndarray | None
-    cached: np.ndarray
-    on_disk: np.ndarray
+    keys: list[bytes]  # n keys, see `distinct_keys`
+    thetas: np.ndarray  # structural parameters (n, n_structural)
+    misfit: np.ndarray  # statistics (n, n_numbers), NaN where not known
+    known: np.ndarray  # (n,) whether the statistics are known, including failures
+    reasons: list[str]  # of n failures
+    response: np.ndarray | None  # (n, n_channels, n_steps), if requested
+    cached: np.ndarray  # (n,) whether no simulation was needed
+    on_disk: np.ndarray  # (n,) whether the result came from the disk
 
     @classmethod
     def of(

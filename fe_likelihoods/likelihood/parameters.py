@@ -55,19 +55,10 @@ class Parameter(NamedTuple):
 
 
 def describe_parameters(model: Model, noise: Noise) -> tuple[Parameter, ...]:
-    """Describe the parameters of a model and of a noise, in this order.
+    """Describe the parameters of a model and of a noise, in this order, from the optional members of the model.
 
-    Parameters
-    ----------
-    model : Model
-        Optional members are used: ``nominal``, a mapping of names to the nominal values [SI] of which the parameters
-        are multiples; ``nominal_units``, a mapping of names to the units in which these are shown; ``parameter_units``,
-        a mapping of other parameter names to their units in words.
-    noise : Noise
-
-    Returns
-    -------
-    tuple of Parameter
+    These map names: ``nominal`` to the nominal values [SI] of which the parameters are multiples, ``nominal_units`` to
+    the units in which these are shown, and ``parameter_units`` to the units of other parameters in words.
     """
     return (*(_of_model(model, name) for name in model.parameter_names), *_of_noise(noise, model.channels))
 

@@ -25,24 +25,11 @@ class Simulated(NamedTuple):
 
 
 class RunningSimulation:
-    """A simulation that was requested of a `Simulator`.
+    """A simulation that was requested of a `Simulator`, with its parameters and their key as in `distinct_keys`.
 
-    Attributes
-    ----------
-    key, theta : bytes, (n_structural,) float
-        Structural parameters, and their key as in `distinct_keys`.
-    responses : bool
-        Whether its response was requested.
-    future : Future or None
-        Future of the pool; None if the simulation waits to be run in this process, or in a batch.
-    users : set of SimpleQueue
-        Queues of the requests that wait for it.
-    received : bool
-        Whether it has ended and was counted and cached, or was cancelled.
-    result : Simulated or None
-        Set when it was received.
-    error : BaseException or None
-        What went wrong instead, if the model is not to blame.
+    `future` is None if it waits to be run in this process or in a batch; `users` are the queues of the requests that
+    wait for it. It is `received` when it has ended and was counted and cached, or was cancelled; it then has a
+    `result`, or an `error` for which the model is not to blame.
     """
 
     __slots__ = ("error", "future", "key", "received", "responses", "result", "theta", "users")
@@ -92,7 +79,7 @@ class RunningRequests:
             self._left[name].update(self._simulator.start(new, True, self._arrived))
 
     def wait(self) -> list[Hashable]:
-        """Wait until a request has ended; returns the names of all that have, in the order in which they began.
+        """Wait until a request has ended; names of all that have, in the order in which they began.
 
         A simulation whose process was lost counts as ended: `Simulator.simulate` runs it again.
         """

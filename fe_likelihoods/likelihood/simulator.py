@@ -84,37 +84,15 @@ class _Pool:
 
 
 class Simulator:
-    """A model's simulations, compared with measurements; each is run once.
+    """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
     `statistics` and, where responses are needed, `simulate` are the only places where a likelihood requests
-    simulations; samplers without barriers and guides use `start`, `wait` and `leave`.
-
-    Parameters
-    ----------
-    model : Model
-    measurements : Measurements
-        Measurements in the order of the model's channels.
-    statistic : Statistic, optional
-        Statistic of the residuals; by default the sums of squares.
-    time_shifts : mapping of str to float, optional
-        Largest unknown time shifts of channels [s].
-    pool, cache, memory_rows, memory_bytes, max_failure_share
-        As for `FELikelihood`, which also has the errors that are raised.
-
-    Attributes
-    ----------
-    measured : (n_channels, n_steps) float, or Comparison
-        What responses are compared with: the measured values, or a `Comparison` where samples are missing.
-    simulations, cache_hits, disk_hits : int
-        Simulations run by this object in this process; rows whose statistics were cached; those read from the disk.
-    failures : FailureLog
-        Failed simulations, including failures known from the cache on disk.
-    memory_cache, response_memory : MemoryCache, ResponseMemory
-        The statistics and the responses that are cached in memory.
-    chunk_size : int
-        Number of simulations between two writes to the disk, for simulation in chunks; adapted to their duration.
-    when_simulated : callable or None
-        Called with the number of simulations that have ended, in this process only.
+    simulations; samplers without barriers and guides use `start`, `wait` and `leave`. Options are those of
+    `FELikelihood`; the statistic is the sums of squares by default, and `time_shifts` are the largest unknown ones [s].
+    `measured` are values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`,
+    `cache_hits` and `disk_hits` count simulations run by this object in this process, cached rows, and rows from the
+    disk; `failures` include known ones from the disk. `chunk_size` simulations are run between two writes to the disk,
+    adapted to their duration; `when_simulated` is called with the number that have ended, in this process only.
     """
 
     def __init__(
@@ -186,10 +164,7 @@ class Simulator:
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of everything the statistics are known to depend on: `simulation_key` and code.
-
-        The user's code and values are taken as they were when the simulator was made.
-        """
+        """Hex digest of all that the statistics depend on: `simulation_key`, and the code when this object was made."""
         text = f"{self.simulation_key} {self._checked.label.identity}"
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -214,33 +189,16 @@ class Simulator:
     # requests -----------------------------------------------------------------------------------------------------
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels), without unknown time shifts: the first columns of `statistics`.
-
-        In the squared SI unit of the channel; NaN where there is no usable simulation.
-        """
+        """Sums of squared residuals (n, n_channels) [SI unit squared], without time shifts; NaN for failures."""
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
     def statistics(self, thetas: np.ndarray, is_possible: Callable[[], bool] | None = None) -> np.ndarray:
-        """Statistics of the residuals that the noise needs: for white noise the sums of squares.
+        """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural); NaN if failed.
 
-        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped.
-
-        Parameters
-        ----------
-        thetas : (n, n_structural) float
-            Structural parameters only.
-        is_possible : callable, optional
-            Called before simulations; if it returns False, nothing is simulated, and rows that are not cached are NaN.
-
-        Returns
-        -------
-        (n, n_numbers) float
-            NaN where there is no usable simulation.
-
-        Raises
-        ------
-        TooManyFailures, ChangedModel, StaleCache
-            Simulations that have ended are cached, except after the model has changed.
+        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. If `is_possible`, called
+        before simulations, returns False, nothing is simulated, and rows that are not cached are NaN. Raises
+        `TooManyFailures`, `ChangedModel` or `StaleCache`; simulations that have ended are cached, except after the
+        model has changed.
         """
         thetas = as_rows(thetas, self.model.parameter_names)
         if not np.isfinite(thetas).all():
@@ -257,15 +215,11 @@ class Simulator:
         return misfit if len(keys) == len(thetas) else misfit[distinct]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses of the model at structural parameters (n, n_structural); they and their statistics are cached.
+        """Responses (n, n_channels, n_steps) [SI] at structural parameters (n, n_structural); NaN and reason if failed.
 
-        Duplicates are simulated once, and cached responses are reused. A point whose statistics are cached without its
-        response is simulated again, unless its simulation failed. Raises the errors of `statistics`.
-
-        Returns
-        -------
-        SimulationBatch
-            Responses (n, n_channels, n_steps) [SI], NaN where there is no usable simulation, and the reasons.
+        They and their statistics are cached. Duplicates are simulated once, and cached responses are reused. A point
+        whose statistics are cached without its response is simulated again, unless it failed. Raises the errors of
+        `statistics`.
         """
         thetas = as_rows(thetas, self.model.parameter_names)
         finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
@@ -288,9 +242,9 @@ class Simulator:
         return SimulationBatch(response, reasons)
 
     def has_responses(self, keys: list[bytes]) -> np.ndarray:
-        """Whether `simulate` needs no simulation for each of the distinct keys: (n,) bool, see `distinct_keys`.
+        """Whether `simulate` needs no simulation for each distinct key (n,); responses on disk are read into memory.
 
-        Responses of the cache on disk are read into memory. Some may be simulated again for verification.
+        Some may be simulated again for verification.
         """
         requested = self._requested_responses(keys)
         self._known.fill(requested, self._run)
@@ -316,16 +270,10 @@ class Simulator:
         return misfit
 
     def look_up(self, keys: list[bytes], distinct: list[int], on_disk: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Cached statistics (n, n_numbers) of distinct keys, and whether they are cached (n,); nothing is simulated.
+        """Cached statistics (n, n_numbers) of distinct keys, and whether they are cached (n,), without new simulations.
 
-        Parameters
-        ----------
-        keys : list of n bytes
-            See `distinct_keys`.
-        distinct : list of int
-            For every requested row, the index of its key, for the counts.
-        on_disk : bool
-            Whether to look in the cache on disk as well. Some of its rows may be simulated again for verification.
+        `distinct` has the index of the key of every requested row, for the counts. With `on_disk`, some rows of the
+        cache may be simulated again for verification.
         """
         misfit, known = self.memory_cache.look_up(keys, self.n_numbers)
         if all(known):
@@ -342,18 +290,10 @@ class Simulator:
         return misfit, known
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
-        """Cache statistics that are known from an earlier run in memory, without a simulation.
+        """Cache statistics (n, n_numbers) of an earlier run in memory, unsimulated; ValueError for another shape.
 
-        Failures are recorded, and all rows count for `max_failure_share`. Rows that are cached already are not changed.
-        Nothing is written to the cache on disk.
-
-        Parameters
-        ----------
-        thetas : (n, n_structural) float
-        statistics : (n, n_numbers) float
-            What `statistics` returned for them; ValueError for another shape.
-        reasons : sequence of n str
-            Reasons of failures; empty where the simulation succeeded.
+        Failures (with a reason) are recorded, and all rows count for `max_failure_share`. Rows that are cached already
+        are not changed. Nothing is written to the cache on disk.
         """
         thetas, statistics = as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
         if statistics.shape != (len(thetas), self.n_numbers) or len(reasons) != len(thetas):
@@ -408,28 +348,11 @@ class Simulator:
         return RunningRequests(self)
 
     def start(self, keys: Sequence[bytes], responses: bool, arrived: SimpleQueue) -> list[RunningSimulation]:
-        """Submit simulations to the pool, unless they run already; returns without waiting for them.
+        """Submit simulations of n distinct keys to the pool, unless they run already; returns without waiting for them.
 
-        Without a pool that takes single items, they are run by `wait`.
-
-        Parameters
-        ----------
-        keys : sequence of n bytes
-            Keys of structural parameters, distinct, see `distinct_keys`.
-        responses : bool
-            Whether the responses are requested.
-        arrived : SimpleQueue
-            Receives each `RunningSimulation` that has ended in the pool, for `wait` or `receive`. Pass simulations that
-            are no longer needed to `leave`.
-
-        Returns
-        -------
-        list of n RunningSimulation
-
-        Raises
-        ------
-        TooManyFailures, ChangedModel
-            As for `statistics`.
+        Without a pool that takes single items, they are run by `wait`. `arrived` receives each simulation that has
+        ended in the pool, for `wait` or `receive`; pass those that are no longer needed to `leave`. Raises
+        `TooManyFailures` and `ChangedModel`.
         """
         thetas = thetas_of(keys, self.n_structural)
         if not self.streams:
@@ -463,10 +386,10 @@ class Simulator:
         return wanted
 
     def wait(self, waiting: Collection[RunningSimulation], arrived: SimpleQueue) -> list[RunningSimulation]:
-        """Wait until some simulations have ended, which are then counted and cached; see `receive`.
+        """Wait until some simulations have ended, which are then counted and cached; each has a `result` or an `error`.
 
-        Unless they run in a pool, a first part of `waiting`, all simulations of one `start`, is run here. Returns the
-        simulations that have ended, with `result` or `error` set; raises the errors of `start`.
+        Unless they run in a pool, a first part of `waiting`, all simulations of one `start`, is run here, with its
+        errors.
         """
         if self.streams:
             ended = take_all(arrived, wait=True)

@@ -16,63 +16,27 @@ __all__ = ["Accumulator"]
 
 @dataclass(eq=False)
 class Accumulator:
-    """Evaluates a quantity of responses and accumulates its statistics.
+    """Evaluates a quantity of responses and accumulates its statistics, by result and by sample.
 
     A result is the value of the quantity for one response. Without noise, equal samples share one result. With noise,
     every sample has its own.
-
-    Parameters
-    ----------
-    members : list of ndarray
-        Sample indices for each distinct theta.
-    noise : SampleNoise, ModelError or None
-        Noise of every sample, None for a prediction without noise.
-    evaluate : callable or None
-        The quantity as a function of a response (n_channels, n_steps) [SI], None for histories.
-    rows : list of int or None
-        Rows of the response whose histories are wanted, None for another quantity.
-    result_of_sample : ndarray, shape (n,)
-        Index of each sample's result.
-    probabilities : tuple of float
-        Probabilities of the quantiles.
-    memory_bytes : int or None
-        Largest size of the retained results [bytes], None for no limit.
-    seeds : numpy.random.SeedSequence
-        Seeds for the noise and for choosing the retained samples.
-
-    Attributes
-    ----------
-    moments : RunningMoments
-        Mean and variance of the results, for histories without noise.
-    noise_variance : RunningMoments
-        Mean variance of the noise, for histories; per step if the noise depends on the response.
-    retained : RetainedResults or None
-        Results for quantiles, None if there are none.
-    failed : list of ndarray
-        Indices of samples that are left out.
-    collapsed : list of ndarray
-        Indices of those whose structure collapsed.
-    reasons : Counter
-        Number of samples left out for each reason, without the durations of the simulations.
-    shape : tuple of int or None
-        Shape of a result, None as long as it is unknown.
     """
 
-    members: list[np.ndarray]
-    noise: SampleNoise | ModelError | None
-    evaluate: Callable[[np.ndarray], np.ndarray] | None
-    rows: list[int] | None
-    result_of_sample: np.ndarray
-    probabilities: tuple[float, ...]
-    memory_bytes: int | None
-    seeds: np.random.SeedSequence
-    moments: RunningMoments = field(default_factory=RunningMoments)
-    noise_variance: RunningMoments = field(default_factory=RunningMoments)
-    retained: RetainedResults | None = None
-    failed: list[np.ndarray] = field(default_factory=list)
-    collapsed: list[np.ndarray] = field(default_factory=list)
-    reasons: Counter = field(default_factory=Counter)
-    shape: tuple[int, ...] | None = None
+    members: list[np.ndarray]  # sample indices for each distinct theta
+    noise: SampleNoise | ModelError | None  # None: without noise
+    evaluate: Callable[[np.ndarray], np.ndarray] | None  # of a response (n_channels, n_steps) [SI]; None for histories
+    rows: list[int] | None  # of the response whose histories are wanted, or None
+    result_of_sample: np.ndarray  # (n,)
+    probabilities: tuple[float, ...]  # of the quantiles
+    memory_bytes: int | None  # of the retained results [bytes]; None: no limit
+    seeds: np.random.SeedSequence  # of the noise and of the choice of retained samples
+    moments: RunningMoments = field(default_factory=RunningMoments)  # of histories without noise
+    noise_variance: RunningMoments = field(default_factory=RunningMoments)  # of histories; per step for some noises
+    retained: RetainedResults | None = None  # results for quantiles
+    failed: list[np.ndarray] = field(default_factory=list)  # indices of samples that are left out
+    collapsed: list[np.ndarray] = field(default_factory=list)  # indices of samples whose structure collapsed
+    reasons: Counter = field(default_factory=Counter)  # samples left out per reason, without durations
+    shape: tuple[int, ...] | None = None  # of a result; None until it is known
 
     def allocate(self, shape: tuple[int, ...]) -> None:
         """Allocate memory for retained results, once the shape of a result is known."""
@@ -91,16 +55,9 @@ class Accumulator:
         self.retained = RetainedResults(self.result_of_sample, shape, dtype, limit, rng)
 
     def add(self, start: int, responses: np.ndarray, reasons: list[str]) -> None:
-        """Add the responses of the distinct thetas from index `start` on.
+        """Add responses (m, n_channels, n_steps) [SI] of the distinct thetas from index `start` on.
 
-        Parameters
-        ----------
-        start : int
-            Index of the first theta.
-        responses : ndarray, shape (m, n_channels, n_steps)
-            The responses [SI].
-        reasons : list of str
-            Why each simulation failed, empty for successful ones.
+        The reasons say why each simulation failed, empty for a success.
         """
         members = self.members[start : start + len(responses)]
         usable = []

@@ -1,9 +1,8 @@
 """The excitation of a prediction, and the state of the structure at its beginning.
 
-A model with memory, such as reinforced concrete after cracking, responds to an earthquake according to what happened
-before. A prediction under another record therefore starts from one of two states: "virgin", the state of the model at
-the beginning of its own excitation, or "end", the state at the end of that excitation. For the second, the model runs
-its own excitation, a pause, and the new record, and only the response to the new record is used.
+A structure with memory, such as cracked concrete, responds to an earthquake according to what happened before. A
+prediction under another record starts "virgin", as the model's own excitation does, or from the "end" of that
+excitation: the model then runs its own excitation, a pause, and the new record, whose response alone is used.
 """
 
 import warnings
@@ -21,24 +20,12 @@ STATES = ("virgin", "end")
 
 
 class Excitation(NamedTuple):
-    """A model under the excitation of a prediction.
-
-    Attributes
-    ----------
-    model : Model
-        The model under the whole excitation.
-    first : int
-        Index of the response sample at which the prediction begins.
-    n_steps : int
-        Number of samples in the prediction.
-    from_state : str
-        State at the beginning of the prediction, "virgin" or "end".
-    """
+    """A model under the whole excitation of a prediction."""
 
     model: Model
-    first: int
-    n_steps: int
-    from_state: str
+    first: int  # response sample at which the prediction begins
+    n_steps: int  # samples in the prediction
+    from_state: str  # at the beginning of the prediction, "virgin" or "end"
 
     def simulate(self, thetas: np.ndarray, pool: Any = None, stored: StoredResponses | None = None) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) of the prediction at parameter sets (n, n_parameters).
@@ -50,28 +37,10 @@ class Excitation(NamedTuple):
 
 
 def chosen_state(model: Model, record: Any, from_state: str | None, stacklevel: int = 3) -> str:
-    """Return the state from which a prediction starts.
+    """State from which a prediction starts, "virgin" by default, which a warning names if the model is path dependent.
 
-    Parameters
-    ----------
-    model : Model
-        The model. Without an attribute ``path_dependent`` it counts as path dependent.
-    record : Record or None
-        The new excitation, None for the model's own.
-    from_state : {"virgin", "end"} or None
-        The state, None for the default.
-    stacklevel : int
-        Place of the line to which a warning refers, as in `warnings.warn`.
-
-    Returns
-    -------
-    str
-        "virgin" or "end". The default is "virgin"; a warning names it if the model is path dependent.
-
-    Raises
-    ------
-    ValueError
-        If the state is another one, or is "end" without a record.
+    A model without the attribute ``path_dependent`` counts as such. ValueError for any other state, or "end" without a
+    record.
     """
     if from_state is None:
         if record is not None and hasattr(model, "with_record") and getattr(model, "path_dependent", True):
@@ -94,28 +63,9 @@ def chosen_state(model: Model, record: Any, from_state: str | None, stacklevel: 
 
 
 def excite(model: Model, record: Any, from_state: str, rest: float) -> Excitation:
-    """Return the model under the excitation of a prediction.
+    """The model under a record (None: its own excitation), after a pause `rest` [s] if it starts from its "end".
 
-    Parameters
-    ----------
-    model : Model
-        The model.
-    record : Record or None
-        The new excitation, None for the model's own.
-    from_state : {"virgin", "end"}
-        State at the beginning of the prediction.
-    rest : float
-        Pause before the new record if the state is "end" [s].
-
-    Returns
-    -------
-    Excitation
-        The model and the samples of the prediction.
-
-    Raises
-    ------
-    ValueError
-        If the model has one excitation only, or cannot continue from the end of its own.
+    ValueError if the model has one excitation only, or cannot continue from the end of its own.
     """
     if record is None:
         return Excitation(model, 0, model.n_steps, from_state)

@@ -28,25 +28,16 @@ _REPLICATES = 100  # resamplings for the errors of the curve
 class FragilityCurve(NamedTuple):
     """Lognormal fragility curve, P(exceed | intensity) = Phi(ln(intensity / median) / dispersion).
 
-    Attributes
-    ----------
-    median : float
-        Intensity at which the probability is one half.
-    dispersion : float
-        Standard deviation of the log capacity in terms of intensity [-].
-    median_error, dispersion_error : float
-        Errors for fixed records: from the uncertainty of ratios and event population, if there are any; otherwise Monte
-        Carlo errors, by resampling the samples (which all records share). They do not include the effect of other
-        records. They are inf if more than a tenth of the resamplings do not determine a curve.
-    unit : str
-        Unit of the intensities; empty where it is not known.
+    The errors are for fixed records, without the effect of other records: from the uncertainty of ratios and event
+    population, if there are any; otherwise Monte Carlo errors, by resampling the samples (which all records share).
+    They are inf if more than a tenth of the resamplings do not determine a curve.
     """
 
-    median: float
-    dispersion: float
+    median: float  # intensity at which the probability is one half
+    dispersion: float  # standard deviation of the log capacity in terms of intensity [-]
     median_error: float = np.inf
     dispersion_error: float = np.inf
-    unit: str = ""
+    unit: str = ""  # of the intensities; empty where it is not known
 
     def __str__(self) -> str:
         median, dispersion = number(self.median), number(self.dispersion)
@@ -132,29 +123,10 @@ def curve_with_errors(
     draws: np.ndarray | None,
     rng: np.random.Generator,
 ) -> FragilityCurve:
-    """Fit the curve to probabilities of samples, with errors.
+    """Fit the curve to samples' probabilities to exceed (n_records, n_samples); `counted` is 1 where a sample counts.
 
-    Parameters
-    ----------
-    intensity : (n_records,) ndarray
-        Positive intensities.
-    exceeds, counted : (n_records, n_samples) ndarray
-        Probability of each sample to exceed, and 1 or 0 whether it counts.
-    effective : float
-        Effective number of independent samples.
-    draws : (n_draws, n_records) ndarray, or None
-        Draws of the probabilities, to each of which a curve is fitted for the errors. None: the samples are resampled.
-    rng : numpy.random.Generator
-        Draws of the resampling.
-
-    Returns
-    -------
-    FragilityCurve
-
-    Raises
-    ------
-    ValueError
-        As `fit_fragility`.
+    The errors come from curves fitted to `draws` (n_draws, n_records) of the probabilities; None: the samples are
+    resampled, of which `effective` are independent. ValueError as `fit_fragility`.
     """
     n = exceeds.shape[1]
     curve = fit_fragility(intensity, exceeds.sum(axis=1), counted.sum(axis=1))

@@ -20,20 +20,10 @@ __all__ = ["HeldOutScore", "HeldOutScores", "LeftOutTests", "leave_one_out"]
 
 
 class HeldOutScore(NamedTuple):
-    """How well an event is predicted from the other ones.
+    """How well an event is predicted from the other ones."""
 
-    Attributes
-    ----------
-    scores : HistoryScores or QuantityScores
-        Scores of the prediction against the event's measurements.
-    log_density : float
-        Log predictive density of all data in the event, see `LeftOut`; NaN without the event's evidence.
-    prediction : Prediction
-        The prediction.
-    """
-
-    scores: HistoryScores | QuantityScores
-    log_density: float
+    scores: HistoryScores | QuantityScores  # against the event's measurements
+    log_density: float  # predictive, of all its data, see `LeftOut`; NaN without its evidence
     prediction: Prediction
 
     @property

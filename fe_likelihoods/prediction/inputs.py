@@ -31,45 +31,18 @@ __all__ = [
 
 
 class PredictionSource(NamedTuple):
-    """What a prediction is made with.
-
-    Attributes
-    ----------
-    model : Model
-        The model.
-    noise : Noise or None
-        The noise, None for a bare model. For a noise that was integrated out, the noise with its parameters.
-    likelihood : FELikelihood or None
-        The likelihood, None for a bare model.
-    executor : Executor or None
-        Where simulations run, None for this process.
-    """
+    """What a prediction is made with; a bare model has no noise and no likelihood."""
 
     model: Model
-    noise: Any
+    noise: Any  # for a noise that was integrated out, the noise with its parameters
     likelihood: FELikelihood | None
-    executor: Any
+    executor: Any  # where simulations run, None: in this process
 
 
 def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
-    """Return the model, the noise, the likelihood and the executor of an object.
+    """Model, noise, likelihood and executor (default: the likelihood's pool) of a posterior, likelihood or model.
 
-    Parameters
-    ----------
-    posterior_or_model : Posterior, FELikelihood or Model
-        The object to predict with.
-    pool : optional
-        Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
-
-    Returns
-    -------
-    PredictionSource
-        The parts.
-
-    Raises
-    ------
-    ValueError
-        If the object is none of the three.
+    ValueError if the object is none of the three.
     """
     likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
     if hasattr(likelihood, "measurements") and hasattr(likelihood, "model"):
@@ -83,30 +56,10 @@ def read_source(posterior_or_model: Any, pool: Any = None) -> PredictionSource:
 
 
 def part_of(posterior_or_model: Any, samples: Any, part: str | None, noise: bool) -> tuple[Any, Any]:
-    """Return one likelihood of a `JointLikelihood` and its samples; anything else as it is given.
+    """The likelihood named `part` of a `JointLikelihood` and its samples; anything else as it is given.
 
-    Parameters
-    ----------
-    posterior_or_model : Posterior, FELikelihood, JointLikelihood or Model
-        The object to predict with.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        Samples of its parameters.
-    part : str or None
-        Name of the likelihood, for a `JointLikelihood` only.
-    noise : bool
-        Whether the noise parameters are needed.
-
-    Returns
-    -------
-    object
-        The object to predict with.
-    samples
-        Samples of its parameters.
-
-    Raises
-    ------
-    ValueError
-        If there is one model and `part` is given, or several and it is not.
+    `noise` says whether the noise parameters are needed. ValueError if there is one model and `part` is given, or
+    several and it is not.
     """
     likelihood = getattr(posterior_or_model, "likelihood", posterior_or_model)
     if not isinstance(likelihood, JointLikelihood):
@@ -128,32 +81,12 @@ def simulates_in_batches(model: Model) -> bool:
 def split_samples(
     source: PredictionSource, samples: Any, noise: bool | str, other_record: bool = False
 ) -> tuple[np.ndarray, SampleNoise | ModelError | None]:
-    """Split samples into structural parameters and, if wanted, the noise or the model's error of each sample.
+    """Structural parameters (n, n_structural) of samples, and the noise or model error of each if wanted, else None.
 
-    Parameters
-    ----------
-    source : PredictionSource
-        The model and the noise.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        All parameters, or without `noise` the structural parameters alone.
-    noise : bool or str
-        Whether the noise is wanted; the name of an event for the noise that was calibrated with it
-        (``groups="event"``); "model" for the model error alone (`model_error`).
-    other_record : bool
-        Whether the prediction is under a record that differs from the likelihood's record.
-
-    Returns
-    -------
-    thetas : ndarray, shape (n, n_structural)
-        Structural parameters.
-    sample_noise : SampleNoise, ModelError or None
-        Noise of each sample, None if it is not wanted.
-
-    Raises
-    ------
-    ValueError
-        If the samples have another shape, are not finite, or give an impossible noise; or if noise is wanted for a bare
-        model, or the noise has no ``standard_deviations``.
+    `noise` is whether the noise is wanted; the name of an event for the noise that was calibrated with it
+    (``groups="event"``); or "model" for the `model_error` alone. Without it, samples may be structural parameters
+    alone. `other_record` says that the record is not the likelihood's. ValueError for samples of another shape, not
+    finite, or with an impossible noise, and if the model is bare or the noise has no ``standard_deviations``.
     """
     model, noise_model = source.model, source.noise
     structural = tuple(model.parameter_names)

@@ -1,12 +1,11 @@
-r"""Model error in the response of a structure, without the sensor noise.
+r"""Model error in the response of a structure, without the sensor noise. See ``docs/theory/prediction.rst``.
 
 A noise whose standard deviation follows the response (`GaussianNoise` with ``level="measured"`` or ``"response"``) has
-two parts: the sensor noise, which is no motion of the structure, and the model error. Their variances add,
-:math:`\sigma^2 = s^2 + \sigma_m^2`. The likelihood takes both as white. Peaks are sensitive to this: the largest of
-many independent errors adds to each peak, while model errors are motions of a structure and change as slowly as its
-response. A draw of the model error therefore has the Fourier amplitudes of the response, random phases, and the
-standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself (frequency bands) keeps it, and the
-white sensor noise is subtracted per frequency. See ``docs/theory/prediction.rst``.
+two parts, the sensor noise, which is no motion of the structure, and the model error: :math:`\sigma^2 = s^2 +
+\sigma_m^2`. The likelihood takes both as white, but the largest of many independent errors adds to each peak, while
+model errors change as slowly as the response. A draw of the model error therefore has the Fourier amplitudes of the
+response, random phases, and the standard deviation :math:`\sigma_m` at each step. A noise that has a spectrum itself
+(frequency bands) keeps it, and the white sensor noise is subtracted per frequency.
 """
 
 from typing import Any, NamedTuple
@@ -19,21 +18,11 @@ __all__ = ["ModelError", "model_error"]
 
 
 class ModelError(NamedTuple):
-    """Model error of every sample; a prediction uses it like a `SampleNoise`.
-
-    Attributes
-    ----------
-    noise : Noise
-        The noise.
-    deviations : ndarray, shape (n, n_noise)
-        Noise parameters.
-    dt : float
-        Time step of the responses [s].
-    """
+    """Model error of every sample; a prediction uses it like a `SampleNoise`."""
 
     noise: Any
-    deviations: np.ndarray
-    dt: float
+    deviations: np.ndarray  # noise parameters (n, n_noise)
+    dt: float  # time step of the responses [s]
 
     def of_response(self, parameters: np.ndarray, response: np.ndarray) -> np.ndarray:
         """Standard deviations (n_channels, n_steps) [SI] of one sample, without the sensor noise."""
@@ -55,26 +44,11 @@ class ModelError(NamedTuple):
 
 
 def model_error(noise: Any, parameters: np.ndarray, dt: float) -> ModelError:
-    """Return the model error for samples of the noise parameters.
+    """The model error for samples (n, n_noise) of the noise parameters, at a time step of the responses [s].
 
-    Parameters
-    ----------
-    noise : Noise
-        With a method ``response_deviations``, such as `GaussianNoise` with ``level="response"``, and ``sensor``, the
-        known standard deviations of the sensors, or None.
-    parameters : (n, n_noise) float
-        Noise parameters.
-    dt : float
-        Time step of the responses [s].
-
-    Returns
-    -------
-    ModelError
-
-    Raises
-    ------
-    ValueError
-        If the noise does not follow the response: its levels do not tell the model error from sensor noise.
+    The noise needs a method ``response_deviations``, and ``sensor``, the known standard deviations of the sensors or
+    None. ValueError if the noise does not follow the response: its levels do not tell the model error from sensor
+    noise.
     """
     if not follows_response(noise):
         raise ValueError(

@@ -287,28 +287,10 @@ def at_parameters(parameters: Mapping[str, float], names: Sequence[str], n: int)
 def draw_new_event(
     hierarchy: Hierarchy, names: list[str], n: int, noise: Any, seed: np.random.SeedSequence
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draw the parameters of a new event, and their weights in single populations.
+    """Draw named parameters of a new event, m arrays each, and their weights (n_populations, m) in single populations.
 
-    Parameters
-    ----------
-    hierarchy : Hierarchy
-        The population.
-    names : list of str
-        Parameters to draw.
-    n : int
-        Number of draws.
-    noise : Noise or None
-        Noise whose parameters are among the names; draws where it is impossible are left out, with a warning if they
-        are more than 1 %.
-    seed : numpy.random.SeedSequence
-        Seed of the draws.
-
-    Returns
-    -------
-    draws : dict of str to (m,) ndarray
-        Draws of these parameters.
-    weights : (n_populations, m) ndarray
-        See `Hierarchy.population_weights`.
+    See `Hierarchy.population_weights`. Draws where the noise, whose parameters are among the names, is impossible are
+    left out, with a warning if they are more than 1 %.
     """
     own = [name for name in hierarchy.posterior.varying if name not in names]
     draws = hierarchy.new_test(n, [*names, *own], np.random.default_rng(seed))

@@ -21,34 +21,12 @@ __all__ = ["predict_channels_of"]
 def predict_channels_of(
     model: Model, source: PredictionSource, samples: Any, noise: bool | str
 ) -> tuple[PredictionSource, Any, str]:
-    """Return source and samples with which a posterior predicts the channels of another model.
+    """Source and samples with which a posterior predicts the channels of another model that has the same parameters.
 
-    Parameters
-    ----------
-    model : Model
-        A model with the same parameters.
-    source : PredictionSource
-        The model and the noise of the posterior.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        Samples of its parameters.
-    noise : bool or str
-        Whether the noise is wanted, as for `split_samples`.
-
-    Returns
-    -------
-    source : PredictionSource
-        With the model and the noise of its channels.
-    samples
-        With the parameters of this noise; as they were if it is not wanted.
-    remark : str
-        Which channels have the mean noise of which others; empty if there are none, or the noise is not wanted.
-
-    Raises
-    ------
-    ValueError
-        If there is no likelihood; the model has other parameters; or, if the noise is wanted, a channel shares its
-        quantity with no measured channel, a measured channel has another quantity, or the noise has no method
-        ``with_channels``. As `split_samples` for samples that do not fit.
+    The samples get the noise parameters of these channels, if the noise is wanted (`noise` as for `split_samples`). The
+    remark says which channels have the mean noise of which others, and is else empty. ValueError if there is no
+    likelihood; the model has other parameters; or, if the noise is wanted, a channel shares its quantity with no
+    measured channel, a measured channel has another quantity, or the noise has no method ``with_channels``.
     """
     if source.likelihood is None:
         raise ValueError(

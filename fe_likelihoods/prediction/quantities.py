@@ -42,35 +42,21 @@ _AS_FAR, _MOVED = 0.97, 0.01  # of the largest displacement so far, as far as wh
 
 @dataclass(frozen=True, eq=False)
 class ChannelQuantity:
-    """A number computed from the history of one channel, or of several.
+    """A number from the history of one channel, or of several; ``str(quantity)`` is, for example, "peak of deck".
 
-    Parameters
-    ----------
-    channel : str
-        Name of the channel.
-    function : callable
-        Function of the history (n_steps,) [SI] that returns a number [SI].
-    part : slice
-        Samples of the history that the function receives, such as the second half of a test. Default: all.
-    others : tuple of str or ndarray
-        Further arguments of the function: histories of other channels, by name, or arrays of the same number of
-        samples [SI], such as an imposed displacement. The part is taken of each.
-    timed : bool
-        Whether the last argument of the function is the time step [s].
-    describe : callable, optional
-        Function that returns a `Channel` with the number's name, dimension and display unit for the `Channel` of the
-        history, or raises ValueError for a channel that has no such number. Default: the channel itself.
-    name : str
-        What the number is, such as "peak"; ``str(quantity)`` is "peak of deck".
+    `others` are further arguments of the function: histories of other channels, by name, or arrays of the same number
+    of samples [SI], such as an imposed displacement; the part is taken of each. `describe` returns a `Channel` with the
+    number's name, dimension and display unit for the `Channel` of the history, or raises ValueError for a channel that
+    has no such number; by default it is the channel itself.
     """
 
     channel: str
-    function: Callable[..., float]
-    part: slice = field(default_factory=lambda: slice(None))
+    function: Callable[..., float]  # of the history (n_steps,) [SI], returns a number [SI]
+    part: slice = field(default_factory=lambda: slice(None))  # samples of the history that the function receives
     others: tuple[str | np.ndarray, ...] = ()
-    timed: bool = False
+    timed: bool = False  # whether the last argument is the time step [s]
     describe: Callable[[Channel], Channel] | None = None
-    name: str = "quantity"
+    name: str = "quantity"  # what the number is, such as "peak"
 
     def __str__(self) -> str:
         return f"{self.name} of {self.channel}"
@@ -108,21 +94,11 @@ Quantity = None | str | ChannelQuantity | Sequence[str] | Sequence[ChannelQuanti
 
 
 class Evaluator(NamedTuple):
-    """How a quantity is computed from the response of a model.
+    """How a quantity is computed from the response of a model."""
 
-    Attributes
-    ----------
-    rows : list of int or None
-        Rows of the response whose histories are the quantity, None for another quantity.
-    function : callable or None
-        Function of the response (n_channels, n_steps) [SI], None for histories.
-    channels : tuple of Channel
-        Channels of the quantity, with its dimension and display unit; empty for a function of the whole response.
-    """
-
-    rows: list[int] | None
-    function: Callable[[np.ndarray], Any] | None
-    channels: tuple[Channel, ...]
+    rows: list[int] | None  # whose histories are the quantity, None for others
+    function: Callable[[np.ndarray], Any] | None  # of the response (n_channels, n_steps) [SI]
+    channels: tuple[Channel, ...]  # of the quantity; empty for a function of the whole response
 
 
 def peak(channel: str, part: slice = slice(None)) -> ChannelQuantity:
@@ -248,24 +224,9 @@ def final_value(channel: str, samples: int = 1) -> ChannelQuantity:
 
 
 def measured_quantity(quantity: Any, measurements: Measurements) -> np.ndarray:
-    """Evaluate a quantity of channels for measurements.
+    """Measured values, () or (n_quantities,) [SI], of one `ChannelQuantity` or a sequence, as it was predicted.
 
-    Parameters
-    ----------
-    quantity : ChannelQuantity or sequence of ChannelQuantity
-        The quantity, as it was predicted.
-    measurements : Measurements
-        Measurements of these channels.
-
-    Returns
-    -------
-    ndarray, shape () or (n_quantities,)
-        The measured values [SI].
-
-    Raises
-    ------
-    ValueError
-        If the quantity is another one, the measurements lack a channel, or samples of it are missing.
+    ValueError for any other quantity, or if the measurements lack a channel or samples of it.
     """
     several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
     if not isinstance(several, Sequence) or not all(isinstance(each, ChannelQuantity) for each in several):
@@ -373,28 +334,10 @@ def _of_failure(channel: Channel) -> Channel:
 
 
 def evaluator(quantity: Quantity, channels: Sequence[Channel], dt: float, n_steps: int | None = None) -> Evaluator:
-    """Return how a quantity is computed from responses.
+    """How a quantity of `propagate` is computed from responses of these channels, with the time step [s].
 
-    Parameters
-    ----------
-    quantity : Quantity
-        The quantity, as in `fe_likelihoods.prediction.propagation.propagate`.
-    channels : sequence of Channel
-        Channels of the model.
-    dt : float
-        Time step of the model [s].
-    n_steps : int, optional
-        Number of history steps, to check the arrays of a quantity before the simulations.
-
-    Returns
-    -------
-    Evaluator
-        Rows of histories, or a function of the response.
-
-    Raises
-    ------
-    ValueError
-        If this is not a quantity, it names an unknown channel, or one that has no such number.
+    With `n_steps`, the arrays of a quantity are checked before the simulations. ValueError if this is not a quantity,
+    it names an unknown channel, or one that has no such number.
     """
     channels = tuple(channels)
     names = [channel.name for channel in channels]

@@ -209,22 +209,8 @@ def exceedance(
 def with_collapses(found: Exceedance, prediction: Prediction, level: float = 0.95) -> Exceedance:
     """Count the samples of a prediction whose structure collapsed as exceedances of every limit.
 
-    A probability that leaves them out speaks of the structures that stand, and is too low.
-
-    Parameters
-    ----------
-    found : Exceedance
-        Probability among the samples that did not fail.
-    prediction : Prediction
-        The prediction with its collapsed samples.
-    level : float
-        Probability of the interval.
-
-    Returns
-    -------
-    Exceedance
-        With p = c + (1 - c) p', for the share c of collapsed samples and the probability p' among the others. The ends
-        of the interval combine those of c and p'.
+    A probability that leaves them out speaks of the structures that stand, and is too low. For a share c of collapsed
+    samples and the probability p' among the others, p = c + (1 - c) p'; the interval combines the ends of c and p'.
     """
     n_collapsed = len(prediction.collapsed)
     if not n_collapsed:
@@ -294,22 +280,8 @@ def exceedance_probability(
 ) -> Exceedance:
     """Probability of an exceedance with ratios, or in an event population, from the quantiles of its draws.
 
-    Parameters
-    ----------
-    values : (n, ...) ndarray
-        Values of the samples, before they are multiplied by ratios.
-    limits : ndarray
-        Limits that are broadcast to the values.
-    spread : EventSpread
-        Ratios of one quantity, and weights.
-    effective, level, seed
-        As for `exceedance`.
-    below : bool
-        Whether the limit is exceeded by values below it.
-
-    Returns
-    -------
-    Exceedance
+    The values (n, ...) are not yet multiplied by ratios, limits are broadcast to them, and other arguments are those of
+    `exceedance`. With `below`, values below a limit exceed it.
     """
     values, limits = np.broadcast_arrays(values, limits)
     single = exceedance_of_samples(values, limits, spread.ratios, below)
@@ -333,29 +305,11 @@ def _upper_by_events(
 def interval_of_draws(
     draws: np.ndarray, share: np.ndarray, effective: ArrayLike, spread: EventSpread, level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interval of a probability from its draws, extended to contain the probability itself.
+    """Interval of the probability `share` (...) from draws of it (n_draws, ...), NaN left out, extended to contain it.
 
     Probabilities far in a tail differ between populations by many powers of ten, so that their mean, which is the
-    probability of a new event, can be above nearly all of them. The interval is then extended to it. Without ratios,
-    the drawn probabilities are shares of samples, which may all be zero or one: the interval then also contains the
-    Clopper-Pearson interval.
-
-    Parameters
-    ----------
-    draws : (n_draws, ...) ndarray
-        Probability given each draw of the event population; NaN is left out.
-    share : (...) ndarray
-        The probability.
-    effective : float or (...) ndarray
-        Effective number of independent samples.
-    spread : EventSpread
-        Whether there are ratios.
-    level : float
-        Probability of the interval.
-
-    Returns
-    -------
-    lower, upper : (...) ndarray
+    probability of a new event, can be above nearly all of them. Without ratios, the drawn probabilities are shares of
+    samples, which may all be zero or one: the interval then also contains the Clopper-Pearson interval.
     """
     lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     least, most = (share, share) if spread.ratios is not None else binomial_interval(share, effective, level)
@@ -425,26 +379,9 @@ def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
 
 
 def binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the Clopper-Pearson interval of a probability.
+    """Clopper-Pearson interval of a probability, for a share of `effective` trials, which may be no whole number.
 
-    Parameters
-    ----------
-    share : array_like
-        Fraction of the trials that exceed.
-    effective : array_like
-        Number of independent trials, not necessarily a whole number.
-    level : float
-        Probability of the interval, between 0 and 1.
-
-    Returns
-    -------
-    lower, upper : ndarray
-        Bounds of the interval.
-
-    Raises
-    ------
-    ValueError
-        If the level is not between 0 and 1.
+    ValueError if the level is not between 0 and 1.
     """
     tail = 0.5 * (1.0 - check_level(level))
     share = np.asarray(share, dtype=float)

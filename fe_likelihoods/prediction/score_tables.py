@@ -190,36 +190,11 @@ def score_histories(
     envelope: np.ndarray,
     level: float,
 ) -> HistoryScores:
-    """Score predicted histories.
+    """Score predicted histories [SI]; all arrays are (n_channels, n_samples), measured values NaN where missing.
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-        The channels.
-    measured : ndarray, shape (n_channels, n_samples)
-        Measured values [SI], NaN where missing.
-    moments : (ndarray, ndarray), each (n_channels, n_samples)
-        Predicted means and standard deviations [SI].
-    band : (ndarray, ndarray), each (n_channels, n_samples)
-        Predicted quantiles with the probabilities (1 - level) / 2 and (1 + level) / 2 [SI].
-    envelope : ndarray, shape (n_channels, n_samples)
-        Envelope of the predicted mean [SI].
-    level : float
-        Probability of the band.
-
-    Returns
-    -------
-    HistoryScores
-
-    Raises
-    ------
-    ValueError
-        If a channel has no sample or is zero at all of them.
-
-    Warns
-    -----
-    UserWarning
-        If the predicted standard deviation of measured samples is zero.
+    Moments are means and standard deviations, the band has quantiles with the probabilities (1 - level) / 2 and (1 +
+    level) / 2, and the envelope is of the predicted mean. ValueError if a channel has no sample or is zero at all of
+    them; warns if the predicted standard deviation of measured samples is zero.
     """
     error = rrmse(moments[0], measured, [channel.name for channel in channels])
     there = np.isfinite(measured)
@@ -263,25 +238,7 @@ def score_values(
     level: float,
     effective_sample_size: float | None = None,
 ) -> QuantityScores:
-    """Score predicted numbers.
-
-    Parameters
-    ----------
-    names, units : sequence of str
-        Name and display unit of each quantity.
-    values : ndarray, shape (n, n_quantities)
-        Samples of the predictions [SI], three or more.
-    measured : (n_quantities,) array_like
-        Measured values [SI].
-    level : float
-        Probability of the intervals, between 0 and 1.
-    effective_sample_size : float, optional
-        As for `fe_likelihoods.prediction.scores.crps_samples`.
-
-    Returns
-    -------
-    QuantityScores
-    """
+    """Score predicted numbers (n, n_quantities), three samples or more, against measured ones (n_quantities,) [SI]."""
     measured, ascending = np.asarray(measured, dtype=float), np.sort(values, axis=0)
     (lower, upper), quartiles = central_interval(ascending, level), central_interval(ascending, 0.5)
     return QuantityScores(
@@ -309,17 +266,9 @@ def central_interval(ascending: np.ndarray, level: float) -> tuple[np.ndarray, n
 
 
 def envelope(histories: np.ndarray) -> np.ndarray:
-    """Envelope of histories: the absolute value of the analytic signal, the history plus i times its Hilbert transform.
+    """Amplitude of oscillating histories at each step: 2 for ``2 * sin(omega * t)``.
 
-    Parameters
-    ----------
-    histories : ndarray, shape (n_channels, n_steps)
-        The histories.
-
-    Returns
-    -------
-    ndarray, shape (n_channels, n_steps)
-        The amplitude of the oscillation at each step; 2 for ``2 * sin(omega * t)``.
+    It is the absolute value of the analytic signal, the history plus i times its Hilbert transform.
     """
     from scipy.signal import hilbert  # imported here because it is slow to import
 
@@ -327,20 +276,11 @@ def envelope(histories: np.ndarray) -> np.ndarray:
 
 
 def strong_part(measured: ArrayLike, start: float = 0.05, stop: float = 0.95) -> np.ndarray:
-    """Mask of the strong part of histories, between two shares of the sum of squares.
+    """Mask of the strong part of histories (..., n_samples), NaN if missing, between two shares of the sum of squares.
 
-    Parameters
-    ----------
-    measured : (..., n_samples) array_like
-        Histories, NaN where a sample is missing. For an acceleration, the samples between 5 and 95 % make up the
-        significant duration (M. D. Trifunac, A. G. Brady, 1975, A study on the duration of strong earthquake ground
-        motion, Bulletin of the Seismological Society of America 65, 581-626).
-    start, stop : float
-        The shares.
-
-    Returns
-    -------
-    ndarray of bool, shape (..., n_samples)
+    For an acceleration, the samples between 5 and 95 % make up the significant duration (M. D. Trifunac, A. G. Brady,
+    1975, A study on the duration of strong earthquake ground motion, Bulletin of the Seismological Society of America
+    65, 581-626).
     """
     squares = np.square(np.nan_to_num(np.asarray(measured, dtype=float)))
     share = np.cumsum(squares, axis=-1)

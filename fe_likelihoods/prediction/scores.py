@@ -192,21 +192,10 @@ def pit_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarra
 
 
 def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
-    """Predicted probability of a value below the measured one, for distributions that are given by samples.
+    """Predicted probability (...) of a value below the measured one, from samples (n, ...); NaN where one is missing.
 
-    Parameters
-    ----------
-    values : (n, ...) array_like
-        Samples of the predictions, two or more.
-    observed : (...) array_like
-        Measured values, NaN where missing.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        (k + 0.5) / (n + 1) for k samples below the value; samples equal to it count one half. NaN where the measured
-        value is missing or a sample is NaN. It is never 0 or 1, because no finite number of samples shows that a value
-        is impossible.
+    It is (k + 0.5) / (n + 1) for k samples below the value, equal samples counting one half, and never 0 or 1, because
+    no finite number of samples shows that a value is impossible.
     """
     ascending, observed = _samples(values, observed)
     below = (ascending < observed).sum(axis=0) + 0.5 * (ascending == observed).sum(axis=0)

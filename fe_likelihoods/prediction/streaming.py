@@ -1,16 +1,9 @@
-"""Mean, variance and quantiles of results that arrive in batches.
+"""Mean, variance and quantiles of results that arrive in batches. See ``docs/theory/prediction.rst``.
 
-Mean and variance need one pass. They are computed per batch and combined by the update of Chan, Golub & LeVeque (1983),
-which avoids the cancellation in "mean square minus squared mean". Quantiles need the results themselves, of which as
-many are retained as fit into a limit of memory. A result may stand for several samples, because resampling makes
-copies, so that every result has a count.
-
-See ``docs/theory/prediction.rst``.
-
-References
-----------
-T. F. Chan, G. H. Golub, R. J. LeVeque (1983), Algorithms for computing the sample variance: analysis and
-recommendations, The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115.
+Mean and variance need one pass. They are combined over batches by the update of T. F. Chan, G. H. Golub and R. J.
+LeVeque (1983), The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115, which avoids the
+cancellation in "mean square minus squared mean". Quantiles need the results themselves, of which as many are retained
+as fit into a limit of memory. Every result has a count, because resampling makes copies of samples.
 """
 
 from collections.abc import Sequence
@@ -24,15 +17,7 @@ _CHUNK = 2**18  # values that are sorted at once
 
 
 class RunningMoments:
-    """Running mean and variance of equally shaped arrays.
-
-    Attributes
-    ----------
-    count : float
-        Number of samples so far.
-    mean : ndarray, shape (...)
-        Their mean, None before the first sample.
-    """
+    """Running mean (None before the first sample) and variance of `count` equally shaped arrays."""
 
     def __init__(self) -> None:
         self.count = 0.0
@@ -65,32 +50,10 @@ class RunningMoments:
 
 
 class RetainedResults:
-    """Results retained for quantiles: all of them if they fit into the limit, else a random subsample.
+    """Results retained for quantiles: all of them if they fit into the limit [bytes], else a random subsample.
 
-    Parameters
-    ----------
-    result_of_sample : ndarray of int, shape (n,)
-        Index of each sample's result. Copies of a sample share one result.
-    shape : tuple of int
-        Shape of a result.
-    dtype : type
-        Floating-point type of the retained results.
-    memory_bytes : int or None
-        Largest size of the retained results [bytes], None for no limit.
-    rng : numpy.random.Generator
-        Chooses the subsample.
-
-    Attributes
-    ----------
-    complete : bool
-        Whether all results are retained.
-    shape : tuple of int
-        Shape of a result.
-
-    Raises
-    ------
-    ValueError
-        If fewer than 20 results fit.
+    Each of the n samples has the index of its result, because copies of a sample share one. ValueError if fewer than 20
+    results fit; `complete` says whether all are retained.
     """
 
     def __init__(
@@ -161,31 +124,12 @@ class RetainedResults:
 def quantiles_with_errors(
     values: np.ndarray, counts: np.ndarray, probabilities: Sequence[float], effective: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute quantiles of an array's columns, and their standard errors.
+    r"""Quantiles (n_probabilities, k) of values (m, k), each row taken `counts` times, and their standard errors.
 
-    Parameters
-    ----------
-    values : ndarray, shape (m, k)
-        The results.
-    counts : ndarray of int, shape (m,)
-        Number of samples that each row stands for.
-    probabilities : sequence of float
-        Probabilities of the quantiles, between 0 and 1.
-    effective : float
-        Effective number of independent samples.
-
-    Returns
-    -------
-    quantiles : ndarray, shape (n_probabilities, k)
-        Quantiles as by `numpy.quantile` with every row repeated `counts` times.
-    errors : ndarray, shape (n_probabilities, k)
-        Their standard errors, inf for a single sample.
-
-    Notes
-    -----
     The number of samples below the p-quantile is binomial, so that its rank among n samples has the standard error
     :math:`s = n \sqrt{p (1 - p) / n_\mathrm{eff}}`. The error of the quantile is a quarter of the distance between the
-    sorted samples at the ranks 2 s below and 2 s above it, the 95 % interval. See ``docs/theory/prediction.rst``.
+    sorted samples at the ranks 2 s below and 2 s above it, the 95 % interval, and inf for a single sample. See
+    ``docs/theory/prediction.rst``.
     """
     n = int(counts.sum())
     if n == len(values):

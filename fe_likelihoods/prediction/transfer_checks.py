@@ -85,12 +85,8 @@ class Peaks:
 class Ends:
     """How much the channels of final values still move at the end, collected while responses are simulated.
 
-    Parameters
-    ----------
-    quantities : iterable of object
-        Predicted quantities; those by `final_value` are examined, and `final_values` of others by name.
-    model : Model
-        The model that predicts. Tests with imposed deformations are not examined.
+    Examined are quantities by `final_value`, and `final_values` of others by name; tests with imposed deformations are
+    not.
     """
 
     def __init__(self, quantities: Iterable[Any], model: Any) -> None:
@@ -285,23 +281,9 @@ def sample_to_check(source: PredictionSource, samples: Any) -> int | None:
 def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response: np.ndarray | None) -> tuple[str, ...]:
     """Remarks if the residuals of a likelihood contradict the noise with which it was sampled.
 
-    Samples that do not fit, such as draws of the prior, are not judged. The latest result for a likelihood is kept, so
-    that predictions under other excitations need no simulation for it.
-
-    Parameters
-    ----------
-    source : PredictionSource
-        With a likelihood.
-    point : (ndim,) ndarray
-        A sample of all parameters.
-    response : (n_channels, n_steps) ndarray, or None
-        Its response to the calibration excitation [SI]. None: the kept result is returned, or, if there is none, the
-        response is looked up among the likelihood's stored responses, or simulated.
-
-    Returns
-    -------
-    tuple of str
-        Remarks; empty if there are none.
+    They are judged at one sample (ndim,) with its response (n_channels, n_steps) [SI] to the calibration excitation,
+    looked up or simulated where it is None. Samples that do not fit, such as draws of the prior, are not judged. The
+    latest result for a likelihood is kept, so that predictions under other excitations need no simulation for it.
     """
     likelihood = source.likelihood
     n_structural = len(source.model.parameter_names)
@@ -335,20 +317,11 @@ def remarks_on_calibration(source: PredictionSource, point: np.ndarray, response
 def remark_on_same_response(
     source: PredictionSource, other: Any, point: np.ndarray, response: np.ndarray | None
 ) -> str:
-    """Remark if the response to another motion equals the one to the motion of the calibration; empty if not.
+    """Remark if the response to another motion equals the response to the calibration motion; empty if not.
 
-    The first samples of both are compared, unless the motions have the same first samples.
-
-    Parameters
-    ----------
-    source : PredictionSource
-        The calibration, with a likelihood.
-    other : Model
-        The model under the other motion, from its virgin state.
-    point : (ndim,) ndarray
-        A sample of all parameters.
-    response : (n_channels, n_steps) ndarray, or None
-        Its response to the other motion [SI]. None: nothing is compared.
+    The first samples of both are compared, for one sample (ndim,) and its response (n_channels, n_steps) [SI] of
+    `other`, the virgin model under the other motion. Not if the motions have the same first samples, or without a
+    response.
     """
     if response is None or other.fingerprint == source.model.fingerprint:
         return ""
@@ -375,11 +348,6 @@ def remark_on_harmonic(calibrated: Any, other: Any) -> str:
 
     The bandwidth is (sum P)^2 / sum P^2 times the frequency step, for the power P of the Fourier transform: the width
     of a band with constant power. The mean over the supports is compared.
-
-    Parameters
-    ----------
-    calibrated, other : Model
-        The models under the motion of the calibration and under the other one.
     """
     found = [[_bandwidth(each) for each in motions_of(model)] for model in (calibrated, other)]
     if not all(found):

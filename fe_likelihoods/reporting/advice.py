@@ -28,19 +28,10 @@ STATUS = {WRONG: "do not use", CARE: "use with care", REMARK: "use"}
 
 
 class Judgement(NamedTuple):
-    """Whether a result can be used, from all that was found about sampling, fit, residuals, failures, priors and data.
+    """Whether a result can be used, from all that was found; ``str`` gives it in one sentence."""
 
-    ``str`` gives it in one sentence.
-
-    Attributes
-    ----------
-    status : {"use", "use with care", "do not use"}
-    findings : tuple of Finding
-        The reasons, the most severe first, and remarks.
-    """
-
-    status: str
-    findings: tuple[Finding, ...]
+    status: str  # "use", "use with care" or "do not use"
+    findings: tuple[Finding, ...]  # reasons, the most severe first, and remarks
 
     def __str__(self) -> str:
         reasons = [each.name for each in self.findings if STATUS[each.weight] == self.status != "use"]
@@ -154,18 +145,9 @@ def _of_discretisation(run: FinishedRun, simulate: Any) -> list[Finding]:
 def advise(
     run: FinishedRun, rows: list[ParameterRow], fits: Fits, failed: Failures, of_model: Sequence[Finding] = ()
 ) -> Judgement:
-    """The judgement of a run, with all that a reader has to know.
+    """The judgement of a run, with all that a reader has to know; `of_model` is about its motion, step and mesh.
 
     A run that says nothing about the parameters gets no notes that compare its samples with prior, truth or noise.
-
-    Parameters
-    ----------
-    run : FinishedRun
-    rows : list of ParameterRow
-    fits : Fits
-    failed : Failures
-    of_model : sequence of Finding
-        About its motion, step and mesh.
     """
     found = [
         *_of_the_verdict(run),

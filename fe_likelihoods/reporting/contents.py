@@ -33,24 +33,14 @@ LARGEST_SHAPE = 0.7  # weights of a larger Pareto shape have no useful mean (Veh
 
 
 class DataSet(NamedTuple):
-    """One data set: what was measured, and what it was compared with.
+    """One data set: what was measured, and what it was compared with."""
 
-    Attributes
-    ----------
-    name, model, excitation, description : str
-        Name in a joint likelihood, class of the model, name of the excitation, description of the measurements.
-    noise : str
-        The noise model.
-    channels : str
-        Names, units, numbers of samples and steps.
-    """
-
-    name: str
-    model: str
+    name: str  # in a joint likelihood
+    model: str  # its class
     excitation: str
     description: str
     noise: str
-    channels: str
+    channels: str  # names, units, numbers of samples and steps
 
 
 class PredictedValue(NamedTuple):

@@ -25,54 +25,25 @@ UNLIKELY = 0.01  # probability of such a distance by chance
 
 
 class Failure(NamedTuple):
-    """Failures for one reason: how many, and where.
+    """Failures for one reason: how many, and where."""
 
-    Attributes
-    ----------
-    reason : str
-        The reason; with "#" in the place of numbers where there are more than three with other numbers.
-    count : int
-    where : str
-        The parameter that tells these failures from the successful simulations best, in words.
-    ranges : str
-        Parameter ranges over all recorded failures.
-    example : str
-        The parameters of one failure, after its reason where `reason` has "#".
-    """
-
-    reason: str
+    reason: str  # with "#" for numbers, where there are more than three with other numbers
     count: int
-    where: str
-    ranges: str
-    example: str
+    where: str  # the parameter that tells these failures from successes best, in words
+    ranges: str  # of the parameters, over all recorded failures
+    example: str  # parameters of one failure, after its reason where `reason` has "#"
 
 
 class Failures(NamedTuple):
-    """All failures, with the number of attempts.
+    """All failures, with the number of attempts; `near` are those on which a tempered sampler's verdict depends."""
 
-    Attributes
-    ----------
-    rows : tuple of Failure
-        By reason, the most frequent first.
-    count, attempts : int
-        Number of failures, and of all attempts.
-    remark : str
-        What is not known about them; empty if all are known.
-    prior_failed, prior_draws : int
-        Number of failures among the prior draws with which the run began, and number of these draws; zeros if not
-        known.
-    near : NearFailures
-        Failures among the posterior samples, and all evaluated points there. For a tempered sampler, the failures on
-        which its verdict depends.
-    """
-
-    rows: tuple[Failure, ...]
+    rows: tuple[Failure, ...]  # by reason, the most frequent first
     count: int
     attempts: int
-    remark: str = ""
-    prior_failed: int = 0
+    remark: str = ""  # what is not known about them
+    prior_failed: int = 0  # of the prior draws with which the run began; 0 if not known
     prior_draws: int = 0
-    near: NearFailures = NearFailures(0, 0)
+    near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
 
     @property
     def sentence(self) -> str:

@@ -42,25 +42,13 @@ MOST_STORED = 100  # responses of a guide that are compared in addition
 
 
 class Window(NamedTuple):
-    """The part of the measurements that belongs to one event.
+    """The part of the measurements that belongs to one event."""
 
-    Attributes
-    ----------
-    title : str
-        Name of the data set and of the event; empty if there is one only.
-    measurements : Measurements
-        Measurements of this event.
-    inside : (n_channels, n_samples) bool
-        The samples, among those of all events.
-    rows, columns : ndarray of int
-        Channels and samples that are kept.
-    """
-
-    title: str
+    title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
-    inside: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
+    inside: np.ndarray  # (n_channels, n_samples) bool, among the samples of all events
+    rows: np.ndarray  # channels that are kept
+    columns: np.ndarray  # samples that are kept
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """The part of values (..., n_channels, n_samples), NaN outside of the event."""
@@ -68,26 +56,13 @@ class Window(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """Measurements of one event, and responses to compare with them.
+    """Measurements of one event, and responses to compare with them."""
 
-    Attributes
-    ----------
-    title : str
-        Name of the data set and of the event; empty if there is one only.
-    measurements : Measurements
-    responses : (n, n_channels, n_samples) float
-        Responses at the times of the samples [SI], for several parameters.
-    fitted : bool
-        Whether the first response is the fit, not one more draw of the prior.
-    parts : dict of str to (n, n_channels, n_samples) float
-        What the motion of each support contributes to a linear structure on several supports; empty for others.
-    """
-
-    title: str
+    title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
-    responses: np.ndarray
-    fitted: bool
-    parts: dict[str, np.ndarray]
+    responses: np.ndarray  # (n, n_channels, n_samples) at the times of the samples [SI]
+    fitted: bool  # whether the first response is the fit, not one more draw of the prior
+    parts: dict[str, np.ndarray]  # shares of each support's motion in the responses of a linear structure
 
 
 def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:
@@ -118,12 +93,7 @@ def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:
 def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
     """Draws of the prior (n, ndim), always the same ones: 100, or fewer if these take longer than ten seconds.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    seconds : float, optional
-        Duration of one simulation [s]. Default: the mean of those that the posterior has made; of the second draw where
-        it has made none; nothing where all draws are cached.
+    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else of the second draw.
     """
     try:
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
@@ -146,23 +116,10 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
 
 
 def compare(likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "") -> tuple[Compared, ...]:
-    """Responses at points, and those that a guide has left in memory, beside the measurements of each event.
+    """Responses at points (n, ndim), and those that a guide has left in memory, beside the measurements of each event.
 
-    Parameters
-    ----------
-    likelihood : FELikelihood
-        Its caches are asked first; it counts the other simulations.
-    points : (n, ndim) float
-        Parameters; simulations that fail are left out.
-    fitted : bool
-        Whether the first point is the fit.
-    key : str
-        Name of the data set.
-
-    Returns
-    -------
-    tuple of Compared
-        One for each event; none if the first simulation fails and is the fit, or all fail.
+    The likelihood's caches are asked first; it counts the other simulations. Failed ones are left out; the result is
+    empty if all fail, or the first one fails and is the fit. `key` is the name of the data set.
     """
     n = len(likelihood.model.parameter_names)
     try:
@@ -219,20 +176,10 @@ def _support_parts(model: Any, thetas: np.ndarray, responses: np.ndarray) -> dic
 
 
 def fit_gate(compared: Sequence[Compared], rows: Sequence[ParameterRow] = ()) -> tuple[Finding, ...]:
-    """What speaks against a fit, in words; nothing is simulated.
+    """What speaks against a fit, in words; nothing is simulated, and `rows` are empty before a run.
 
-    Parameters
-    ----------
-    compared : sequence of Compared
-        Measurements and responses, for each data set and event.
-    rows : sequence of ParameterRow
-        The posterior, its prior, and true values where they are known; none before a run.
-
-    Returns
-    -------
-    tuple of Finding
-        Faults of the data that explain the measurements better, channels that are hardly reproduced, parameters at
-        bounds, far from their prior, or not informed, and missed true values.
+    Findings are faults of the data that explain the measurements better, channels that are hardly reproduced,
+    parameters at bounds, far from their prior, or not informed, and missed true values.
     """
     found: list[Finding] = []
     for each in compared:

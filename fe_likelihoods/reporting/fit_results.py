@@ -21,90 +21,47 @@ SMALL_PROBABILITY = 0.01  # of white or normal residuals, below which a reader i
 
 
 class ChannelFit(NamedTuple):
-    """How well one channel of one event is reproduced.
-
-    Attributes
-    ----------
-    channel : Channel
-    samples : int
-        Number of samples that are compared.
-    before, after : float
-        Relative root mean square error (RRMSE) [-]; NaN where there is no simulation.
-    checks : ResidualChecks or None
-        Checks of the residuals after the update, one entry; None where they cannot be checked.
-    """
+    """How well one channel of one event is reproduced, by relative root mean square errors [-]."""
 
     channel: Channel
-    samples: int
-    before: float
-    after: float
-    checks: ResidualChecks | None
+    samples: int  # that are compared
+    before: float  # NaN where there is no simulation
+    after: float  # NaN where there is no simulation
+    checks: ResidualChecks | None  # of the residuals after the update; None where they cannot be checked
 
 
 class Fit(NamedTuple):
     """Measurements and responses of one data set or event.
 
-    Attributes
-    ----------
-    title : str
-        Name of the data set and of the event; empty if there is one only.
-    measurements : Measurements
-        Measurements of this event.
-    responses : dict of str to (n_channels, n_samples) float
-        Responses at the times of the samples [SI], by title: before and after the update.
-    residuals : (n_channels, n_samples) float, or None
-        Measured minus simulated after the update [SI].
-    channels : tuple of ChannelFit
-    noise : {"white", "autoregressive", "bands", "effective"}
-        How the likelihood treats successive errors: as independent, with a correlation or with a spectrum (the
-        innovations or the whitened residuals are checked then), or as fewer independent ones. Where the level of the
-        noise depends on the response, the residuals are divided by it before they are checked.
+    The noise says how the likelihood treats successive errors: as independent ("white"), with a correlation
+    ("autoregressive") or with a spectrum ("bands"; the innovations or the whitened residuals are checked then), or as
+    fewer independent ones ("effective"). Where its level depends on the response, residuals are divided by it before
+    the checks.
     """
 
-    title: str
+    title: str  # name of the data set and of the event; empty if there is one only
     measurements: Measurements
-    responses: dict[str, np.ndarray]
-    residuals: np.ndarray | None
+    responses: dict[str, np.ndarray]  # (n_channels, n_samples) [SI], before and after the update
+    residuals: np.ndarray | None  # (n_channels, n_samples) [SI], measured minus simulated
     channels: tuple[ChannelFit, ...]
     noise: str
 
 
 class Fits(NamedTuple):
-    """The fits of all data sets and events.
-
-    Attributes
-    ----------
-    fits : tuple of Fit
-    before, after : str
-        What the two responses are, in words.
-    simulations : int
-        Simulations that were run for them.
-    failures : tuple of str
-        Simulations that failed, in words.
-    compared : tuple of Compared
-        What `fit_gate` judges.
-    """
+    """The fits of all data sets and events; `before` and `after` say in words what the two responses are."""
 
     fits: tuple[Fit, ...]
     before: str
     after: str
-    simulations: int
-    failures: tuple[str, ...]
-    compared: tuple[Compared, ...] = ()
+    simulations: int  # run for the fits
+    failures: tuple[str, ...]  # simulations that failed, in words
+    compared: tuple[Compared, ...] = ()  # what `fit_gate` judges
 
 
 def fit_data_sets(run: FinishedRun) -> Fits:
     """Simulate two points of each data set, before and after the update, and compare them with the measurements.
 
-    Parameters
-    ----------
-    run : FinishedRun
-        Run of a posterior with a likelihood of this package.
-
-    Returns
-    -------
-    Fits
-        Empty for a posterior without such a likelihood.
+    The result is empty for a posterior without a likelihood of this package.
     """
     if run.likelihood is None:
         return Fits((), "", "", 0, ())

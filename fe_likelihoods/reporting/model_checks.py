@@ -43,23 +43,9 @@ Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 def find_discretisation_error(
     posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate
 ) -> list[Finding]:
-    """Halve step and mesh at a fit, and compare the change of the parameters with their standard deviations.
+    """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    Parameters
-    ----------
-    posterior : Posterior
-        Its likelihood may consist of several data sets.
-    point : (ndim,) float
-        The fit.
-    sd : (ndim,) float
-        Posterior standard deviations.
-    simulate : callable
-        Simulates a model: ``simulate(model, points)`` returns a `SimulationBatch`.
-
-    Returns
-    -------
-    list of Finding
-        Empty where step and mesh are fine enough.
+    ``simulate(model, points)`` returns a `SimulationBatch`. No finding where step and mesh are fine enough.
     """
     prior_sd = np.array([row[3] for row in posterior.prior.table()[1]])
     parts, changes = [], {}
@@ -87,22 +73,9 @@ def find_discretisation_error(
 
 
 def find_unread_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
-    """Compare a response with the response to twice the motion.
+    """Finding if twice the motion fails, or does not change the response (n_channels, n_steps) at `theta`.
 
-    Parameters
-    ----------
-    model : Model
-        One without a motion that can be replaced has no findings.
-    theta : (n_parameters,) float
-    response : (n_channels, n_steps) float
-        Its response at `theta`.
-    simulate : callable
-        As for `find_discretisation_error`.
-
-    Returns
-    -------
-    list of Finding
-        At most one: twice the motion changes nothing, or fails.
+    A model without a motion that can be replaced has none; `simulate` as for `find_discretisation_error`.
     """
     if not motions_to_replace(model):
         return []

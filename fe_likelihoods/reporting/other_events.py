@@ -24,27 +24,15 @@ SMALL_COVERAGE = 0.5  # of the strong part, below which a prediction is said to 
 
 
 class NumberRow(NamedTuple):
-    """A predicted number of an event, such as a peak, in the unit of its channel.
+    """A predicted number of an event, such as a peak, in the unit of its channel; NaN without measurements."""
 
-    Attributes
-    ----------
-    name, unit : str
-        Name of the quantity, such as "peak of deck", and its display unit.
-    median : float
-        Predicted median.
-    quartiles, ends : (float, float)
-        Ends of the central intervals with probabilities 0.5 and 0.9.
-    measured, pit : float
-        Measured value, and predicted probability of a smaller one; NaN without measurements.
-    """
-
-    name: str
-    unit: str
+    name: str  # such as "peak of deck"
+    unit: str  # for display
     median: float
-    quartiles: tuple[float, float]
-    ends: tuple[float, float]
+    quartiles: tuple[float, float]  # of the central interval with probability 0.5
+    ends: tuple[float, float]  # of the central interval with probability 0.9
     measured: float
-    pit: float
+    pit: float  # predicted probability of a value smaller than the measured one
 
     @property
     def place(self) -> str:
@@ -59,43 +47,22 @@ class NumberRow(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """The prediction of one event.
-
-    Attributes
-    ----------
-    name : str
-    predictions : mapping of str to Prediction
-        By quantity; none where all simulations have failed.
-    measured : Measurements or None
-    numbers : tuple of NumberRow
-        Numbers of all predictions that are not histories.
-    histories : tuple of HistoryScores
-        Scores of all predicted histories, where there are measurements.
-    values : tuple of QuantityScores
-        Scores of all predicted numbers, where there are measurements.
-    sentence : str
-        How it was predicted, and how the measurements compare with it.
-    remarks : tuple of str
-        Doubts about the prediction: warnings, failed samples, scores that could not be computed.
-    """
+    """The prediction of one event; its scores exist where there are measurements."""
 
     name: str
-    predictions: EventPredictions
+    predictions: EventPredictions  # by quantity; none if all simulations failed
     measured: Measurements | None
-    numbers: tuple[NumberRow, ...]
+    numbers: tuple[NumberRow, ...]  # of all predictions that are not histories
     histories: tuple[HistoryScores, ...]
     values: tuple[QuantityScores, ...]
-    sentence: str
-    remarks: tuple[str, ...]
+    sentence: str  # how it was predicted, and how the measurements compare with it
+    remarks: tuple[str, ...]  # doubts: warnings, failed samples, scores that could not be computed
 
 
 def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
     """Predictions of each event by quantity, or why there are none; ValueError for other objects.
 
-    Parameters
-    ----------
-    events : mapping of str to Prediction, to mapping of str to Prediction, or to SimulationFailed
-        By the name of the event.
+    The events map names to a `Prediction`, a mapping of predictions, or `SimulationFailed`.
     """
     if not isinstance(events, Mapping):
         raise ValueError(f"events must be a mapping of names to predictions of these events; got {events!r}")
@@ -121,19 +88,7 @@ def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
 def describe_event(
     name: str, predictions: EventPredictions | SimulationFailed, measured: Measurements | None
 ) -> OtherEvent:
-    """Score the predictions of an event, and say how it compares with the measurements.
-
-    Parameters
-    ----------
-    name : str
-    predictions : mapping of str to Prediction, or SimulationFailed
-        By quantity, or the error that `fe_likelihoods.propagate` raises where all simulations fail.
-    measured : Measurements or None
-
-    Returns
-    -------
-    OtherEvent
-    """
+    """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
         remark = f"all simulations failed: {predictions.reason}"
         return OtherEvent(name, {}, measured, (), (), (), "It could not be predicted.", (remark,))

@@ -39,26 +39,14 @@ RESOLUTION = 110  # dots per inch: sharp at the width of a page, some tens of kB
 
 
 class Picture(NamedTuple):
-    """A figure of a report.
-
-    Attributes
-    ----------
-    title, caption, alt : str
-        Title, what to look for, and a description for readers who do not see it.
-    source : str
-        The PNG as a data URI; empty if it could not be drawn.
-    problem : str
-        Why it could not be drawn; empty otherwise.
-    width : int
-        Smallest width at which the labels can be read [pixel]; a narrower page scrolls.
-    """
+    """A figure of a report."""
 
     title: str
-    caption: str
-    alt: str
-    source: str
-    problem: str
-    width: int = 0
+    caption: str  # what to look for
+    alt: str  # description for readers who do not see it
+    source: str  # the PNG as a data URI; empty if it could not be drawn
+    problem: str  # why it could not be drawn; empty otherwise
+    width: int = 0  # smallest one to read the labels [pixel]; a narrower page scrolls
 
 
 def save_picture(figure: "Figure", path: Path) -> None:

@@ -48,28 +48,13 @@ SMALLEST_MOTION = 1e-6  # [g]
 
 
 class Rehearsal(NamedTuple):
-    """What a rehearsal has found.
-
-    Attributes
-    ----------
-    findings : tuple of Finding
-        The most severe first.
-    simulations : int
-        Number of simulations made.
-    seconds : float
-        Duration of one simulation [s].
-    searched : float
-        Simulations that a search for the best fit took from one start; NaN where there was none.
-    identifiability : Identifiability or None
-        What the data tell of the parameters, from this search; None where it found no fit, or where there are several
-        data sets.
-    """
+    """What a rehearsal has found, the most severe finding first."""
 
     findings: tuple[Finding, ...]
-    simulations: int
-    seconds: float
-    searched: float
-    identifiability: Identifiability | None = None
+    simulations: int  # number of simulations made
+    seconds: float  # per simulation [s]
+    searched: float  # simulations of a search for the best fit from one start; NaN without one
+    identifiability: Identifiability | None = None  # of this search; None without a fit, or for several data sets
 
 
 class _Stage:

@@ -26,56 +26,25 @@ LONGEST_AUTOCORRELATION = 50.0  # iterations per autocorrelation time that emcee
 class FinishedRun(NamedTuple):
     """A run, as a report reads it.
 
-    Attributes
-    ----------
-    sampler : emcee.EnsembleSampler
-        The sampler; tempered samplers are subclasses.
-    posterior : object, or None
-        The posterior; None if the sampler's log-density is a plain function.
-    likelihood : FELikelihood, JointLikelihood or None
-        Its likelihood, None for a posterior without data of this package.
-    prior : Prior or None
-        Its prior.
-    parameters : tuple of Parameter
-        Units, nominal values and labels.
-    samples : (n, ndim) float
-        Samples of the posterior [unit of the parameter].
-    log_prob : (n,) float
-        Their log-probabilities.
-    mean_error : (ndim,) float
-        Monte Carlo standard error of the mean; NaN where it is not known.
-    effective_sample_size : float
-        Number of independent samples with the same error of the mean, for the parameter where it is smallest.
-    truth : (ndim,) float
-        True values, NaN where none are known.
-    discard, thin : int
-        Number of iterations left out at the beginning of the chain; of the others, one in `thin` was kept.
-    tempered : bool
-        Whether the sampler has a ladder, an evidence and a verdict.
-    verdict : Verdict or None
-        Verdict of a tempered sampler; None for a chain without one.
-    check : EvidenceCheck or None
-        The independent estimate of the evidence.
-    autocorrelation_time : float
-        Largest autocorrelation time of emcee's own sampler, in iterations; NaN for tempered samplers.
+    A tempered sampler is a subclass of emcee's sampler, with a ladder, an evidence and a verdict.
     """
 
     sampler: EnsembleSampler
-    posterior: Any
-    likelihood: FELikelihood | JointLikelihood | None
+    posterior: Any  # None if the sampler's log-density is a plain function
+    likelihood: FELikelihood | JointLikelihood | None  # None without data of this package
     prior: Prior | None
     parameters: tuple[Parameter, ...]
-    samples: np.ndarray
-    log_prob: np.ndarray
-    mean_error: np.ndarray
-    effective_sample_size: float
-    truth: np.ndarray
-    discard: int
-    thin: int
+    samples: np.ndarray  # (n, ndim) of the posterior [unit of the parameter]
+    log_prob: np.ndarray  # (n,)
+    mean_error: np.ndarray  # (ndim,) Monte Carlo standard error; NaN where it is not known
+    effective_sample_size: float  # independent samples with the same error of the mean, the smallest
+    truth: np.ndarray  # (ndim,), NaN where none is known
+    discard: int  # iterations left out at the beginning of the chain
+    thin: int  # of the other iterations, one in `thin` was kept
     tempered: bool
     verdict: Verdict | None
-    check: EvidenceCheck | None
-    autocorrelation_time: float
+    check: EvidenceCheck | None  # independent estimate of the evidence
+    autocorrelation_time: float  # the largest, of emcee's own sampler [iterations]; else NaN
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,29 +84,11 @@ def read_run(
     discard: int = 0,
     thin: int = 1,
 ) -> FinishedRun:
-    """Read a finished run.
+    """Read a finished run of this project or of emcee; `discard` and `thin` as in `emcee.EnsembleSampler.get_chain`.
 
-    Parameters
-    ----------
-    sampler : emcee.EnsembleSampler
-        A sampler that has run, of this project or of emcee.
-    posterior : Posterior or callable, optional
-        What was sampled. Default: the log-density of the sampler.
-    names : sequence of str, optional
-        Names of the parameters, for a posterior without names.
-    truth : mapping of str to float, or sequence of float, optional
-        True values of synthetic data, in the units of the samples.
-    discard, thin : int
-        As in `emcee.EnsembleSampler.get_chain`.
-
-    Returns
-    -------
-    FinishedRun
-
-    Raises
-    ------
-    ValueError
-        If the sampler has no chain, or names, true values or the posterior do not match it.
+    By default the posterior is the sampler's log-density. Names are for a posterior without them; `truth` has true
+    values of synthetic data, in the units of the samples. ValueError if the sampler has no chain, or names, true values
+    or the posterior do not match it.
     """
     if not isinstance(sampler, EnsembleSampler):
         raise ValueError(

@@ -43,44 +43,24 @@ def moments_of(run: FinishedRun) -> Moments:
 
 
 class ParameterRow(NamedTuple):
-    """One parameter, all values in the unit of its label.
-
-    Attributes
-    ----------
-    name, label, unit : str
-        Name, name with unit, and unit alone; empty where it is not known.
-    prior : str
-        Prior distribution in words; empty where it is not known.
-    prior_mean, prior_sd : float
-        Moments of the prior; NaN where they are not known.
-    mean, mean_error, sd : float
-        Posterior mean, its Monte Carlo standard error, and posterior standard deviation.
-    cv : float
-        Coefficient of variation [-]; NaN for a mean of zero.
-    low, high : float
-        Ends of the 90 % interval: the 5 % and 95 % quantiles.
-    nominal, truth : float
-        Nominal and true value; NaN where there is none.
-    lower, upper : float
-        Bounds of the prior; infinite where there is none or the prior is not known.
-    """
+    """One parameter, all values in the unit of its label; texts are empty and numbers NaN where they are not known."""
 
     name: str
-    label: str
+    label: str  # name with unit
     unit: str
-    prior: str
+    prior: str  # in words
     prior_mean: float
     prior_sd: float
     mean: float
-    mean_error: float
+    mean_error: float  # Monte Carlo standard error
     sd: float
-    cv: float
-    low: float
-    high: float
+    cv: float  # coefficient of variation [-]; NaN for a mean of zero
+    low: float  # 5 % quantile
+    high: float  # 95 % quantile
     nominal: float
     truth: float
-    lower: float
-    upper: float
+    lower: float  # bound of the prior; infinite where there is none or it is not known
+    upper: float  # bound of the prior; infinite where there is none or it is not known
 
 
 def parameter_rows(run: FinishedRun) -> list[ParameterRow]:
@@ -121,14 +101,7 @@ def _words_of(prior: Prior, name: str, factor: float) -> str:
 
 
 def describe_prior(distribution: Distribution, factor: float = 1.0) -> str:
-    """A distribution in words: "normal (1, 0.25), above 0".
-
-    Parameters
-    ----------
-    distribution : Distribution
-    factor : float
-        Size of the text's unit, in the unit of the distribution.
-    """
+    """A distribution in words: "normal (1, 0.25), above 0"; `factor` is the text's unit in the distribution's unit."""
     if isinstance(distribution, TruncatedNormal):
         text = f"normal, mean {distribution.mean / factor:.4g}, sd {distribution.sd / factor:.4g}"
         return text + _limits(distribution, factor)

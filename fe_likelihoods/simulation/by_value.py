@@ -91,18 +91,10 @@ class Recent(OrderedDict):
 
 
 class Pickled(NamedTuple):
-    """A function as it is sent to workers.
+    """A function as it is sent to workers."""
 
-    Attributes
-    ----------
-    payload : bytes
-        Digest of the library, name of the sending process, and the pickled function.
-    key : bytes
-        Digest of the payload; differs between functions, and after a change of their values.
-    """
-
-    payload: bytes
-    key: bytes
+    payload: bytes  # digest of the library, name of the sending process, and the pickled function
+    key: bytes  # digest of the payload; differs after a change of the function's values
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
@@ -124,9 +116,8 @@ class Pickled(NamedTuple):
     def load(self) -> "Arrived":
         """The function, in a worker.
 
-        ValueError if the payload cannot be unpickled, or does not match its digest (then nothing is unpickled);
-        ChangedModel if this process has imported another version of this library, or a file that the model depends on
-        differs.
+        ValueError if the payload does not match its digest (then nothing is unpickled) or cannot be unpickled;
+        ChangedModel if this process has another version of this library, or a file that the model depends on differs.
         """
         global _arriving
         if not self.is_whole():

@@ -9,14 +9,11 @@ The rule for ``pool=``:
   ``apply_async``. This covers the executors of concurrent.futures, loky and mpi4py.futures and the pools of
   multiprocessing and schwimmbad.
 
-The mapped function contains the model and the measurements and may be large; an item is a few parameters. The function
-is sent by value (`fe_likelihoods.simulation.by_value`) to each worker process once, and again when anything that it
-uses has changed; later tasks consist of its digest and the parameters (`fe_likelihoods.simulation.sent_functions`).
-
-``submit(function, item)`` returns a `concurrent.futures.Future` with the result that ``map`` would return, even if the
-item kills every process that runs it; ``submit_all(function, items)`` returns a list of futures, and
-``give_up(futures)`` cancels futures. A pool that only has ``map`` cannot submit items; its attribute ``submits`` is
-False. Results do not depend on the pool, to the last bit.
+The function (model and measurements) may be large and is sent by value (`fe_likelihoods.simulation.by_value`) to each
+worker once, and again when anything that it uses has changed; later tasks consist of its digest and the parameters.
+``submit(function, item)`` returns a `Future` with the result that ``map`` would return, even if the item kills every
+process that runs it. A pool that only has ``map`` cannot submit items: its attribute ``submits`` is False. Results do
+not depend on the pool, to the last bit.
 """
 
 from typing import Any
@@ -32,9 +29,9 @@ __all__ = ["DaskExecutor", "LocalPool", "PoolExecutor", "as_executor"]
 def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | PoolExecutor | None":
     """Executor for a pool, by the rule above; None for None.
 
-    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`; an item that kills every
-    process that runs it also gets an `Outcome`, if the pool survives. ValueError if `pool` is of no such kind, or its
-    workers are other processes and the model cannot be sent to them.
+    Its ``map(function, items)`` returns a list. The functions must return an `Outcome`, also given for an item that
+    kills every process that runs it, if the pool survives. ValueError if `pool` is of no such kind, or its workers are
+    other processes and the model cannot be sent to them.
     """
     if pool is None or isinstance(pool, LocalPool | PoolExecutor):
         executor = pool

@@ -1,12 +1,10 @@
 """Reasons of failed simulations: failures of the model, and faults of the infrastructure.
 
-A failed simulation has a reason in words. A plain `str` is a failure of the model: the exception that it raised, a
-response with NaN, a wrong shape, the exit code of a program. It depends on the parameters alone and is stored in a
-cache on disk.
-
-A `TransientReason` is a fault of the infrastructure: a process that was killed or crashed, a time, memory or output
-limit, a full disk, a missing folder or library. The log-likelihood is -inf in this run, but the next run simulates the
-point again. A `MisfitReason` depends on the measurements, so it does not apply to other measurements.
+A reason that is a plain `str` is a failure of the model: an exception, a response with NaN, a wrong shape, the exit
+code of a program. It depends on the parameters alone and is stored in a cache on disk. A `TransientReason` is a fault
+of the infrastructure: a process that was killed or crashed, a time, memory or output limit, a full disk, a missing
+folder or library. The log-likelihood is -inf in this run, but the next run simulates the point again. A `MisfitReason`
+depends on the measurements, so it does not apply to other measurements.
 """
 
 import subprocess
@@ -35,7 +33,7 @@ class FailedRun(RuntimeError):
 
 
 class RunFailed(FailedRun):
-    """A run in another process failed: its `reason`, and its duration `seconds` [s] or None.
+    """A failed run in another process: its duration `seconds` [s] or None, and its `reason`.
 
     The reason is a `TransientReason` if the process was stopped, was killed or crashed.
     """
@@ -47,10 +45,7 @@ class RunFailed(FailedRun):
 
 
 class UnusableModel(ValueError):
-    """A model whose responses cannot be used at any parameters. The message says what to do.
-
-    Samplers stop (`ends_run`), since no point can be evaluated any more.
-    """
+    """A model whose responses cannot be used at any parameters, so that samplers stop (`ends_run`); says what to do."""
 
     ends_run = True
 

@@ -1,13 +1,11 @@
 """A working folder of its own for each simulation in a worker process.
 
-User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder.
-Simulations that shared a folder would read each other's files. So a worker process changes into a temporary folder for
-each simulation. This folder shows the sender's working folder: files as links, subfolders as folders with links. If
-Python code opens a link for writing, a private file takes its place first (`fe_likelihoods.simulation.shared_files`).
-If compiled code or a program has written through a link, this name is a private copy from then on, and the simulation
-is run again.
-
-Threads of one process share its working folder: there, simulations that write run one after the other.
+User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder. So
+a worker process changes into a temporary folder for each simulation, which shows the sender's working folder: files as
+links, subfolders as folders with links. If Python code opens a link for writing, a private file takes its place first
+(`fe_likelihoods.simulation.shared_files`). If compiled code or a program has written through a link, this name is a
+private copy from then on, and the simulation is run again. Threads of one process share its working folder: there,
+simulations that write run one after the other.
 """
 
 import atexit
@@ -259,7 +257,7 @@ def _remove(process: subprocess.Popen, owner: int) -> None:
 
 
 def discard(process: int, reason: str = "") -> str:
-    """Remove the folder of a worker process that was killed; returns what to add to the reason of its simulation.
+    """Remove the folder of a killed worker process; returns what to add to the reason of its simulation.
 
     With the `reason` of a failure, the folder is kept if `KEEP` says so.
     """

@@ -78,16 +78,9 @@ class ModelLabel:
     """Label of a model in its present state, completed by its simulations.
 
     Its code is the mapping ``code_parts()`` if the model has this method; for other user models, the object itself; and
-    the residual statistic that is stored, if the user has defined one.
-
-    Attributes
-    ----------
-    items : dict of str to str
-        Digests of everything that is known without a simulation.
-    opened : Opened
-        What simulations opened.
-    observes : bool
-        Whether simulations are observed, since they may run user code.
+    the residual statistic that is stored, if the user has defined one. `items` are digests of everything that is known
+    without a simulation, `opened` is what simulations opened; `observes` says whether they are observed, since they may
+    run user code.
     """
 
     def __init__(self, model: Any, statistic: Any = None) -> None:
@@ -186,10 +179,7 @@ def cpu_name() -> str:
 
 
 def value_digest(value: Any) -> str:
-    """Digest of a value, a function or a class, with everything that its code names.
-
-    ValueError if the value contains an object whose content cannot be read, such as an open file.
-    """
+    """Digest of a value, function or class with all that its code names; ValueError for an open file in it."""
     walk = _Walk()
     items = walk.items({"value": value})
     if walk.opaque:

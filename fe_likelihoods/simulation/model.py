@@ -1,13 +1,10 @@
 """Protocol of a structural model, and functions that run a batch of its simulations.
 
-A model is any object with named parameters, named channels and a method `simulate` that computes the response for one
-parameter set. It raises `SimulationFailed` if a simulation is impossible. No base class is needed.
-
-Samplers request many parameter sets at once. `simulate_batch` and `misfit_batch` use the model's own batch methods if
-it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one by
-one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
-becomes a reason in words and a row of NaN, and does not affect other rows. Ctrl-C and ``sys.exit`` are no failures
-(`fe_likelihoods.simulation.interrupts`).
+A model is any object with named parameters, named channels and a method `simulate` for one parameter set, which raises
+`SimulationFailed` if a simulation is impossible. `simulate_batch` and `misfit_batch` use the model's own batch methods
+if it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one
+by one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
+becomes a reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
 """
 
 import logging
@@ -81,34 +78,17 @@ def split_seconds(reason: str) -> tuple[str, float | None]:
 
 
 class SimulationBatch(NamedTuple):
-    """Responses for several parameter sets.
+    """Responses for several parameter sets."""
 
-    Attributes
-    ----------
-    response : (n, n_channels, n_steps) float
-        [SI]; NaN where the simulation failed.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded.
-    """
-
-    response: np.ndarray
-    reasons: list[str]
+    response: np.ndarray  # (n, n_channels, n_steps) [SI]; NaN where the simulation failed
+    reasons: list[str]  # of n failures; empty for successes
 
 
 class MisfitBatch(NamedTuple):
-    """Misfits for several parameter sets.
+    """Misfits for several parameter sets."""
 
-    Attributes
-    ----------
-    misfit : (n, n_channels) float
-        Sums of squared residuals [SI unit of the channel, squared], or (n, n_numbers) for another residual statistic;
-        NaN where the simulation failed.
-    reasons : list of n str
-        Reasons of failures; empty where the simulation succeeded.
-    """
-
-    misfit: np.ndarray
-    reasons: list[str]
+    misfit: np.ndarray  # sums of squares (n, n_channels) [SI unit squared], or another statistic; NaN if failed
+    reasons: list[str]  # of n failures; empty for successes
 
 
 class Model(Protocol):
@@ -191,16 +171,9 @@ def first_part(model: Model, seconds: float) -> Model:
 
 @interrupts_end_the_run()
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
-    """Responses for many parameter sets.
+    """Responses for many parameter sets (n, n_parameters), the same for every pool to the last bit.
 
-    Parameters
-    ----------
-    model : Model
-    thetas : (n, n_parameters) float
-        Parameter sets.
-    pool : object with ``map(function, items)``, optional
-        Runs the simulations one by one, even if the model has a batch method (which would run in this process). The
-        results do not depend on the pool.
+    A pool runs the simulations one by one, even if the model has a batch method (which would run in this process).
     """
     shape = (len(model.channels), model.n_steps)
     if pool is None and getattr(model, "simulate_batch", None) is not None:
@@ -211,21 +184,9 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
 
 @interrupts_end_the_run()
 def derivatives_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> np.ndarray:
-    """Derivatives of the responses by the structural parameters, from the model's own ``jacobian``.
+    """Derivatives (n, n_parameters, n_channels, n_steps) of the responses, from the model's own ``jacobian``.
 
-    Parameters
-    ----------
-    model, thetas, pool
-        As for `simulate_batch`.
-
-    Returns
-    -------
-    (n, n_parameters, n_channels, n_steps) float
-
-    Raises
-    ------
-    ValueError
-        If ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
+    ValueError if ``jacobian`` fails, or returns an array of another shape, or one that is not real or not finite.
     """
     shape = (len(model.parameter_names), len(model.channels), model.n_steps)
     values, reasons = _run_each(partial(_attempt, _derivatives, model), thetas, shape, pool)
@@ -264,14 +225,8 @@ def misfit_batch(
 ) -> MisfitBatch:
     """Sums of squared residuals, or another residual statistic, for many parameter sets; responses are not kept.
 
-    Parameters
-    ----------
-    model, thetas, pool
-        As for `simulate_batch`.
-    measured : (n_channels, n_steps) float, or Comparison
-        Measured response [SI]. With a `Comparison`, the model's own ``misfit_batch`` is not used.
-    statistic : Statistic, optional
-        Residual statistic, by default the sums of squares. If given, the model's own ``misfit_batch`` is not used.
+    Measured values are (n_channels, n_steps) [SI]. The model's own ``misfit_batch`` is not used with a `Comparison` or
+    a statistic; pools are as for `simulate_batch`.
     """
     shape = (statistic_width(measured, statistic),)
     own = (
@@ -334,7 +289,7 @@ def _response(model: Model, theta: np.ndarray) -> np.ndarray:
 
 
 def real_response(response: Any, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """What a model returned as a response (n_channels, n_steps) of floats [SI], which may be infinite or NaN.
+    """A model's response as floats (n_channels, n_steps) [SI], which may be infinite or NaN.
 
     `SimulationFailed` if it is complex, has another shape, or is not an array of numbers.
     """

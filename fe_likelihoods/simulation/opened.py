@@ -35,13 +35,10 @@ _digests: dict[str, tuple[tuple, float, str]] = {}
 
 
 class Opened(NamedTuple):
-    """What one simulation opened: digests of the contents of files, by path.
-
-    `shared` is a file that it has written and that other simulations may write too; "" if there is none.
-    """
+    """What one simulation opened: digests of the contents of files, by path."""
 
     files: dict[str, str]
-    shared: str = ""
+    shared: str = ""  # a file that it has written and other simulations may write too
 
     def items(self) -> dict[str, str]:
         """Digests by file name, so that the folder does not matter."""
@@ -82,9 +79,7 @@ class _Observer:
 
 
 class Observed:
-    """A function of one item for other processes, whose results include what it opened there.
-
-    In other processes, it is called in a working folder of its own (`fe_likelihoods.simulation.folder`).
+    """A function of one item, whose results include what it opened; other processes call it in a folder of its own.
 
     A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
     files if there are more than 100 in all; None if there is nothing to report.

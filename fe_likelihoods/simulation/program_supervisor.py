@@ -1,12 +1,10 @@
 """Process that runs programs one after the other, and kills all processes that a program leaves behind.
 
-The end of a program is reported after these were killed. On Linux the supervisor is a subreaper
-(``PR_SET_CHILD_SUBREAPER``): a process whose parent has ended becomes a child of the supervisor, whatever session,
-group or environment it has. So the supervisor's descendants are exactly the program and the processes that it started.
-On other systems, the program's process group is killed. All are also killed, and the folder of the run is removed, at
-SIGTERM and when standard input closes, as it does when the process that started the supervisor dies.
-
-This file imports the standard library only, so that it can be run alone and starts quickly.
+On Linux the supervisor is a subreaper (``PR_SET_CHILD_SUBREAPER``): a process whose parent has ended becomes its child,
+whatever session, group or environment it has, so that its descendants are exactly the program and the processes that it
+started. On other systems, the program's process group is killed. All are also killed, and the folder of the run is
+removed, at SIGTERM and when standard input closes, as it does when the process that started the supervisor dies. This
+file imports the standard library only, so that it can be run alone and starts quickly.
 """
 
 import ctypes

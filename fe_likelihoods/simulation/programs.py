@@ -89,28 +89,10 @@ def run_program(
 ) -> int:
     """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Absolute path of the program, and arguments; no shell is used. Standard input is empty.
-    environment : mapping
-        All environment variables of the program.
-    folder : Path
-        Working folder.
-    stdout, stderr : Path
-        Files for the program's output.
-    place : Path
-        Folder of the run, which is removed if this process is killed.
-    watch : callable
-        Called repeatedly with the time since the start of the program [s]. It returns the time until the next call [s],
-        or raises an exception, which stops the program and is passed on.
-
-    Raises
-    ------
-    OSError
-        If the program cannot be started.
-    RunFailed
-        If the supervisor dies.
+    The command has an absolute path; no shell is used, standard input is empty, and `environment` has all variables.
+    `place` is the folder of the run, which is removed if this process is killed. `watch` is called with the time since
+    the start [s] and returns the time until the next call [s], or raises an exception, which stops the program and is
+    passed on. OSError if the program cannot be started, RunFailed if the supervisor dies.
     """
     paths = {"folder": str(folder), "stdout": str(stdout), "stderr": str(stderr), "place": str(place)}
     keeper, answer = _take(), {}

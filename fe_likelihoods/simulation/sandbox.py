@@ -19,24 +19,13 @@ _POLL_INTERVAL = 0.1  # [s] between checks of the output size
 
 
 class Sandbox:
-    """Callable that runs a function in another process.
+    """Callable that runs a function of one argument in another process, whose output is not shown.
 
     The process is kept for later calls. It is replaced after a call that did not end by itself, and after
-    `runs_per_process` calls, which limits memory leaks. Concurrent calls from several threads use one process each. The
-    function is sent by value, in its state at the call. Its output is not shown.
-
-    Parameters
-    ----------
-    function : callable
-        Takes one argument. ValueError if it cannot be sent to another process.
-    time_limit : float, optional
-        Largest duration of a call [s], without the start of the process and without waiting for other simulations.
-    memory_limit : int
-        Limit of the process's address space [bytes]; 0 for no limit.
-    max_output : int
-        Largest output per call [bytes].
-    runs_per_process : int, optional
-        Number of calls after which a process is replaced; never by default.
+    `runs_per_process` calls (default: never), which limits memory leaks. Concurrent calls from several threads use one
+    process each. The function is sent by value, in its state at the call; ValueError if it cannot be sent. `time_limit`
+    [s] is for a call, without the start of the process and waiting for other simulations; `memory_limit` [bytes] for
+    the address space (0: none), and `max_output` [bytes] for a call.
     """
 
     def __init__(
@@ -56,10 +45,7 @@ class Sandbox:
         return vars(self) | {"_free": []}
 
     def __call__(self, item: Any) -> Any:
-        """Result of the function for one item; raises any exception that the function raises.
-
-        RunFailed if the process died, or was killed because it took too long or printed too much.
-        """
+        """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
         worker = self._take(Pickled.of(self.function))
         start = time.monotonic()
         try:

@@ -1,11 +1,10 @@
 """Files that simulations running at once may both write: simulations that write such files run one after the other.
 
-An audit hook (`sys.addaudithook`) sees what Python code is about to write. A file outside of the simulation's own
-folder, which the simulation has not made exclusively, may belong to other simulations too. Before such a write, the
-simulation waits for a lock, which all simulations of this user share on this machine, and holds it to its end.
-
-Compiled code and programs write without an event. A file that they have written by an absolute path is noticed when
-Python code reads it: it has changed since the simulation began. If that happens twice, the model is refused.
+An audit hook (`sys.addaudithook`) sees what Python code is about to write. Before it writes a file outside of its own
+folder, which it has not made exclusively, a simulation waits for a lock, which all simulations of this user share on
+this machine, and holds it to its end. Compiled code and programs write without an event: a file that they have written
+by an absolute path is noticed when Python code reads it, since it has changed since the simulation began. If that
+happens twice, the model is refused.
 """
 
 import contextlib
@@ -58,23 +57,11 @@ def worse(path: str, other: str) -> str:
 
 
 class RunningSimulation:
-    """A simulation that runs now.
+    """A simulation that runs now, in its own folder `place` (without links; "" if it has none).
 
-    Parameters
-    ----------
-    place : str
-        Its own folder, without links in the path; "" if it has none.
-    thread : int
-        The thread that runs it; 0 if all threads of this process belong to it.
-    is_remote : bool
-        Whether it was sent by another machine.
-
-    Attributes
-    ----------
-    shared
-        The first file that it wrote and that other simulations may write too; "" if there is none.
-    has_programs
-        Whether it has started other processes.
+    `thread` runs it, 0 if all threads of this process belong to it; `is_remote` if another machine has sent it.
+    `shared` is the first file that it wrote and other simulations may write too, else ""; `has_programs` if it started
+    processes.
     """
 
     def __init__(self, place: str, thread: int, is_remote: bool) -> None:

@@ -23,14 +23,9 @@ def map_threads(
 ) -> tuple[np.ndarray, list[str]]:
     """Results of many simulations, NaN where one failed, and the reasons; on as many threads as numba uses.
 
-    Parameters
-    ----------
-    run : callable
-        Takes one row of `thetas` (n, n_parameters) and returns a response, or raises `SimulationFailed`.
-    thetas, shape
-        Parameter sets; shape of one result.
-    measured : (n_channels, n_steps) float, optional
-        Measured response [SI]: results are the sums of squared residuals (n_channels,) instead of responses.
+    `run` takes one row of `thetas` (n, n_parameters) and returns a response of this shape, or raises
+    `SimulationFailed`. With `measured` (n_channels, n_steps) [SI], results are the sums of squared residuals
+    (n_channels,) instead.
     """
     out = np.full((len(thetas), *shape), np.nan)
     reasons = [""] * len(thetas)

@@ -1,11 +1,9 @@
 """Client for UM-Bridge servers: requests, network faults, and the choice of a server.
 
-UM-Bridge (L. Seelinger, V. Cheng-Seelinger, A. Davis, M. Parno and A. Reinarz, *UM-Bridge: Uncertainty quantification
-and modeling bridge*, Journal of Open Source Software 8(83), 4748, 2023, doi:10.21105/joss.04748) sends model parameters
-as JSON over HTTP and receives the output in the same way. The standard library suffices for this protocol; UM-Bridge's
-Python client has no time limit, and cannot distinguish a lost connection from a model error.
-
-Requests are sent directly, ignoring ``http_proxy``, so that servers on this machine are found.
+UM-Bridge (L. Seelinger, V. Cheng-Seelinger, A. Davis, M. Parno and A. Reinarz, 2023, Journal of Open Source Software
+8(83), 4748, doi:10.21105/joss.04748) sends JSON over HTTP. The standard library suffices; UM-Bridge's Python client has
+no time limit, and cannot distinguish a lost connection from a model error. Requests are sent directly, ignoring
+``http_proxy``, so that servers on this machine are found.
 """
 
 import json
@@ -88,23 +86,10 @@ class UMBridgeServers:
         return type(self), (self.urls, self.retries, self.retry_wait)
 
     def evaluate(self, request: dict[str, Any], time_limit: float | None = None) -> Any:
-        """Output vectors of an evaluation, as read from JSON and not checked.
+        """Output vectors of an evaluation, as read from JSON and not checked; `time_limit` [s] is for one attempt.
 
-        Parameters
-        ----------
-        request : dict
-            Content of the request.
-        time_limit : float or None
-            Longest time until the answer [s], not counting earlier attempts.
-
-        Raises
-        ------
-        ServerError
-            If the server answers with an error.
-        ServerTimeout
-            If the server does not answer within the time limit.
-        Unavailable
-            If all attempts have failed.
+        `ServerError` if the server answers with an error, `ServerTimeout` if not in time, `Unavailable` if all attempts
+        failed.
         """
         for attempt in range(self.retries + 1):
             if attempt:

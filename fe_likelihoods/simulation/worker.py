@@ -1,12 +1,9 @@
 """A local process that calls a function for one item at a time, and may hang, crash or use too much memory.
 
-The process is a Python interpreter that receives the function by value (`fe_likelihoods.simulation.by_value`), so it
-does not import the user's script. It leads a new session, which is killed with it. On Linux it is also killed when the
-process that started it ends, for whatever reason (``PR_SET_PDEATHSIG``); on macOS it ends within a second, unless
-compiled code keeps the interpreter busy.
-
-It is started with `subprocess`, because pool processes, in which it must also work, often may not start processes with
-`multiprocessing`.
+The function is received by value, so that the user's script is not imported. The process leads a new session, which is
+killed with it. On Linux it is also killed when the process that started it ends, for whatever reason
+(``PR_SET_PDEATHSIG``); on macOS it ends within a second, unless compiled code keeps the interpreter busy. It is started
+with `subprocess`, because pool processes, in which it must also work, often may not use `multiprocessing`.
 """
 
 import ctypes
@@ -72,25 +69,12 @@ def _start(start: Callable[[], subprocess.Popen]) -> subprocess.Popen:
 class Worker:
     """A process that calls a function. Its methods may be called from one thread, apart from `kill`.
 
-    It is killed by `kill`, when this object is garbage-collected, or when this process ends.
-
-    Parameters
-    ----------
-    environment : mapping, optional
-        Environment variables in addition to this process's variables.
-    memory_limit : int
-        Limit of the process's address space [bytes], beyond which allocations fail; 0 for no limit.
-    output : open file, optional
-        Receives standard output and standard error; by default, the worker writes to the streams of this process.
-
-    Attributes
-    ----------
-    keys, calls
-        Keys of the functions that are loaded (`Pickled`); number of items that were sent.
-    waits
-        Whether its simulation waits for another one (`fe_likelihoods.simulation.shared_files`), as far as received.
-    kept
-        Where the folder of a failed simulation was kept, to be added to the reason; "" before `kill`.
+    It is killed by `kill`, when this object is garbage-collected, or when this process ends. `environment` adds
+    variables; `memory_limit` [bytes] of the address space (0: none) makes allocations fail beyond it; `output` receives
+    both streams (default: the streams of this process). `keys` are the keys of loaded functions (`Pickled`), `calls`
+    counts items sent, `waits` says whether its simulation waits for another one
+    (`fe_likelihoods.simulation.shared_files`), as far as received, and `kept` where the folder of a failed simulation
+    was kept, to be added to the reason; "" before `kill`.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
@@ -125,8 +109,7 @@ class Worker:
     def load(self, function: Pickled, seconds: float | None = None) -> None:
         """Send the function to call, unless it is loaded, and wait until it is.
 
-        WorkerDied if the process dies meanwhile, or does not answer within `seconds`; ValueError if it cannot load the
-        function.
+        WorkerDied if the process dies or does not answer within `seconds`; ValueError if it cannot load the function.
         """
         self._key = function.key
         if function.key in self.keys:
