@@ -110,7 +110,7 @@ def write_until_killed(path, kill, max_rows, pipe):
 
 
 @pytest.mark.parametrize(
-    ("kills", "max_rows"), [(5, 1_000_000), (5, 1_000), pytest.param(40, 10_000, marks=pytest.mark.slow)]
+    ("kills", "max_rows"), [(5, 1_000_000), (5, 1_000), pytest.param(40, 1_000_000, marks=pytest.mark.slow)]
 )
 def test_killed_while_writing(path, rng, kills, max_rows):
     """SIGKILL at random moments: acknowledged batches are stored, others are complete or absent."""
