@@ -1,7 +1,7 @@
 from . import presets
 from .cost import estimate_cost
 from .judgement.verdict import Verdict
-from .moves.population_moves import MixtureMove, RandomWalkMove, StudentTMove
+from .moves.population_moves import MixtureMove, RandomWalkMove
 from .rare_events import subset_simulation
 from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals
@@ -21,7 +21,6 @@ __all__ = [
     "SMCSampler",
     "SamplingWarning",
     "Stage",
-    "StudentTMove",
     "TMCMCSampler",
     "TemperedSampler",
     "Verdict",

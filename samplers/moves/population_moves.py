@@ -27,7 +27,6 @@ from ..proposals.mixture import (
     draw,
     fit_mixture,
     from_component_space,
-    invert_roots,
     location_and_root,
     log_density,
     log_responsibilities,
@@ -41,7 +40,6 @@ __all__ = [
     "GuideMove",
     "MixtureMove",
     "RandomWalkMove",
-    "StudentTMove",
     "calibrate_move",
     "describe",
 ]
@@ -184,35 +182,7 @@ class _FittedMove(MHMove):
             half.tune(state, accepted)
 
 
-class _GaussianFit(_FittedMove):
-    """A move whose proposal has the mean and a covariance root of weighted points."""
-
-    def __init__(self):
-        super().__init__()
-        self._mean = None
-        self._root = None
-
-    @property
-    def _is_fitted(self) -> bool:
-        return self._root is not None
-
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit the proposal to points (n, ndim) with normalised weights (n,)."""
-        self._mean, self._root = location_and_root(coords, weights)
-        self._halves = ()
-
-    @property
-    def mean(self) -> np.ndarray | None:
-        """Weighted mean (ndim,) of the points that the proposal was fitted to; None before the first fit."""
-        return self._mean
-
-    @property
-    def root(self) -> np.ndarray | None:
-        """Lower-triangular root (ndim, ndim) of the fitted covariance or scale matrix; None before the first fit."""
-        return self._root
-
-
-class RandomWalkMove(_GaussianFit):
+class RandomWalkMove(_FittedMove):
     """Gaussian random walk with the weighted covariance of the stage.
 
     Parameters
@@ -238,7 +208,22 @@ class RandomWalkMove(_GaussianFit):
         self.scale = scale
         self.adapt = adapt
         self.target = target
+        self._root: np.ndarray | None = None
         self._log_factor = 0.0
+
+    @property
+    def _is_fitted(self) -> bool:
+        return self._root is not None
+
+    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
+        """Fit the covariance to points (n, ndim) with normalised weights (n,)."""
+        self._root = location_and_root(coords, weights)[1]
+        self._halves = ()
+
+    @property
+    def root(self) -> np.ndarray | None:
+        """Lower-triangular root (ndim, ndim) of the fitted covariance; None before the first fit."""
+        return self._root
 
     @property
     def log_scale_factor(self) -> float:
@@ -291,43 +276,6 @@ class ConditionalMove(MHMove):
     def tune(self, state: State, accepted: np.ndarray) -> None:
         """Increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
         self.scale = min(self.scale * math.exp(float(np.mean(accepted)) - self.target), 1.0)
-
-
-class StudentTMove(_GaussianFit):
-    """Independent draws from a multivariate Student t with the weighted mean and covariance of the stage.
-
-    When the posterior is nearly Gaussian, one sweep replaces most of the ensemble by new points. The tails are heavier
-    than Gaussian tails, so the ratio of target and proposal stays bounded unless the posterior has even heavier tails.
-
-    Parameters
-    ----------
-    dof : float
-        Degrees of freedom; above 2, so that the covariance exists.
-    """
-
-    def __init__(self, dof: float = 6.0):
-        if not dof > 2.0:
-            raise ValueError(f"dof must be above 2, otherwise a Student t has no covariance; got {dof}")
-        super().__init__()
-        self.dof = dof
-        self._inverse = None
-
-    def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
-        """Fit mean and covariance to points (n, ndim) with normalised weights (n,)."""
-        super().calibrate(coords, weights, inside)
-        self._root = self._root * math.sqrt((self.dof - 2.0) / self.dof)
-        self._inverse = invert_roots(self._root[None])[0]
-
-    def _log_density(self, coords):
-        """Log density up to a constant."""
-        z = (coords - self._mean) @ self._inverse.T
-        return -0.5 * (self.dof + z.shape[1]) * np.log1p(np.sum(z**2, axis=1) / self.dof)
-
-    def _draw(self, coords, random):
-        z = random.standard_normal(coords.shape)
-        stretch = np.sqrt(self.dof / random.chisquare(self.dof, size=len(coords)))
-        proposed = self._mean + (z * stretch[:, None]) @ self._root.T
-        return proposed, self._log_density(coords) - self._log_density(proposed)
 
 
 class MixtureMove(_FittedMove):

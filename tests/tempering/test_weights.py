@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.special import logsumexp
 
 from samplers.estimates.weights import (
@@ -12,7 +11,7 @@ from samplers.estimates.weights import (
     log_mean_weight,
     normalised_weights,
 )
-from samplers.moves.population_moves import RandomWalkMove, StudentTMove
+from samplers.moves.population_moves import RandomWalkMove
 from samplers.proposals.mixture import location_and_root
 from samplers.resampling import RESAMPLING
 from samplers.tempering.next_beta import next_beta
@@ -134,15 +133,6 @@ def test_roots_are_regular_and_follow_units(rng):
         assert np.all(np.isfinite(root)) and np.all(root.diagonal() > 0)
 
 
-def test_student_t_is_drawn_from_the_density_it_states(rng):
-    move = StudentTMove(dof=5.0)
-    move.calibrate(rng.standard_normal((500, 2)) @ np.array([[1.0, 0.0], [2.0, 0.3]]), np.full(500, 1 / 500))
-    x, factors = move.get_proposal(np.zeros((20000, 2)), rng)
-    theirs = stats.multivariate_t(move.mean, move.root @ move.root.T, df=5.0)
-    assert np.allclose(factors, theirs.logpdf(np.zeros(2)) - theirs.logpdf(x))
-    distance = np.linalg.solve(move.root, (x - move.mean).T)
-    assert stats.kstest(np.sum(distance**2, axis=0) / 2, stats.f(2, 5).cdf).pvalue > 1e-4
-    with pytest.raises(ValueError, match="dof"):
-        StudentTMove(dof=2.0)
+def test_a_walk_without_a_positive_scale_is_refused():
     with pytest.raises(ValueError, match="scale"):
         RandomWalkMove(scale=-1.0)
