@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from importlib import resources
 from types import MappingProxyType
 from typing import Any
@@ -82,8 +81,6 @@ _COLUMN_FILES = {
     "eq1-eq2": "bridge_column_events.h5",
     "short": "bridge_column_short.h5",
 }
-_COARSE_SHARE = 0.75  # part of the Arias intensity that the coarse column sees
-_COARSE_TOLERANCES = {"tolerance": 1e-3, "element_tolerance": 1e-3}
 
 
 def _bundled(name: str) -> Dataset:
@@ -248,13 +245,6 @@ def bridge_column(
     ValueError
         If measurements are given without a record or do not match it, there is no such bundled set, or the noise is
         unknown.
-
-    Notes
-    -----
-    The attribute `coarse` of the posterior is a cheaper posterior of the same parameters. It uses the first part of the
-    record, up to three quarters of its Arias intensity, and larger tolerances in the solution of the equations of
-    motion. It costs a quarter as much and is wider, but has nearly the same location. A larger time step or fewer
-    strips would save less and would shift the posterior by many of its standard deviations.
     """
     from .models.rc_column import RCColumn
 
@@ -280,17 +270,7 @@ def bridge_column(
     sensors = [channel.name for channel in model.channels if channel.name not in BRIDGE_COLUMN_NOISE]
     rms = measurements.select(sensors).root_mean_squares if sensors else ()
     prior = bridge_column_prior(law.parameter_names, dict(zip(sensors, rms, strict=True)))
-    coarse = None
-    intensity = np.cumsum(record.acceleration**2)
-    end = int(np.searchsorted(intensity, _COARSE_SHARE * intensity[-1])) * record.dt
-    # a channel that was not measured in the first part leaves no coarse posterior
-    early = measurements.complete or (measurements.times_of_first_samples < end).all()
-    if end > record.dt and early:
-        cheap = replace(model, loading=record.trim(0.0, end), **_COARSE_TOLERANCES)
-        coarse = Posterior(
-            FELikelihood(cheap, measurements.trim(0.0, end), likelihood.noise, cache=likelihood.simulator.cache), prior
-        )
-    posterior = Posterior(likelihood, prior, coarse)
+    posterior = Posterior(likelihood, prior)
     return posterior.marginal() if noise == "marginal" else posterior
 
 

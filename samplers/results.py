@@ -126,7 +126,7 @@ class RunResults:
     def prior_draws(self) -> np.ndarray | None:
         """Draws of the prior (nwalkers, ndim) from which this object annealed; None if they are not known.
 
-        They are not known for a run that was read from a file, or if the annealing began with a `start_density`.
+        They are not known for a run that was read from a file.
         """
         return self._prior_draws
 

@@ -28,7 +28,7 @@ class SMCSampler(TemperedSampler):
 
     Parameters
     ----------
-    nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, start_density, guide, max_simulations, seed
+    nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
         `samplers.moves.population_moves.MixtureMove`: three kernels from a mixture fitted to every stage.
     recycle : bool, optional

@@ -41,7 +41,6 @@ from .judgement.verdict import CONVERGED, describe_early_stop, independent_point
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move
 from .output import Output
-from .proposals.starting import StartingProposal
 from .record import EvaluatedBatch, RunStart
 from .replay import compare, describe_run, differences, open_record, points_to_compare
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
@@ -59,7 +58,7 @@ __all__ = ["TemperedSampler"]
 
 logger = logging.getLogger(__name__)
 
-ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "start_density", "guide", "max_simulations", "seed")
+ARGUMENTS = ("log_prior_fn", "log_likelihood_fn", "guide", "max_simulations", "seed")
 
 
 class TemperedSampler(RunResults, EnsembleSampler):
@@ -83,9 +82,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
     log_likelihood_fn : callable, optional
         Log-likelihood, in place of `log_prob_fn`, which is then None. It is called in the same way, and may return
         blobs; the log-prior is added to its values. Its attributes are used like attributes of `log_prob_fn`.
-    start_density : callable, optional
-        Normalised log-density that the initial state is drawn from, instead of the prior, called like `log_prior_fn`;
-        finite wherever the log-prior is. The annealing then leads from this density to the posterior.
     guide : Guide, optional
         An object that proposes draws near the posterior (`samplers.tempering.guide`). Its weighted draws replace the
         annealing, and the sweeps at beta = 1 are proposals of the guide. If the draws cannot be trusted, recycling
@@ -137,7 +133,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         *,
         log_prior_fn: Callable | None = None,
         log_likelihood_fn: Callable | None = None,
-        start_density: Callable | None = None,
         guide: Guide | None = None,
         max_simulations: float | None = None,
         seed: int | None = None,
@@ -145,7 +140,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ):
         check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
         check_arguments(pool, backend, seed)
-        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn, start_density)
+        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn)
         self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
         self._optional.check_ndim(ndim, functions.name)
@@ -212,10 +207,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         captured = ErrorCapturing(functions.function, args, kwargs, self.vectorize)
         limit = FailureLimit(self.settings.max_failure_share, self.nwalkers, self.ndim)
         common = captured, functions.log_prior, convention, self._record, limit, self._budget, functions.name
-        options = {
-            "check": FirstEvaluations(functions, bool(args or kwargs), blobs_dtype is not None),
-            "start_density": functions.start_density,
-        }
+        options = {"check": FirstEvaluations(functions, bool(args or kwargs), blobs_dtype is not None)}
         if not self.settings.asynchronous:
             return Evaluator(*common, **options)
         check_asynchronous(functions.function, self.pool, self.vectorize)
@@ -274,7 +266,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         Parameters
         ----------
         initial_state : (nwalkers, ndim) float, State or None
-            Draws of the prior, or of `start_density`. None: continue from the last state if there is one, else draw
+            Draws of the prior. None: continue from the last state if there is one, else draw
             ``log_prob_fn.sample_prior(nwalkers, random)``. After annealing, a State of this sampler (or the coordinates
             of its last State) is continued, and so is a run that began with the same draws. Other coordinates start a
             new annealing, whose steps are added to the chain: call `reset` before, or use a new sampler. Points that
@@ -440,24 +432,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)
         self._output.write(self._result, self._verdict)
 
-    @property
-    def proposal(self) -> StartingProposal:
-        """Distribution around the last state, with ``logpdf(x)`` and ``rvs(size, random_state)``.
-
-        Another sampler of the same parameters can start from it (`start_density`) instead of from the prior.
-
-        Raises
-        ------
-        ValueError
-            If the sampler has not run, or `log_prob_fn` has no method `sample_prior`.
-        """
-        last, sample_prior = get_previous_state(self), self._optional.sample_prior
-        if last is None or not self._result.finished:
-            raise ValueError("a proposal is fitted to the last state: call run_mcmc first")
-        if sample_prior is None:
-            raise ValueError(f"a proposal contains the prior, and {self._functions.name} has no method sample_prior")
-        return StartingProposal(last.coords, self._evaluator.log_prior, sample_prior)
-
     def compute_log_prob(self, coords):
         """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
         self._evaluator.pool = self.pool
@@ -552,7 +526,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         stored = self._record.start
         found = [] if stored is None else differences(stored.header, self._header())
         if stored is not None and not found:
-            log_prior = float(np.sum(self._evaluator.log_base(stored.coords)))
+            log_prior = float(np.sum(self._evaluator.log_prior(stored.coords)))
             if not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
                 found = ["the log-prior of the draws that it started from differs"]
         known = points_to_compare(self._record, get_previous_state(self))
@@ -588,18 +562,18 @@ class TemperedSampler(RunResults, EnsembleSampler):
         return start
 
     def _new_start(self, state: State, skip_check: bool, anew: bool = False) -> RunStart:
-        """Draws of the prior, or of the start density, checked and entered in the record, or in a new record."""
+        """Draws of the prior, checked and entered in the record, or in a new record."""
         check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
-        log_base = self._evaluator.log_base_of_start(coords)
+        log_prior = self._evaluator.log_prior_of_start(coords)
         if not np.array_equal(coords, self._drawn):
-            self._functions.check_start(coords, self._evaluator.log_base)
+            self._functions.check_start(coords, self._evaluator.log_prior)
         self._output.check_file()
         if anew:
             self._forget_run()
         run = {"run": uuid.uuid4().hex, "seed": self._seed, "of_earlier_guides": self._budget.of_guides}
-        run["log_prior"] = float(np.sum(log_base))
+        run["log_prior"] = float(np.sum(log_prior))
         start = RunStart(self._header() | run, coords, self.random_state)
         self._record.begin(start)
         self._output.begin(run["run"])
@@ -615,7 +589,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.evaluates_parts = True
         self.random_state = start.random_state
         self._budget.restart(start.header["of_earlier_guides"])
-        self._prior_draws = start.coords if self._functions.start_density is None else None
+        self._prior_draws = start.coords
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         set_moves(self, *schedule)
         if self._given_guide is not None:
@@ -626,7 +600,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.on_unknown = self._say_that_bits_differ if self._output.last_state() is not None else None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
-        if not_normalised := self._functions.check_integral(start.coords, self._evaluator.log_base):
+        if not_normalised := self._functions.check_integral(start.coords, self._evaluator.log_prior):
             warn(not_normalised)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)
         labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}

@@ -31,7 +31,7 @@ class TMCMCSampler(TemperedSampler):
 
     Parameters
     ----------
-    nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, start_density, guide, max_simulations, seed
+    nwalkers, ndim, log_prob_fn, ..., log_prior_fn, log_likelihood_fn, guide, max_simulations, seed
         As in `samplers.tempered.TemperedSampler`, in the same order. By default `moves` is
         `samplers.moves.population_moves.MixtureMove`.
     coefficient_of_variation : float, optional

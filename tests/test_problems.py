@@ -417,29 +417,6 @@ def test_bad_arguments_of_the_bridge_are_refused(arguments, message):
         problems.isolated_bridge(**arguments)
 
 
-def test_the_coarse_column_uses_the_first_part_of_the_record(data, tmp_path):
-    """Its response is nearly the first part of the response of the other."""
-    fine = bridge_column(every=8, duration=12.0, cache=tmp_path / "cache.db")
-    coarse = fine.coarse
-    assert coarse.parameter_names == fine.parameter_names
-    assert coarse.coarse is None
-    assert coarse.prior.distributions == fine.prior.distributions
-    assert coarse.fingerprint != fine.fingerprint
-    assert coarse.likelihood.simulator.cache is fine.likelihood.simulator.cache
-    n, measured = coarse.likelihood.measurements.n_steps, fine.likelihood.measurements
-    np.testing.assert_array_equal(coarse.likelihood.measurements.values, measured.values[:, :n])
-    intensity = np.cumsum(fine.likelihood.model.loading.acceleration**2)
-    assert intensity[n - 2] < 0.75 * intensity[-1] <= intensity[n - 1]
-    cheap, whole = (p.likelihood.model.simulate(TRUTH) for p in (coarse, fine))
-    assert np.all(rrmse(cheap, whole[:, :n]) < 5e-3)
-
-
-def test_a_record_that_is_too_short_has_no_coarse_column(data):
-    record = Record("two samples", data.record.dt, [0.0, 1.0])
-    posterior = bridge_column(record=record)
-    assert posterior.coarse is None
-
-
 def test_bridge_column_with_other_sensors():
     record, outputs = bridge_column_data().record.trim(8.0, 9.0), ("displacement", "strain@0.1:0.4", "base_moment")
     with pytest.raises(ValueError, match="no noise level for strain@0.1:0.4, base_moment: give levels="):

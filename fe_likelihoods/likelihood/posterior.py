@@ -42,14 +42,11 @@ class Posterior:
     likelihood : FELikelihood or JointLikelihood
     prior : Prior, or mapping of parameter names to distributions
         It must have exactly the likelihood's parameters, in any order.
-    coarse : Posterior, optional
-        A cheaper posterior of the same parameters (for example of the first part of a record). A first sampler runs on
-        it, and a second one starts from ``first.proposal`` (see docs/parallel, "Fewer simulations").
 
     Raises
     ------
     ValueError
-        If the names of prior and likelihood, or of the coarse posterior, differ; the message lists both.
+        If the names of prior and likelihood differ; the message lists both.
 
     Examples
     --------
@@ -62,17 +59,10 @@ class Posterior:
         self,
         likelihood: FELikelihood | JointLikelihood,
         prior: Prior | Mapping[str, Distribution],
-        coarse: "Posterior | None" = None,
     ) -> None:
         self.likelihood = likelihood
         prior = prior if isinstance(prior, Prior) else Prior(prior)
         self.prior = prior.reorder(likelihood.parameter_names)
-        if coarse is not None and tuple(coarse.parameter_names) != self.prior.names:
-            raise ValueError(
-                f"the coarse posterior must have the parameters {', '.join(self.prior.names)}, in this order; "
-                f"it has {', '.join(coarse.parameter_names)}"
-            )
-        self.coarse = coarse
 
     @property
     def ndim(self) -> int:
@@ -98,7 +88,7 @@ class Posterior:
     def fingerprint(self) -> str:
         """Hex digest (BLAKE2b, 128 bits) of everything the density depends on: likelihood, noise and prior.
 
-        It is the same in every process. The coarse posterior is not part of it.
+        It is the same in every process.
 
         Raises
         ------
@@ -215,7 +205,7 @@ class Posterior:
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.
 
-        Its parameters are the structural ones, its evidence is the same, and its coarse posterior is marginal as well.
+        Its parameters are the structural ones, and its evidence is the same.
         `draw_noise` draws the standard deviations afterwards. A sampler has fewer dimensions to search, which saves
         simulations; the quadrature costs a few microseconds per row, and about 100 for a single row.
 
@@ -225,8 +215,7 @@ class Posterior:
             If the noise is not white, has sensor noise, or is integrated out already.
         """
         likelihood = self.likelihood.marginal(self.prior.distributions)
-        structural = self.prior.subset(likelihood.parameter_names)
-        return Posterior(likelihood, structural, None if self.coarse is None else self.coarse.marginal())
+        return Posterior(likelihood, self.prior.subset(likelihood.parameter_names))
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples of all parameters from samples of the structural ones, for a `marginal` posterior.

@@ -196,12 +196,6 @@ class Measurements:
         return times + self.starts[row] if self.starts[row] else times
 
     @property
-    def times_of_first_samples(self) -> NDArray[np.float64]:
-        """Time of the first sample of each channel that is not missing, shape (n_channels,) [s]."""
-        first = np.argmax(np.isfinite(self.values), axis=1)
-        return np.array(self.starts) + first * np.array(self.steps)
-
-    @property
     def end(self) -> float:
         """Time of the last sample of all channels [s]."""
         last = self.n_steps - 1 - np.argmax(np.isfinite(self.values)[:, ::-1], axis=1)

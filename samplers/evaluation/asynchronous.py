@@ -92,8 +92,8 @@ class AsynchronousEvaluator(Evaluator):
         """Begin to evaluate points (n, ndim); the limit of simulations may allow only the first points."""
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
-        log_base = self.log_base(coords)
-        inside = log_base > -np.inf
+        log_prior = self.log_prior(coords)
+        inside = log_prior > -np.inf
         points = np.flatnonzero(inside)
         parts = self.record.find(coords[points])
         numbers, refused, end = [], False, len(coords)
@@ -113,7 +113,7 @@ class AsynchronousEvaluator(Evaluator):
             numbers.append((known, wanted))
             if refused:
                 break
-        pending = PendingPoints(coords[:end], log_base[:end], refused)
+        pending = PendingPoints(coords[:end], log_prior[:end], refused)
         outside = np.flatnonzero(~inside[:end])
         if len(outside) > 0:
             pending.arrive(outside, pending.base[outside])
@@ -162,8 +162,8 @@ class AsynchronousEvaluator(Evaluator):
             whole, counted = len(numbers) == len(pending.coords), self.record.count - len(numbers)
             failed = len(self.record.failed) - len(batch.reasons)
             self._limit.check(batch, counted, failed, len(self._running), whole)
-        log_base = pending.base["log_prior"][rows]
-        pending.arrive(rows, self._pack(log_base, np.ones(len(rows), dtype=bool), batch))
+        log_prior = pending.base["log_prior"][rows]
+        pending.arrive(rows, self._pack(log_prior, np.ones(len(rows), dtype=bool), batch))
 
     def _gather(self, most: int) -> np.ndarray:
         """Numbers (m,) of the points that have arrived when `most` other points are running."""

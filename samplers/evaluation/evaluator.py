@@ -160,8 +160,7 @@ class Evaluator:
     """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs: a walker
-    carries all three through moves and resampling. The field log_prior is the log-density at beta = 0, which is the
-    `start_density` if there is one.
+    carries all three through moves and resampling.
 
     Parameters
     ----------
@@ -181,8 +180,6 @@ class Evaluator:
         Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
     check : callable, optional
         Called with this object and the first batch that it evaluates; raises ValueError for a wrong function.
-    start_density : callable, optional
-        Log-density at beta = 0, which takes the place of the log-prior in the records; the log-prior by default.
 
     Attributes
     ----------
@@ -216,9 +213,8 @@ class Evaluator:
         budget: Budget | None = None,
         name: str = "log_prob_fn",
         check: Callable[["Evaluator", EvaluatedBatch], None] | None = None,
-        start_density: Callable | None = None,
     ):
-        self._name, self._check, self._start_density = name, check, start_density
+        self._name, self._check = name, check
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self.record, self._limit = Record() if record is None else record, limit
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
@@ -247,29 +243,8 @@ class Evaluator:
         log_prior = log_densities(results, len(coords), "log_prior_fn")
         return np.where(np.isnan(log_prior), -np.inf, log_prior)
 
-    def log_base(self, coords: np.ndarray) -> np.ndarray:
-        """Log-density (n,) at beta = 0 of points (n, ndim): the log-prior, unless a `start_density` is given."""
-        return self._with_start_density(coords, self.log_prior(coords))
-
-    def _with_start_density(self, coords: np.ndarray, log_prior: np.ndarray) -> np.ndarray:
-        inside = log_prior > -np.inf
-        if self._start_density is None or not inside.any():
-            return log_prior
-        values = self._convention.call(self._start_density, coords[inside])
-        log_start = log_densities(values, int(np.sum(inside)), "start_density")
-        if not np.all(np.isfinite(log_start)):
-            first = np.flatnonzero(~np.isfinite(log_start))[0]
-            raise ValueError(
-                "start_density must be finite wherever the log-prior is, since annealing cannot reach other points; "
-                f"got {log_start[first]} at {coords[inside][first]}. Mix it with the prior: "
-                "numpy.logaddexp(log(0.95) + start_density, log(0.05) + log_prior), for draws of this mixture"
-            )
-        log_base = np.full(len(coords), -np.inf)
-        log_base[inside] = log_start
-        return log_base
-
-    def log_base_of_start(self, coords: np.ndarray) -> np.ndarray:
-        """`log_base` (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the prior."""
+    def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the support."""
         try:
             log_prior = self.log_prior(coords)
         except Exception as error:
@@ -282,7 +257,7 @@ class Evaluator:
                 f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
                 f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
             )
-        return self._with_start_density(coords, log_prior)
+        return log_prior
 
     def inside(self, coords: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) lies in the support of the prior."""
@@ -328,10 +303,10 @@ class Evaluator:
         """
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
-        log_base = self.log_base(coords)
-        inside = log_base > -np.inf
+        log_prior = self.log_prior(coords)
+        inside = log_prior > -np.inf
         if not inside.any():
-            return self._pack(log_base, inside, None)
+            return self._pack(log_prior, inside, None)
         points = coords[inside]
         batches: list[EvaluatedBatch] = []
         for rows, known in self.record.find(points):
@@ -351,8 +326,8 @@ class Evaluator:
                 batches.append(self._compute_and_store(part, whole=len(part) == len(points)))
             self.evaluations += len(part)
             if len(part) < rows.stop - rows.start:
-                raise BudgetExhausted(self._first_records(log_base, inside, batches))
-        return self._pack(log_base, inside, merge_batches(batches))
+                raise BudgetExhausted(self._first_records(log_prior, inside, batches))
+        return self._pack(log_prior, inside, merge_batches(batches))
 
     def _fitting(self, coords: np.ndarray) -> np.ndarray:
         """The points (n, ndim), or the first points that the limit of simulations allows."""
@@ -407,11 +382,11 @@ class Evaluator:
             self.record.evaluated(batch)
             self.new_evaluations += len(batch.coords)
 
-    def _pack(self, log_base: np.ndarray, inside: np.ndarray, batch: EvaluatedBatch | None) -> np.ndarray:
-        """Records of points with log-density (n,) at beta = 0; only the points `inside` (n,) are evaluated."""
+    def _pack(self, log_prior: np.ndarray, inside: np.ndarray, batch: EvaluatedBatch | None) -> np.ndarray:
+        """Records of points with log-prior (n,); only the points `inside` (n,) are evaluated."""
         blobs = None if batch is None else self.typed(batch.blobs)
-        records = np.zeros(len(log_base), dtype=self._fields)
-        records["log_prob"], records["log_prior"] = -np.inf, log_base
+        records = np.zeros(len(log_prior), dtype=self._fields)
+        records["log_prob"], records["log_prior"] = -np.inf, log_prior
         if batch is not None:
             records["log_prob"][inside] = np.where(np.isnan(batch.log_prob), -np.inf, batch.log_prob)
             if blobs is not None:
@@ -445,12 +420,12 @@ class Evaluator:
             this, before = ("blobs", "none") if has_blobs else ("no blobs", "some")
             raise ValueError(f"{self._name} must return blobs with every point or with none; got {this} after {before}")
 
-    def _first_records(self, log_base: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
+    def _first_records(self, log_prior: np.ndarray, inside: np.ndarray, batches: list[EvaluatedBatch]) -> np.ndarray:
         """Records of the points before the first point that was not evaluated."""
         done = sum(len(batch.coords) for batch in batches)
         first = slice(0, int(np.flatnonzero(inside)[done]))
         batch = merge_batches(batches) if batches else None
-        return self._pack(log_base[first], inside[first], batch)
+        return self._pack(log_prior[first], inside[first], batch)
 
     def call(self, function: Callable, coords: np.ndarray) -> np.ndarray:
         """Values (n,) of another function of points (n, ndim) that is called like the log-density."""

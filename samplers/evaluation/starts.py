@@ -1,6 +1,6 @@
-"""Tests of whether initial points can be draws of the density at beta = 0, by default the prior.
+"""Tests of whether initial points can be draws of the prior.
 
-Annealing must start from draws of this density: a ball of points, as is usual in emcee, gives a wrong evidence and
+Annealing must start from draws of the prior: a ball of points, as is usual in emcee, gives a wrong evidence and
 wrong weights of modes. If there are draws to compare with, two-sample Kolmogorov-Smirnov tests compare each parameter,
 its distance from the median of the draws (which tests the scale), and the distance of the points from the centre (which
 tests all parameters together). The tests are valid for any prior, also with ties.

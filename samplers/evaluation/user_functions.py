@@ -15,6 +15,7 @@ __all__ = ["OptionalAttributes", "UserFunctions"]
 
 logger = logging.getLogger(__name__)
 
+
 # An integral of the prior that differs from 1 by a factor of less than this, or by less than this many standard errors,
 # is taken as 1; with larger errors, nothing is known.
 FACTOR, ERRORS, LARGEST_ERROR = 1.1, 5.0, 0.3
@@ -120,15 +121,12 @@ class UserFunctions(NamedTuple):
         Log-density of the prior.
     optional : OptionalAttributes
         Optional attributes of `function`.
-    start_density : callable, optional
-        Log-density that the initial state is drawn from; the log-prior by default.
     """
 
     name: str
     function: Callable
     log_prior: Callable
     optional: OptionalAttributes
-    start_density: Callable | None = None
 
     @classmethod
     def of(
@@ -136,7 +134,6 @@ class UserFunctions(NamedTuple):
         log_prob_fn: Callable | None,
         log_likelihood_fn: Callable | None,
         log_prior_fn: Callable | None,
-        start_density: Callable | None = None,
     ) -> "UserFunctions":
         """Check and combine the arguments of a sampler.
 
@@ -154,9 +151,8 @@ class UserFunctions(NamedTuple):
             )
         name = "log_likelihood_fn" if log_prob_fn is None else "log_prob_fn"
         function = log_likelihood_fn if log_prob_fn is None else log_prob_fn
-        for label, value in ((name, function), ("start_density", start_density)):
-            if not callable(value) and value is not None:
-                raise ValueError(f"{label} must be callable; got {value!r}")
+        if not callable(function):
+            raise ValueError(f"{name} must be callable; got {function!r}")
         optional = OptionalAttributes.of(function)
         log_prior = optional.log_prior if log_prior_fn is None else log_prior_fn
         if not callable(log_prior):
@@ -164,7 +160,7 @@ class UserFunctions(NamedTuple):
                 f"annealing starts from the prior: pass log_prior_fn, or a {name} with a method log_prior (a posterior "
                 f"object itself, not its bound method); got {log_prior!r}"
             )
-        return cls(name, function, log_prior, optional, start_density)
+        return cls(name, function, log_prior, optional)
 
     @property
     def is_likelihood(self) -> bool:
@@ -173,15 +169,10 @@ class UserFunctions(NamedTuple):
 
     def described(self) -> dict:
         """Entries in the header of a run besides fingerprints; None for unused functions."""
-        return {
-            "log_likelihood_fn": "used" if self.is_likelihood else None,
-            "start_density": None if self.start_density is None else "used",
-        }
+        return {"log_likelihood_fn": "used" if self.is_likelihood else None}
 
     def draw_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
-        """Draws (n, ndim) of the prior; ValueError without `sample_prior`, or with a `start_density`."""
-        if self.start_density is not None:
-            raise ValueError(f"initial_state is None, but start_density is given: pass {n} draws of it")
+        """Draws (n, ndim) of the prior; ValueError without `sample_prior`."""
         if self.optional.sample_prior is None:
             raise ValueError(
                 f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
@@ -189,56 +180,49 @@ class UserFunctions(NamedTuple):
             )
         return np.array(self.optional.sample_prior(n, random), dtype=float)
 
-    def check_start(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Raise ValueError for points that cannot be draws of their density (`samplers.evaluation.starts`).
+    def check_start(self, coords: np.ndarray, log_prior: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Raise ValueError for points that cannot be draws of the prior (`samplers.evaluation.starts`).
 
         Parameters
         ----------
         coords : (n, ndim) float
             The points.
-        log_base : callable
-            Function of points (n, ndim) that returns the log-density (n,) that they are said to be drawn from.
+        log_prior : callable
+            Function of points (n, ndim) that returns the log-prior (n,).
         """
         fresh, names = self._fresh_draws(*coords.shape), list(self.optional.parameter_names or ())
         if fresh is None:
-            reason, compared = spread_by_metropolis(coords, log_base), ""
+            reason, compared = spread_by_metropolis(coords, log_prior), ""
         else:
             reason, compared = compare_with_draws(coords, fresh, names), f"compared with {len(fresh)} fresh draws, "
         if not reason:
             return
-        density, remedy = "start_density", "Pass the log-density that they were drawn from"
-        if self.start_density is None:
-            known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
-            density = "the prior"
-            remedy = (
-                f"Pass {known}, not points near the posterior; or declare what they were drawn from: "
-                "start_density=log_density. If they are draws of the prior, its log-density is another one: a constant "
-                "without bounds has no draws. To continue a chain, pass None, or the State that run_mcmc returned"
-            )
+        known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
         raise ValueError(
-            f"initial_state must consist of draws of {density}; got points that cannot be: {compared}{reason}. "
-            f"The evidence would be wrong. {remedy}"
+            f"initial_state must consist of draws of the prior; got points that cannot be: {compared}{reason}. "
+            f"The evidence would be wrong. Pass {known}, not points near the posterior. If they are draws of the "
+            "prior, its log-density is another one: a constant without bounds has no draws. To continue a chain, pass "
+            "None, or the State that run_mcmc returned"
         )
 
-    def check_integral(self, coords: np.ndarray, log_base: Callable[[np.ndarray], np.ndarray]) -> str:
-        """Why the evidence is wrong if the density of the start is not normalised; empty if it is, or if unknown.
+    def check_integral(self, coords: np.ndarray, log_prior: Callable[[np.ndarray], np.ndarray]) -> str:
+        """Why the evidence is wrong if the log-prior is not normalised; empty if it is, or if unknown.
 
         Parameters as for `check_start`.
         """
-        value, error = log_integral(coords, log_base)
+        value, error = log_integral(coords, log_prior)
         if not error < LARGEST_ERROR or abs(value) < max(np.log(FACTOR), ERRORS * error):
             return ""
-        density = "the log-prior" if self.start_density is None else "start_density"
         return (
-            f"{density} is not normalised: its density integrates to exp({value:.2f} +- {error:.2f}) over its support, "
-            "in place of 1, and log_evidence may be wrong by as much. The posterior is right. Subtract "
-            f"{value:.4g} from {density} (for a constant in a box, exactly the logarithm of the volume), or do not use "
-            "the evidence"
+            f"the log-prior is not normalised: its density integrates to exp({value:.2f} +- {error:.2f}) over its "
+            "support, in place of 1, and log_evidence may be wrong by as much. The posterior is right. Subtract "
+            f"{value:.4g} from the log-prior (for a constant in a box, exactly the logarithm of the volume), or do not "
+            "use the evidence"
         )
 
     def _fresh_draws(self, n: int, ndim: int) -> np.ndarray | None:
         """Draws of the prior to compare n points with; None if there are none."""
-        if self.start_density is not None or self.optional.sample_prior is None:
+        if self.optional.sample_prior is None:
             return None
         state, count = np.random.get_state(), draws_to_compare(n)  # noqa: NPY002
         before = sys.exception()

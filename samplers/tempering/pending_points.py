@@ -19,8 +19,8 @@ class PendingPoints:
     ----------
     coords : (n, ndim) float
         The points.
-    log_base : (n,) float
-        Their log-density at beta = 0, -inf outside the support of the prior.
+    log_prior : (n,) float
+        Their log-prior, -inf outside the support of the prior.
     refused : bool
         Whether the limit of simulations refused some of the points; `coords` are the submitted points.
 
@@ -29,15 +29,15 @@ class PendingPoints:
     coords, refused
         See above.
     base : (n,) structured array
-        Records with log_prior = `log_base` and log_prob = -inf, known from the beginning.
+        Records with log_prior = `log_prior` and log_prob = -inf, known from the beginning.
     arrived : (n,) bool
         Which points have arrived.
     """
 
-    def __init__(self, coords: np.ndarray, log_base: np.ndarray, refused: bool = False):
+    def __init__(self, coords: np.ndarray, log_prior: np.ndarray, refused: bool = False):
         self.coords, self.refused = coords, refused
         self.base = np.zeros(len(coords), BASE_FIELDS)
-        self.base["log_prob"], self.base["log_prior"] = -np.inf, log_base
+        self.base["log_prob"], self.base["log_prior"] = -np.inf, log_prior
         self.arrived = np.zeros(len(coords), dtype=bool)
         self._records: np.ndarray | None = None
 

@@ -1,4 +1,4 @@
-"""The initial state: draws of the prior, or of a declared density; anything else is refused before a simulation."""
+"""The initial state: draws of the prior; anything else is refused before a simulation."""
 
 import re
 import warnings
@@ -11,9 +11,7 @@ from scipy import stats
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.evaluation.starts import log_integral
 from samplers.evaluation.user_functions import UserFunctions
-from tests.contract.targets import Box, Gaussian, WithBlobs
-from tests.statistics.test_posteriors import deviations, evidence_deviation, within
-from tests.tempering.guides import SearchingGuide
+from tests.contract.targets import Gaussian
 
 N = 60
 SAMPLERS = [SMCSampler, TMCMCSampler, TemperedSampler]
@@ -131,142 +129,13 @@ def test_a_start_that_was_drawn_by_the_sampler_is_not_tested(monkeypatch, tmp_pa
     assert sampler.iteration == 4
 
 
-# ---------------------------------------------------------------- start_density
-
-
-class Start:
-    """A normal density, wider than the posterior of a Gaussian likelihood and away from it."""
-
-    def __init__(self, ndim=3, mean=0.5, sd=0.3):
-        self.ndim, self.mean, self.sd = ndim, mean, sd
-
-    def __call__(self, x):
-        return np.sum(stats.norm.logpdf(x, self.mean, self.sd), axis=-1)
-
-    def draw(self, n, seed):
-        return np.random.default_rng(seed).normal(self.mean, self.sd, size=(n, self.ndim))
-
-
-@every
-@pytest.mark.parametrize("n", [100, 250], ids=["moves", "recycling"])
-@pytest.mark.parametrize("start", [Start(), Start(mean=0.69, sd=0.05)], ids=["wide", "narrow"])
-def test_a_declared_start_gives_the_evidence(Sampler, n, start, seed):
-    posterior = Gaussian(3, sd=0.1)
-    samplers = []
-    for k in range(6):
-        sampler = Sampler(n, 3, posterior, vectorize=True, seed=[seed, k], start_density=start)
-        sampler.run_mcmc(start.draw(n, [seed, k]), 3)
-        samplers.append(sampler)
-    assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
-    assert within(deviations(samplers, posterior.mean), samplers)
-    assert within(deviations(samplers, posterior.sd**2, lambda x: (x - posterior.mean) ** 2), samplers)
-    assert all(np.allclose(s.get_log_prob(flat=True), posterior(s.get_chain(flat=True))) for s in samplers)
-
-
-def test_fewer_stages_from_a_close_start():
-    posterior, start = Gaussian(3, sd=0.01), Start(mean=0.7, sd=0.02)
-    from_prior, closer = (
-        SMCSampler(100, 3, posterior, vectorize=True, seed=1, start_density=density) for density in (None, start)
-    )
-    from_prior.run_mcmc(None, 1)
-    closer.run_mcmc(start.draw(100, 1), 1)
-    assert 2 * len(closer.ladder) < len(from_prior.ladder)
-
-
-def test_control_a_start_that_is_not_declared_would_be_wrong(monkeypatch):
+def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     """Negative control: why starts are tested."""
     monkeypatch.setattr(UserFunctions, "check_start", lambda *args: None)
-    posterior, start = Gaussian(3, sd=0.1), Start(mean=0.7, sd=0.02)
+    posterior = Gaussian(3, sd=0.1)
     sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
-    sampler.run_mcmc(start.draw(100, 1), 1)
+    sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
     assert sampler.log_evidence - posterior.log_evidence > 10.0 * sampler.log_evidence_error
-
-
-@every
-def test_points_that_are_not_of_the_declared_density_are_refused(Sampler):
-    posterior, start = Gaussian(), Start()
-    sampler = Sampler(N, 3, posterior, vectorize=True, seed=1, start_density=start)
-    with pytest.raises(ValueError, match=r"must consist of draws of start_density; .* Pass the log-density that they"):
-        sampler.run_mcmc(ball(posterior), 1)
-    with pytest.raises(ValueError, match="initial_state is None, but start_density is given: pass 60 draws of it"):
-        sampler.run_mcmc(None, 1)
-    assert posterior.calls == 0
-
-
-def test_a_start_density_covers_the_prior():
-    box = Box([0.0, 0.0], [1.0, 1.0], lambda x: -np.sum((x - 0.5) ** 2, axis=-1) / 0.02)
-
-    def half(x):
-        return np.where(np.all(x < 0.5, axis=-1), np.log(4.0), -np.inf)
-
-    sampler = SMCSampler(N, 2, box, vectorize=True, seed=1, start_density=half)
-    with pytest.raises(ValueError, match=r"start_density must be finite wherever the log-prior is.*logaddexp"):
-        sampler.run_mcmc(np.random.default_rng(1).uniform(0.0, 0.5, (N, 2)), 1)
-    for wrong, message in (
-        (lambda x: x, "start_density must return"),
-        (lambda x: np.full(len(x), np.nan), "start_density must be finite"),
-    ):
-        sampler = SMCSampler(N, 2, box, vectorize=True, seed=1, start_density=wrong)
-        with pytest.raises(ValueError, match=message):
-            sampler.run_mcmc(box.sample_prior(N, np.random.default_rng(1)), 1)
-    with pytest.raises(ValueError, match="start_density must be callable"):
-        SMCSampler(N, 2, box, start_density=1.0)
-
-
-def test_a_start_density_on_a_bounded_prior(seed):
-    """The points outside the prior are not evaluated; the evidence is that of the truncated problem."""
-
-    def log_likelihood(x):
-        return np.sum(stats.norm.logpdf(x, 0.1, 0.1), axis=-1)
-
-    box, made = Box([0.0, 0.0], [1.0, 1.0], log_likelihood), []
-    for k in range(6):
-        random = np.random.default_rng([seed, k])
-        sampler = SMCSampler(100, 2, box, vectorize=True, seed=k, start_density=lambda x: np.sum(np.log(2 - 2 * x), -1))
-        sampler.run_mcmc(random.beta(1.0, 2.0, (100, 2)), 1)
-        made.append(sampler)
-    truth = 2.0 * np.log(stats.norm.cdf(0.9, 0.0, 0.1) - stats.norm.cdf(-0.1, 0.0, 0.1))
-    assert within(evidence_deviation(made, truth), made)
-
-
-@pytest.mark.parametrize("how", ["guide", "likelihood", "blobs"])
-def test_a_start_density_with_other_arguments(how):
-    start, posterior = Start(), WithBlobs() if how == "blobs" else Gaussian()
-    kwargs = {
-        "guide": {"guide": SearchingGuide(posterior)},
-        "likelihood": {"log_likelihood_fn": posterior.log_likelihood, "log_prior_fn": posterior.log_prior},
-        "blobs": {},
-    }[how]
-    function = None if how == "likelihood" else posterior
-    sampler = SMCSampler(300, 3, function, vectorize=True, seed=1, start_density=start, **kwargs)
-    sampler.run_mcmc(start.draw(300, 1), 2)
-    assert abs(sampler.log_evidence - posterior.log_evidence) < 4.5 * sampler.log_evidence_error
-
-
-def test_a_run_from_a_start_density_is_continued_as_such(tmp_path):
-    posterior, start, path = Gaussian(), Start(), str(tmp_path / "run.h5")
-    whole = SMCSampler(N, 3, posterior, vectorize=True, seed=1, start_density=start)
-    whole.run_mcmc(start.draw(N, 1), 2)
-
-    def cut(x):
-        if len(calls) == 5:
-            raise KeyboardInterrupt
-        calls.append(1)
-        return posterior(x)
-
-    def make(function, **kwargs):
-        backend = emcee.backends.HDFBackend(path)
-        prior = {"log_prior_fn": posterior.log_prior, "vectorize": True, "seed": 1}
-        return SMCSampler(N, 3, function, backend=backend, **prior, **kwargs)
-
-    calls = []
-    with pytest.raises(KeyboardInterrupt):
-        make(cut, start_density=start).run_mcmc(start.draw(N, 1), 2)
-    with pytest.raises(ValueError, match="start_density was used, is None"):
-        make(posterior).run_mcmc(start.draw(N, 1), 2)
-    sampler = make(posterior, start_density=start)
-    sampler.run_mcmc(None, 2)
-    assert np.array_equal(sampler.get_chain(), whole.get_chain())
 
 
 # ---------------------------------------------------------------- a log-prior that is not normalised

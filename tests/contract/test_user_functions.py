@@ -306,14 +306,12 @@ def functions_of(how, wrap):
         settings |= {"asynchronous": True, "recycle": True}
     if how in ("pool", "asynchronous"):
         settings["pool"] = InOrder()
-    if how == "start_density":
-        settings["start_density"] = wrap(posterior.log_prior)
     if how == "likelihood":
         return None, settings | {"log_likelihood_fn": wrap(posterior.log_likelihood)}
     return wrap(named(posterior)), settings
 
 
-WAYS = ("point", "batch", "names", "args", "pool", "start_density", "likelihood")
+WAYS = ("point", "batch", "names", "args", "pool", "likelihood")
 
 
 @pytest.mark.parametrize(

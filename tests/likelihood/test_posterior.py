@@ -220,13 +220,6 @@ def test_prior_of_other_parameters_is_refused(oscillator, measurements, prior):
         Posterior(likelihood, None)
 
 
-def test_coarse_posterior(posterior, oscillator, measurements, prior):
-    assert posterior.coarse is None
-    assert Posterior(posterior.likelihood, prior, coarse=posterior).coarse is posterior
-    with pytest.raises(ValueError, match="coarse"):
-        Posterior(posterior.likelihood, prior, coarse=polynomial_posterior(Polynomial()))
-
-
 # measurements against the model --------------------------------------------------------------------------------------
 
 

@@ -205,18 +205,15 @@ def test_the_noise_is_drawn_afterwards_without_a_simulation(full, rng):
         full.draw_noise(samples)
 
 
-def test_cache_pool_and_coarse_posterior_are_kept(full, tmp_path):
+def test_cache_and_failure_limit_are_kept(full, tmp_path):
     model, measurements = full.likelihood.model, full.likelihood.measurements
     likelihood = FELikelihood(model, measurements, cache=tmp_path / "sums.sqlite", max_failure_share=0.5, memory_rows=7)
-    posterior = Posterior(likelihood, full.prior, coarse=full)
+    posterior = Posterior(likelihood, full.prior)
     posterior.log_prob([1.0, 1.0, 0.5, 0.01])
     marginal = posterior.marginal()
     marginal.log_prob([1.0, 1.0])
     assert (marginal.likelihood.simulations, marginal.likelihood.simulator.disk_hits) == (0, 1)
-    assert marginal.likelihood.simulator.failures.max_share == 0.5 and marginal.coarse.parameter_names == [
-        "stiffness",
-        "damping",
-    ]
+    assert marginal.likelihood.simulator.failures.max_share == 0.5
 
 
 def test_problems_with_the_noise_integrated_out():
