@@ -44,7 +44,7 @@ from .output import Output
 from .record import EvaluatedBatch, RunStart
 from .replay import compare, describe_run, differences, open_record, points_to_compare
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
-from .reports import AnnealingResult, Concern, warn
+from .reports import AnnealingResult, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, refuse_unused
 from .tempering.anneal import anneal
@@ -600,8 +600,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.on_unknown = self._say_that_bits_differ if self._output.last_state() is not None else None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
-        if not_normalised := self._functions.check_integral(start.coords, self._evaluator.log_prior):
-            warn(not_normalised)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)
         labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}
         with (
@@ -621,9 +619,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         said = check_likelihood(log_prob, self._evaluator.log_prior(coords))
         for concern in said:
             warn(concern.message)
-        found = (*said, *((Concern(not_normalised, False),) if not_normalised else ()))
         self._result = recording.result._replace(
-            findings=(*recording.result.findings, *found),
+            findings=(*recording.result.findings, *said),
             concerns=() if guidance is None else guidance.guide.concerns,
             refusals=() if guidance is None else guidance.guide.refusals,
             basis="" if guidance is None else guidance.guide.basis,

@@ -15,18 +15,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import special, stats
 
-from ..estimates.weights import log_mean_weight
-
-__all__ = ["SEED", "compare_with_draws", "draws_to_compare", "log_integral", "spread_by_metropolis"]
+__all__ = ["SEED", "compare_with_draws", "draws_to_compare", "spread_by_metropolis"]
 
 LEVEL = 1e-4  # probability of a false alarm in a run
 FRESH_PER_POINT, FEWEST_FRESH, MOST_FRESH = 40, 4_000, 200_000
 LARGEST_TIED_SHARE = 0.5  # in a continuous parameter
 METROPOLIS_STEPS = 20
 FEWEST_FOR_METROPOLIS = 32  # signed ranks of fewer points cannot reach the level
-PROPOSED = 10  # draws of a Gaussian per point, for the integral of a density
-FEWEST_FOR_INTEGRAL, POINTS_PER_PARAMETER = 20, 10  # points; with fewer per parameter, the Gaussian has no correlations
-BRIDGE_STEPS = 100
 SEED = 20_131  # the tests use separate random numbers, so that they change no run
 
 
@@ -117,66 +112,3 @@ def spread_by_metropolis(coords: np.ndarray, log_density: Callable[[np.ndarray],
             verb = "spreads" if np.median(change) > 0.0 else "contracts"
             return f"the population {verb} in Metropolis steps that keep this density (p = {p:.1g})"
     return ""
-
-
-def log_integral(coords: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
-    r"""Logarithm of the integral of a density over its support, and its standard error, from draws of it.
-
-    Bridge sampling (Meng & Wong 1996, Statistica Sinica 6, 831-860) between the draws :math:`x_i` of the density p and
-    draws :math:`y_j` of a Gaussian q: with the ratios :math:`l = p / q` and shares :math:`s_p, s_q` of the draws, the
-    integral r solves
-
-    .. math::
-
-       r = \frac{\mathrm{mean}_j\; l(y_j) / (s_p l(y_j) + s_q r)}{\mathrm{mean}_i\; 1 / (s_p l(x_i) + s_q r)} .
-
-    The Gaussian is fitted to the other half of the draws.
-
-    Parameters
-    ----------
-    coords : (n, ndim) float
-        Independent draws.
-    log_density : callable
-        Function of points (m, ndim) that returns (m,), -inf outside the support.
-
-    Returns
-    -------
-    value, error : float
-        (nan, inf) for fewer than 20 draws, or draws that span no volume.
-    """
-    (n, ndim), random = coords.shape, np.random.RandomState(SEED)
-    if n < FEWEST_FOR_INTEGRAL:
-        return float("nan"), float("inf")
-    halves, found = np.array_split(coords[random.permutation(n)], 2), []
-    for draws, other in (halves, halves[::-1]):
-        covariance = np.atleast_2d(np.cov(other, rowvar=False))
-        if len(other) < POINTS_PER_PARAMETER * ndim:
-            covariance = np.diag(np.diag(covariance))
-        try:
-            normal = stats.multivariate_normal(other.mean(axis=0), covariance)
-        except (np.linalg.LinAlgError, ValueError):
-            return float("nan"), float("inf")
-        proposed = normal.rvs(PROPOSED * len(draws), random_state=random).reshape(-1, ndim)
-        found.append(_bridge(*(log_density(x) - np.atleast_1d(normal.logpdf(x)) for x in (draws, proposed))))
-    values, errors = np.array(found).T
-    return float(values.mean()), float(0.5 * np.hypot(*np.maximum(errors, 0.5 * abs(values[0] - values[1]))))
-
-
-def _bridge(of_draws: np.ndarray, of_proposed: np.ndarray) -> tuple[float, float]:
-    """Log-integral and its error from log-ratios at draws (n,) and at proposed points (m,), by fixed-point steps."""
-    n, m = len(of_draws), len(of_proposed)
-    share, centre = np.log([n, m]) - np.log(n + m), float(np.median(of_draws))
-    below, above = of_draws - centre, of_proposed - centre  # against overflow
-    value = 0.0
-    for _ in range(BRIDGE_STEPS):
-        at_draws = -np.logaddexp(share[0] + below, share[1] + value)
-        at_proposed = above - np.logaddexp(share[0] + above, share[1] + value)
-        old, value = value, log_mean_weight(at_proposed) - log_mean_weight(at_draws)
-        if not np.isfinite(value) or abs(value - old) < 1e-6:
-            break
-    if not np.isfinite(value):
-        return float("nan"), float("inf")
-    variances = [
-        np.expm1(log_mean_weight(2.0 * x) - 2.0 * log_mean_weight(x)) / len(x) for x in (at_draws, at_proposed)
-    ]
-    return value + centre, float(np.sqrt(sum(variances)))

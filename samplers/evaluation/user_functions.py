@@ -9,16 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..interrupts import raise_if_it_ends_the_run
-from .starts import SEED, compare_with_draws, draws_to_compare, log_integral, spread_by_metropolis
+from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
 
 __all__ = ["OptionalAttributes", "UserFunctions"]
 
 logger = logging.getLogger(__name__)
-
-
-# An integral of the prior that differs from 1 by a factor of less than this, or by less than this many standard errors,
-# is taken as 1; with larger errors, nothing is known.
-FACTOR, ERRORS, LARGEST_ERROR = 1.1, 5.0, 0.3
 
 
 class OptionalAttributes(NamedTuple):
@@ -203,21 +198,6 @@ class UserFunctions(NamedTuple):
             f"The evidence would be wrong. Pass {known}, not points near the posterior. If they are draws of the "
             "prior, its log-density is another one: a constant without bounds has no draws. To continue a chain, pass "
             "None, or the State that run_mcmc returned"
-        )
-
-    def check_integral(self, coords: np.ndarray, log_prior: Callable[[np.ndarray], np.ndarray]) -> str:
-        """Why the evidence is wrong if the log-prior is not normalised; empty if it is, or if unknown.
-
-        Parameters as for `check_start`.
-        """
-        value, error = log_integral(coords, log_prior)
-        if not error < LARGEST_ERROR or abs(value) < max(np.log(FACTOR), ERRORS * error):
-            return ""
-        return (
-            f"the log-prior is not normalised: its density integrates to exp({value:.2f} +- {error:.2f}) over its "
-            "support, in place of 1, and log_evidence may be wrong by as much. The posterior is right. Subtract "
-            f"{value:.4g} from the log-prior (for a constant in a box, exactly the logarithm of the volume), or do not "
-            "use the evidence"
         )
 
     def _fresh_draws(self, n: int, ndim: int) -> np.ndarray | None:

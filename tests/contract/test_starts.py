@@ -1,15 +1,10 @@
 """The initial state: draws of the prior; anything else is refused before a simulation."""
 
-import re
-import warnings
-
 import emcee
 import numpy as np
 import pytest
-from scipy import stats
 
-from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.evaluation.starts import log_integral
+from samplers import SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.evaluation.user_functions import UserFunctions
 from tests.contract.targets import Gaussian
 
@@ -136,69 +131,3 @@ def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
     assert sampler.log_evidence - posterior.log_evidence > 10.0 * sampler.log_evidence_error
-
-
-# ---------------------------------------------------------------- a log-prior that is not normalised
-
-
-PRIORS = {
-    "box": (lambda x: np.zeros(len(x)), lambda n, rng: rng.uniform(-5.0, 5.0, (n, 3)), 3.0 * np.log(10.0), 5.0),
-    "half-normal": (
-        lambda x: -0.5 * np.square(x).sum(axis=1) + np.where(np.all(x >= 0.0, axis=1), 0.0, -np.inf),
-        lambda n, rng: np.abs(rng.standard_normal((n, 3))),
-        1.5 * np.log(0.5 * np.pi),
-        np.inf,
-    ),
-    "heavy tails": (
-        lambda x: stats.t.logpdf(x, 3).sum(axis=1) + 2.0,
-        lambda n, rng: rng.standard_t(3, (n, 3)),
-        2.0,
-        np.inf,
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", PRIORS)
-@pytest.mark.parametrize("normalised", [False, True])
-def test_a_log_prior_that_is_not_normalised_is_named_with_its_integral(kind, normalised):
-    density, draw, integral, bound = PRIORS[kind]
-
-    def log_prior(x):
-        inside = np.all(np.abs(x) <= bound, axis=1)
-        return np.where(inside, density(x) - (integral if normalised else 0.0), -np.inf)
-
-    def log_prob(x):
-        return log_prior(x) - 0.5 * np.square((x - 0.5) / 0.3).sum(axis=1)
-
-    start = draw(200, np.random.default_rng(7))
-    sampler = SMCSampler(200, 3, log_prob, log_prior_fn=log_prior, vectorize=True, seed=1)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", SamplingWarning)
-        sampler.run_mcmc(start, 1)
-    named = [str(each.message) for each in caught if "is not normalised: its density" in str(each.message)]
-    if normalised:
-        assert not named and not any("not normalised" in reason for reason in sampler.verdict.reasons)
-        return
-    (message,) = named
-    value, error = map(float, re.search(r"exp\((\S+) \+- (\S+)\)", message).groups())
-    assert abs(value - integral) < 4.0 * error + 0.01
-    assert sampler.verdict.status == "usable" and any("not normalised" in reason for reason in sampler.verdict.reasons)
-
-
-@pytest.mark.parametrize("n", [32, 100])
-@pytest.mark.parametrize("ndim", [1, 4, 10])
-def test_the_error_of_the_integral_of_a_prior_covers(n, ndim, rng):
-    scores = []
-    for _ in range(40):
-        value, error = log_integral(rng.uniform(0.0, 1.0, (n, ndim)), unit_box)
-        scores.append(value / error)
-    assert np.std(scores) < 1.5 and np.max(np.abs(scores)) < 5.0
-
-
-def unit_box(x):
-    return np.where(np.all((x >= 0.0) & (x <= 1.0), axis=1), 0.0, -np.inf)
-
-
-def test_the_integral_of_a_prior_is_unknown_for_few_or_flat_draws(rng):
-    assert log_integral(rng.uniform(size=(19, 2)), unit_box)[1] == np.inf
-    assert log_integral(np.repeat(rng.uniform(size=(50, 1)), 2, axis=1), unit_box)[1] == np.inf
