@@ -30,7 +30,6 @@ from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
 from .evaluation.asynchronous import AsynchronousEvaluator
 from .evaluation.evaluator import CallingConvention, Evaluator, FailureLimit, most_common_reasons
-from .evaluation.first_values import FirstEvaluations
 from .evaluation.pool_queue import advise_on_pool, check_asynchronous, open_queue
 from .evaluation.returned_values import ErrorCapturing
 from .evaluation.user_functions import UserFunctions
@@ -207,13 +206,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
         captured = ErrorCapturing(functions.function, args, kwargs, self.vectorize)
         limit = FailureLimit(self.settings.max_failure_share, self.nwalkers, self.ndim)
         common = captured, functions.log_prior, convention, self._record, limit, self._budget, functions.name
-        options = {"check": FirstEvaluations(functions, bool(args or kwargs), blobs_dtype is not None)}
         if not self.settings.asynchronous:
-            return Evaluator(*common, **options)
+            return Evaluator(*common)
         check_asynchronous(functions.function, self.pool, self.vectorize)
         queue = getattr(self._given_guide, "evaluation_queue", None)
         opened = partial(open_queue, functions.function, captured, convention.as_points, queue)
-        return AsynchronousEvaluator(*common, **options, open_queue=opened)
+        return AsynchronousEvaluator(*common, open_queue=opened)
 
     @classmethod
     def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:

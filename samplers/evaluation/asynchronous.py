@@ -18,7 +18,6 @@ from ..interrupts import deferred_interrupts
 from ..record import EvaluatedBatch, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .evaluator import Evaluator
-from .first_values import POINTS_OF_TERMS
 
 __all__ = ["AsynchronousEvaluator", "EvaluationQueue"]
 
@@ -68,7 +67,7 @@ class AsynchronousEvaluator(Evaluator):
         self._forget_running()
 
     def __getstate__(self) -> dict:
-        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_known": {}, "_held": []}
+        return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_known": {}}
 
     def _forget_running(self) -> None:
         self._queue: EvaluationQueue | None = None
@@ -76,7 +75,6 @@ class AsynchronousEvaluator(Evaluator):
         self._running: dict[int, tuple[PendingPoints, int]] = {}  # points not yet arrived at a decision
         self._tickets: dict[int, int] = {}  # number of the point by ticket of the queue
         self._known: dict[int, tuple[EvaluatedBatch, int]] = {}  # values of points that are still in `_running`
-        self._held: list[EvaluatedBatch] = []  # not stored before the first values are checked
 
     def _opened(self) -> EvaluationQueue:
         if self._queue is None:
@@ -145,8 +143,6 @@ class AsynchronousEvaluator(Evaluator):
         points = np.array([pending.coords[row] for pending, row in self._running.values()])
         key = f"arrived of {hashlib.blake2b(points.tobytes(), digest_size=16).hexdigest()}"
         arrived = self.record.remember(key, gather)[0]
-        if not new:
-            self._check = None  # the first values of the run were checked when they were evaluated
         by_batch: dict[int, list[int]] = {}
         for number in arrived.tolist():
             by_batch.setdefault(id(self._running[number][0]), []).append(number)
@@ -169,24 +165,17 @@ class AsynchronousEvaluator(Evaluator):
         """Numbers (m,) of the points that have arrived when `most` other points are running."""
         while len(self._running) - len(self._known) > most:
             self._take(self._opened().collect())
-            if self._check is None or self._finite() >= POINTS_OF_TERMS:
-                self._check_and_store()
-        self._check_and_store()
         return np.array(sorted(self._known), dtype=np.int64)
 
-    def _finite(self) -> int:
-        """Number of finite values that are known and have not arrived at a decision."""
-        return sum(bool(np.isfinite(batch.log_prob[row])) for batch, row in self._known.values())
-
     def _take(self, collected: list[tuple[int, Any]]) -> None:
-        """Take values that are not known yet from the queue."""
+        """Enter values of the queue that are not known yet in the record."""
         new = [(ticket, self._tickets[ticket], value) for ticket, value in collected if ticket in self._tickets]
         if not new:
             return
         coords = np.array([self._running[number][0].coords[self._running[number][1]] for _, number, _ in new])
         batch = self._as_batch(coords, [value for _, _, value in new])
         with deferred_interrupts():
-            self._held.append(batch)
+            self.record.evaluated(batch)
             for place, (ticket, number, _) in enumerate(new):
                 self._known[number] = batch, place
                 del self._tickets[ticket]
@@ -194,35 +183,12 @@ class AsynchronousEvaluator(Evaluator):
         if self.observer is not None:
             self.observer.finished(len(new))
 
-    def _check_and_store(self) -> None:
-        """Check the first values, and enter arrivals in the record."""
-        if self._known and self._check is not None:
-            try:
-                self._check(self, merge_batches([_single(*known) for known in self._known.values()]))
-            except ValueError:
-                self._held, self._tickets = [], {}  # wrong values are not stored
-                raise
-            self._check = None
-        self._store()
-
-    def _store(self) -> None:
-        """Enter arrivals in the record."""
-        with deferred_interrupts():
-            if self._held:
-                self.record.evaluated(merge_batches(self._held))
-            self._held = []
-
     def close(self) -> None:
-        """End the evaluation of running points; points that have ended are entered in the record.
-
-        The first values are entered without a check, which may take evaluations; the next run makes it.
-        """
+        """End the evaluation of running points; points that have ended are entered in the record."""
         queue, self._queue = self._queue, None
         try:
-            self._store()
             if hasattr(queue, "ended"):
                 self._take(queue.ended())
-                self._store()
         except Exception as error:  # another error or Ctrl-C is the reason why the run ends
             logger.warning("evaluations that have ended are not stored: %s", error)
         finally:

@@ -21,7 +21,6 @@ from ..budget import Budget, BudgetExhausted
 from ..interrupts import Ended, SentFunction, interrupts_end_the_run
 from ..record import EvaluatedBatch, Record, merge_batches
 from ..tempering.pending_points import PendingPoints
-from .first_values import POINTS
 from .pool_queue import map_in
 from .returned_values import ErrorCapturing, log_densities, outcomes
 
@@ -178,8 +177,6 @@ class Evaluator:
         Limits simulations; no limit by default.
     name : str
         Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
-    check : callable, optional
-        Called with this object and the first batch that it evaluates; raises ValueError for a wrong function.
 
     Attributes
     ----------
@@ -212,9 +209,8 @@ class Evaluator:
         limit: FailureLimit | None = None,
         budget: Budget | None = None,
         name: str = "log_prob_fn",
-        check: Callable[["Evaluator", EvaluatedBatch], None] | None = None,
     ):
-        self._name, self._check = name, check
+        self._name = name
         self._function, self._log_prior_fn, self._convention = function, log_prior_fn, convention
         self.record, self._limit = Record() if record is None else record, limit
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
@@ -314,7 +310,6 @@ class Evaluator:
             if observe is not None and len(part) > 0:
                 observe(part)
             if known is not None:
-                self._check = None  # the first batch of the run was checked when it was evaluated
                 self._check_blobs(known)
                 if self.observer is not None:
                     self.observer.repeated(len(part))
@@ -344,11 +339,6 @@ class Evaluator:
             if len(results) == stored:
                 return
             part = self._as_batch(coords[stored : len(results)], results[stored:])
-            if self._check is not None:
-                if np.isfinite(part.log_prob).sum() < POINTS:
-                    return
-                self._check(self, part)
-                self._check = None
             failed.extend(stored + row for row in part.reasons)
             self._enter(_successes(part))
             stored = len(results)
@@ -359,9 +349,6 @@ class Evaluator:
         if self.observer is not None:
             self.observer.settled()
         batch = self._as_batch(coords, results)
-        if self._check is not None:
-            self._check(self, batch)
-            self._check = None
         new = batch.rows([*failed, *range(stored, len(coords))])
         self._check_failures(new, whole=whole and stored == 0)
         self._enter(new)
@@ -426,10 +413,6 @@ class Evaluator:
         first = slice(0, int(np.flatnonzero(inside)[done]))
         batch = merge_batches(batches) if batches else None
         return self._pack(log_prior[first], inside[first], batch)
-
-    def call(self, function: Callable, coords: np.ndarray) -> np.ndarray:
-        """Values (n,) of another function of points (n, ndim) that is called like the log-density."""
-        return log_densities(self._convention.call(function, coords, self.pool), len(coords), "the function")
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""

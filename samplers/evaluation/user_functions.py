@@ -135,7 +135,8 @@ class UserFunctions(NamedTuple):
         Raises
         ------
         ValueError
-            Unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given, and a log-prior is known.
+            Unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given, and a log-prior is known; or if
+            `log_prob_fn` is a method called log_likelihood.
         """
         if (log_prob_fn is None) == (log_likelihood_fn is None):
             given = "neither" if log_prob_fn is None else "both"
@@ -148,6 +149,12 @@ class UserFunctions(NamedTuple):
         function = log_likelihood_fn if log_prob_fn is None else log_prob_fn
         if not callable(function):
             raise ValueError(f"{name} must be callable; got {function!r}")
+        owner = getattr(function, "__self__", None)
+        if name == "log_prob_fn" and owner is not None and function == getattr(owner, "log_likelihood", None):
+            raise ValueError(
+                "log_prob_fn is the method log_likelihood, which lacks the log-prior: the evidence would be wrong. "
+                "Pass None as log_prob_fn, and the method as log_likelihood_fn=; or pass the object itself"
+            )
         optional = OptionalAttributes.of(function)
         log_prior = optional.log_prior if log_prior_fn is None else log_prior_fn
         if not callable(log_prior):

@@ -73,8 +73,6 @@ MOST_LEFT_OUT = 3
 # The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
 # size below 1.5: a round of few draws has an effective share of at least one over their number.
 HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
-# The check of a run's first values needs some values that arrive together.
-FIRST_TOGETHER = 8
 UNREACHED = (
     "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
     "and standard deviations may be too small. Use a larger limit of simulations"
@@ -253,8 +251,7 @@ def let_arrive(
         running = [batch.running for batch in batches]
         if sum(running[:-1]) == 0 and running[-1] <= most:
             return
-        step = 1 if density.evaluations > 0 else FIRST_TOGETHER
-        density.wait(max(sum(running) - step, 0))
+        density.wait(max(sum(running) - 1, 0))
         for batch in batches if guide.observe is not None else ():
             arrived = batch.take_observable()
             if len(arrived) > 0:

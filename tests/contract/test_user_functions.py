@@ -52,29 +52,6 @@ def test_a_log_prior_may_be_an_array_of_one_number(shape):
     assert np.array_equal(sampler.get_chain(), run(SMCSampler, posterior).get_chain())
 
 
-@every
-@pytest.mark.parametrize("vectorize", [False, True])
-@pytest.mark.parametrize(("ndim", "shared"), [(2, False), (3, False), (3, True), (5, True)])
-def test_a_log_prob_that_is_not_summed_is_refused(Sampler, vectorize, ndim, shared):
-    """One term per parameter, alone or with a `shared` number added to each."""
-    posterior = Gaussian(ndim)
-
-    def not_summed(x):
-        return terms(x) + (np.expand_dims(posterior.log_likelihood(x), -1) if shared else 0.0)
-
-    with pytest.raises(ValueError, match=r"log_prob_fn must return one number per point, and blobs .* their sum"):
-        run(Sampler, not_summed, posterior, log_prior_fn=posterior.log_prior, vectorize=vectorize)
-    with pytest.raises(ValueError, match=r"log_likelihood_fn must return one number per point, and blobs"):
-        run(
-            Sampler,
-            None,
-            posterior,
-            log_likelihood_fn=lambda x: 2.0 * not_summed(x),
-            log_prior_fn=posterior.log_prior,
-            vectorize=vectorize,
-        )
-
-
 @pytest.mark.parametrize("vectorize", [False, True])
 @pytest.mark.parametrize("dtype", [None, float])
 def test_as_many_values_as_parameters_may_be_blobs(vectorize, dtype):
@@ -88,22 +65,6 @@ def test_as_many_values_as_parameters_may_be_blobs(vectorize, dtype):
 
     sampler = run(SMCSampler, coordinates, log_prior_fn=Gaussian().log_prior, vectorize=vectorize)
     assert np.array_equal(sampler.get_blobs(flat=True), sampler.get_chain(flat=True)[:, 1:])
-
-
-def test_a_sum_of_arrays_of_different_shapes_is_refused():
-    posterior = Gaussian()
-
-    def outer(x):
-        return posterior.log_prior(x)[:, None] + posterior.log_likelihood(x)
-
-    with pytest.raises(ValueError, match=r"got an array of shape \(24, 24\), the sum of each"):
-        run(SMCSampler, outer, log_prior_fn=posterior.log_prior, vectorize=True)
-
-    def with_blobs(x):  # 23 blobs for 24 points
-        return np.column_stack([posterior(x), np.sin(np.outer(x[:, 0], np.arange(23)))])
-
-    with_23 = run(SMCSampler, with_blobs, log_prior_fn=posterior.log_prior, vectorize=True, nsteps=1, recycle=False)
-    assert with_23.get_blobs().shape == (1, N, 23)
 
 
 # ---------------------------------------------------------------- log_likelihood_fn
@@ -208,72 +169,12 @@ def test_exactly_one_function_is_given(Sampler):
 # ---------------------------------------------------------------- one taken for the other
 
 
-class CallsItsLikelihood(Gaussian):
-    def __call__(self, x):
-        return self.log_likelihood(x)
-
-
-class Noisy(Gaussian):
-    """A likelihood that is estimated, with other random numbers in each call."""
-
-    def __init__(self):
-        super().__init__()
-        self.random = np.random.default_rng(1)
-
-    def log_likelihood(self, x):
-        return super().log_likelihood(x) + 0.1 * self.random.standard_normal(np.shape(x)[:-1])
-
-
 @every
-@pytest.mark.parametrize("vectorize", [False, True])
-def test_a_log_likelihood_as_log_prob_is_refused(Sampler, vectorize):
-    posterior, how = Gaussian(), {"vectorize": vectorize}
-    for function in (CallsItsLikelihood(), posterior.log_likelihood, lambda x: posterior.log_likelihood(x)):
-        with pytest.raises(ValueError, match=r"log_prob_fn returns the log-likelihood without .* log_likelihood_fn="):
-            run(Sampler, function, log_prior_fn=posterior.log_prior, **how)
-    for function in (posterior, lambda x: posterior(x)):
-        with pytest.raises(ValueError, match="the log-prior would be counted twice"):
-            run(Sampler, None, log_likelihood_fn=function, log_prior_fn=posterior.log_prior, **how)
-
-
-@every
-def test_what_is_not_certain_is_not_refused(Sampler):
-    posterior, how = Gaussian(), {"vectorize": True}
-    run(Sampler, Noisy(), **how)
-    run(Sampler, posterior.__call__, log_prior_fn=posterior.log_prior, **how)
-    run(Sampler, lambda x: posterior(x) + 2.0, log_prior_fn=posterior.log_prior, **how)
-    box = Box([0.0, 0.0], [1.0, 1.0], lambda x: -np.sum(x, axis=-1))
-    run(Sampler, box.log_likelihood, box, log_prior_fn=box.log_prior, **how)  # the log-prior is 0
-
-
-def test_the_comparison_costs_two_evaluations():
-    counted, posterior, plain = [], Gaussian(), Gaussian()
-    posterior.log_likelihood = lambda x: counted.append(len(x)) or Gaussian.log_likelihood(posterior, x)
-    posterior.__class__ = type("Own", (Gaussian,), {"__call__": lambda self, x: plain(x)})
-    run(SMCSampler, posterior, vectorize=True)
-    assert counted == [2]
-
-
-def test_an_object_that_names_all_densities_is_not_compared():
-    class Named(Gaussian):
-        def log_likelihood(self, x):
-            raise AssertionError("not to be called")
-
-        def log_prob(self, x):
-            return self.log_prior(x) + Gaussian.log_likelihood(self, x)
-
-        __call__ = log_prob
-
-    posterior = Named()
-    for function in (posterior, posterior.log_prob):
-        run(SMCSampler, function, log_prior_fn=posterior.log_prior, vectorize=True)
-
-
-def test_a_log_likelihood_that_cannot_be_called_is_not_compared():
+def test_a_log_likelihood_as_log_prob_is_refused(Sampler):
     posterior = Gaussian()
-    posterior.log_likelihood = lambda residuals, sigma: 0.0
-    posterior.__class__ = type("Other", (Gaussian,), {"__call__": lambda self, x: self.log_prior(x) - np.sum(x**2, -1)})
-    assert np.isfinite(run(SMCSampler, posterior, vectorize=True).log_evidence)
+    with pytest.raises(ValueError, match=r"is the method log_likelihood, .* as log_likelihood_fn="):
+        Sampler(N, 3, posterior.log_likelihood, log_prior_fn=posterior.log_prior)
+    run(Sampler, posterior.__call__, log_prior_fn=posterior.log_prior, vectorize=True)
 
 
 # ---------------------------------------------------------------- functions that change their argument

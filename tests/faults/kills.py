@@ -181,7 +181,6 @@ def evaluated_again(log, kind):
         lost += max(len((points & seen) - running) - COMPARED, 0)
         # all points of a submission, or those that have ended while the sampler computed proposals
         last = {"asynchronous": 4 * N, "threads": N, "map": 4 * WORKERS}.get(kind, 1)
-        last = 2 if last == 1 and len(made[-1]) == COMPARED else last  # a first batch is stored after its check
         running |= {point for call in made[-last:] for point in call}
         seen |= points
     return lost

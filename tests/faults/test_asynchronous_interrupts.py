@@ -155,39 +155,6 @@ def test_ctrl_c_at_any_line_keeps_what_has_ended(tmp_path):
     assert lines > 100
 
 
-def test_first_values_that_were_kept_without_a_check_are_checked_by_the_next_run(tmp_path, monkeypatch):
-    """A log-likelihood that is given as log-posterior is refused, although its values are in the record."""
-
-    class Mistaken(Noted):
-        def __call__(self, x):
-            self.evaluated.append(np.asarray(x).tobytes())
-            return self.log_likelihood(x)
-
-    path, posterior = tmp_path / "run.h5", Mistaken()
-    with Threads() as pool:
-        sampler = make(path, posterior, pool)
-        interrupted_when_all_has_ended(sampler, pool, monkeypatch, 1, "wait")
-        sampler._record.close()
-        assert len(points_of(path)) == N
-        with pytest.raises(ValueError, match="without the log-prior"):
-            make(path, posterior, pool).run_mcmc(None, 1)
-
-
-def test_values_that_the_check_refuses_are_not_kept(tmp_path):
-    class Mistaken(Noted):
-        def __call__(self, x):
-            return self.log_likelihood(x)
-
-    path = tmp_path / "run.h5"
-    with Threads() as pool:
-        sampler = make(path, Mistaken(), pool)
-        with pytest.raises(ValueError, match="without the log-prior"):
-            sampler.run_mcmc(None, 1)
-        sampler._record.close()
-        assert points_of(path) == []
-        make(path, Noted(), pool).run_mcmc(None, 0)
-
-
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, RuntimeError])
 def test_points_beside_one_that_ends_the_run_are_kept(kind, tmp_path):
     """A worker that raises what is no failure of a point ends the run; all other points that have ended are kept."""
