@@ -40,7 +40,7 @@ class SMCSampler(TemperedSampler):
         annealing, and lose a mode only if both do. `asynchronous` acts with a guide too.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation
         Settings of annealing by moves, as in `samplers.settings.Settings`.
-    fast_sweeps, check_draws, max_failure_share
+    check_draws, max_failure_share
         As in `samplers.settings.Settings`.
 
     Raises

@@ -31,7 +31,8 @@ class OptionalAttributes(NamedTuple):
         Function of points (n, ndim), always an array, that returns whether each point may have a positive density (n,),
         as far as is known without a simulation. A value of -inf at other points is not a failed simulation.
     fast_parameters : sequence of int
-        Indices of parameters whose change needs no simulation (`samplers.moves.fast_parameters`).
+        Indices of parameters whose change needs no simulation, such as noise levels: points that differ only in these
+        count as one simulation.
     ndim : int, optional
         Number of parameters.
     parameter_names : sequence of str
@@ -60,6 +61,10 @@ class OptionalAttributes(NamedTuple):
     def slow_parameters(self, ndim: int) -> list[int]:
         """Indices of the parameters that a simulation depends on; all parameters if none is slow."""
         fast = set(self.fast_parameters)
+        if not fast <= set(range(ndim)):
+            raise ValueError(
+                f"fast_parameters must be indices of parameters, 0 to {ndim - 1}; got {tuple(self.fast_parameters)}"
+            )
         return [j for j in range(ndim) if j not in fast] or list(range(ndim))
 
     @property

@@ -15,7 +15,6 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
 from ..estimates.weights import LOWEST
-from ..moves.fast_parameters import WithFastSweeps
 from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
 from ..reports import Sweep
@@ -105,13 +104,13 @@ class MoveSchedule(NamedTuple):
             Log-target of the stage, scaled so that the target's integral is about 1.
         """
         for move in self.moves:
-            if isinstance(move, MixtureMove | WithFastSweeps):
+            if isinstance(move, MixtureMove):
                 move.cover_basins(coords, log_target)
 
     def expect_independence(self) -> None:
         """Tell mixture moves that the points are already independent draws of the target."""
         for move in self.moves:
-            if isinstance(move, MixtureMove | WithFastSweeps):
+            if isinstance(move, MixtureMove):
                 move.expect_independence()
 
 

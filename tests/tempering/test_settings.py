@@ -32,7 +32,6 @@ CHANGES = {
     "max_correlation": (1e-6, {}),
     "chains": ("leaders", {}),
     "burn_in": (3, {"chains": "leaders"}),
-    "fast_sweeps": (4, {}),
     "recycle": (None, {}),  # the other value than that of the path
     "runs": (2, {}),
     "check_draws": (0, {}),
@@ -40,12 +39,12 @@ CHANGES = {
     "asynchronous": (True, {}),
 }
 ACTS = {
-    "recycling": {"fast_sweeps", "recycle", "runs", "check_draws", "asynchronous"},
+    "recycling": {"recycle", "runs", "check_draws", "asynchronous"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
-    | {"fast_sweeps", "recycle", "check_draws"},
+    | {"recycle", "check_draws"},
     "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
-    | {"burn_in", "fast_sweeps", "check_draws"},
-    "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"}
+    | {"burn_in", "check_draws"},
+    "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "check_draws"}
     | {"min_moves", "max_moves", "max_correlation"},
 }
 
@@ -67,9 +66,7 @@ def test_docstring_of_the_settings_names_every_setting():
 
 
 class Target(Gaussian):
-    """A sharp Gaussian with a fast parameter; optionally, some of its points fail."""
-
-    fast_parameters = (2,)
+    """A sharp Gaussian; optionally, some of its points fail."""
 
     def __init__(self, fails=False, **target):
         super().__init__(**target)
@@ -159,7 +156,6 @@ def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
         {"burn_in": 1.5},
         {"min_moves": 2.0},
         {"max_moves": 5.5},
-        {"fast_sweeps": True},
         {"recycle": "no"},
         {"recycle": 1},
     ],
