@@ -60,9 +60,6 @@ class Settings:
     recycle : bool, optional
         Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and by moves
         only if the result cannot be trusted. None leaves the choice to the sampler.
-    runs : int
-        Number of recycling runs from the same draws of the prior, whose points are used together at the end. A
-        difference between the runs means that one run has lost a part of the posterior, and is reported.
     check_draws : int, optional
         Evaluations for an estimate of the evidence that is independent of the annealing. None: as many as there are
         walkers; 0: no such estimate.
@@ -87,13 +84,12 @@ class Settings:
     chains: str = "equal"
     burn_in: int = 0
     recycle: bool | None = None
-    runs: int = 1
     check_draws: int | None = None
     max_failure_share: float = 0.5
     asynchronous: bool = False
 
     def __post_init__(self):
-        for name in ("min_moves", "max_moves", "burn_in", "runs", "check_draws"):
+        for name in ("min_moves", "max_moves", "burn_in", "check_draws"):
             if name != "check_draws" or self.check_draws is not None:
                 object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
         for name, allowed in (("asynchronous", "True or False"), ("recycle", "True, False or None")):
@@ -104,7 +100,6 @@ class Settings:
                 raise ValueError(f"{name} must be {allowed}; got {value!r}")
         variation, check_draws = self.coefficient_of_variation, self.check_draws
         for name, possible, wanted in (
-            ("runs", self.runs >= 1, "a whole number of at least 1"),
             ("ess_ratio", 0.0 < self.ess_ratio < 1.0, "between 0 and 1 (both excluded)"),
             ("ess_rule", self.ess_rule in ("constant", "declining"), '"constant" or "declining"'),
             ("ess_floor", self.ess_floor >= 0.0, "non-negative"),
@@ -162,17 +157,7 @@ def check_arguments(pool: Any, backend: Any, seed: Any) -> None:
 
 
 def refuse_unused(settings: Settings, guided: bool) -> None:
-    """Raise ValueError for `runs` or `asynchronous` if the annealing, with a guide or without, cannot use them."""
-    if settings.runs > 1 and guided:
-        raise ValueError(
-            f"runs={settings.runs} cannot act here: they begin with draws of the prior, not of a guide: pass "
-            "one of them"
-        )
-    if settings.runs > 1 and not settings.recycle:
-        raise ValueError(
-            f"runs={settings.runs} cannot act here: it belongs to recycling, and the annealing is by moves: pass "
-            "recycle=True"
-        )
+    """Raise ValueError for `asynchronous` if the annealing, with a guide or without, cannot use it."""
     if settings.asynchronous and not (guided or settings.recycle):
         raise ValueError(
             "asynchronous=True cannot act here: moves wait for all points that they propose: pass recycle=True"

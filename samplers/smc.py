@@ -6,7 +6,7 @@ population is nearly uncorrelated with its resampled start. The settings of pape
 
 Tempering has a limit that no setting removes: among modes with similar masses, a mode that is much narrower than the
 others has little mass at small beta, and is lost unless draws of the prior happen to lie in it (Woodard, Schmidler &
-Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walkers, or ``runs=2``.
+Huber 2009, doi:10.1214/EJP.v14-638). If such modes are possible, use more walkers.
 """
 
 from collections.abc import Collection
@@ -35,9 +35,8 @@ class SMCSampler(TemperedSampler):
         Anneal by recycling every evaluated point (`samplers.tempering.recycling`), and by moves if the result cannot be
         trusted. Default: True with 150 walkers or more, unless `moves` or a setting of annealing by moves is given
         (`ess_ratio` to `max_correlation`). With fewer walkers, a mode can be lost unnoticed, and recycling often fails.
-    runs, asynchronous
-        As in `samplers.settings.Settings`; they need recycling. Two runs cost up to twice the evaluations of the
-        annealing, and lose a mode only if both do. `asynchronous` acts with a guide too.
+    asynchronous
+        As in `samplers.settings.Settings`; it needs recycling or a guide.
     ess_ratio, ess_rule, ess_floor, resampling, min_moves, max_moves, max_correlation
         Settings of annealing by moves, as in `samplers.settings.Settings`.
     check_draws, max_failure_share
@@ -46,7 +45,7 @@ class SMCSampler(TemperedSampler):
     Raises
     ------
     ValueError
-        For an impossible value, or for `runs` or `asynchronous` without recycling.
+        For an impossible value, or for `asynchronous` without recycling or a guide.
     TypeError
         For a keyword that is not a setting of this sampler.
 
@@ -57,7 +56,7 @@ class SMCSampler(TemperedSampler):
     >>> sampler.get_chain(flat=True), sampler.log_evidence, sampler.log_evidence_error
     """
 
-    setting_names = (*MOVES, *_OF_WEIGHTS, "recycle", "runs", "asynchronous")
+    setting_names = (*MOVES, *_OF_WEIGHTS, "recycle", "asynchronous")
 
     @classmethod
     def _choose(cls, settings: Settings, given: Collection[str], moves: Any, nwalkers: int) -> tuple[bool, Any]:

@@ -220,7 +220,6 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("seed", "whole number >= 0", "Seed (1)"),
         Key("guide", "yes or no", "Find the posterior from the responses, with hundreds of simulations (no)"),
         Key("preset", "text", '"ramancha2022", "ramancha2022-constant" or "ching-chen-2007": settings of papers'),
-        Key("runs", "whole number >= 1", "Runs of recycling that must agree (1)"),
         Key("recycle", "yes or no", "Reuse every evaluated point; by default with 150 walkers or more"),
         Key("ess_ratio", "number", "Share of effective walkers wanted at each stage, without recycling"),
         Key("min_moves", "whole number", "Fewest sweeps per stage"),

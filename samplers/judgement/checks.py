@@ -5,7 +5,6 @@ or shares that disagree. Each check is a function of stages and arrays that retu
 """
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +17,6 @@ from ..reports import Concern, Stage
 from .modes import find_modes
 
 __all__ = [
-    "check_agreement",
     "check_annealing",
     "check_evidence",
     "check_fallback",
@@ -60,21 +58,8 @@ NEIGHBOURS = 3
 ROUNDING = 1e-12
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
-# Differences of evidences and shares, and of means in many parameters, are reported beyond this many standard errors.
-FAR, FAR_MEANS = 3.0, 4.0
-ADVICE = (
-    "The result contains what all runs have found. Where one run has lost a part of the posterior, all of them may "
-    "have lost another: use more walkers"
-)
-
-
-class WeightedRun(Protocol):
-    """Weighted draws (n, ndim) of the posterior with log-weights (n,), and the log-evidence with its standard error."""
-
-    coords: np.ndarray
-    log_weights: np.ndarray
-    log_evidence: float
-    log_evidence_error: float
+# Differences of evidences are reported beyond this many standard errors.
+FAR = 3.0
 
 
 def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
@@ -371,54 +356,6 @@ def check_shares(
         "has a wrong weight. Use more walkers or more moves, and compare two runs"
     )
     return [Concern(message, True)]
-
-
-def check_agreement(runs: Sequence[WeightedRun], mixture: Mixture, inherited: float) -> list[Concern]:
-    """A concern if runs differ in the evidence, in the share of a posterior part, or in a mean.
-
-    Parameters
-    ----------
-    runs : sequence of WeightedRun
-        The runs, each with weighted draws made at beta = 1.
-    mixture : Mixture
-        Mixture that was fitted to all points; its components are the parts.
-    inherited : float
-        Variance of the log-evidence from the weights by which the proposals of a run were chosen: one over their
-        effective sample size.
-
-    Returns
-    -------
-    list of Concern
-        Empty, or the most serious difference: of a share, else of the evidence, else of a mean.
-    """
-    shares, share_errors, means, mean_errors = [], [], [], []
-    for run in runs:
-        weights = normalised_weights(run.log_weights)
-        parts = np.exp(log_responsibilities(mixture, run.coords))
-        for values, centres, errors in ((parts, shares, share_errors), (run.coords, means, mean_errors)):
-            centres.append(weights @ values)
-            apart = (values - centres[-1]) ** 2
-            errors.append(weights**2 @ apart + inherited * (weights @ apart))
-    evidences = [run.log_evidence for run in runs]
-    for a in range(len(runs)):
-        for b in range(a + 1, len(runs)):
-            name = f"the runs {a + 1} and {b + 1} of the annealing disagree"
-            difference = np.abs(shares[a] - shares[b])
-            limit = np.maximum(LARGE_SHARE_DIFFERENCE, FAR * np.sqrt(share_errors[a] + share_errors[b]))
-            if np.any(difference > limit):
-                k = int(np.argmax(np.where(difference > limit, difference, 0.0)))
-                found = f"the share {shares[a][k]:.2f} in one and {shares[b][k]:.2f} in the other"
-                return [Concern(f"{name}: a part of the posterior has {found}. {ADVICE}", True)]
-            errors = np.array([runs[a].log_evidence_error, runs[b].log_evidence_error])
-            if abs(evidences[a] - evidences[b]) > FAR * np.hypot(*errors):
-                found = " and ".join(f"{evidences[k]:.2f} +- {runs[k].log_evidence_error:.2f}" for k in (a, b))
-                return [Concern(f"{name}: their log-evidences are {found}. {ADVICE}", True)]
-            difference = np.abs(means[a] - means[b]) / np.sqrt(mean_errors[a] + mean_errors[b])
-            if np.any(difference > FAR_MEANS):
-                k = int(np.argmax(difference))
-                found = f"their means of parameter {k} differ by {difference[k]:.1f} standard errors"
-                return [Concern(f"{name}: {found}. {ADVICE}", True)]
-    return []
 
 
 def check_guide_against_recycling(

@@ -30,7 +30,6 @@ from ..estimates.importance import (
 )
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
 from ..judgement.checks import (
-    check_agreement,
     check_annealing,
     check_fallback,
     check_fit,
@@ -50,7 +49,7 @@ from .guided import FEWEST_DRAWS, Guidance, RoundsOfGuide, better_of, draw_round
 from .mutation import MoveSchedule, Mutated, VisitedPoints
 from .pending_points import PendingPoints
 from .population import Density, Population
-from .recycling import TARGET_SHARE, Recycled, pool_runs, recycle, stopped_at, submit_start
+from .recycling import Recycled, recycle, submit_start
 from .smc_moves import anneal_by_moves, move
 
 __all__ = ["anneal", "check_population"]
@@ -106,9 +105,7 @@ def anneal(
         else:
             start = PendingPoints.known(population.coords, population.records)
         recycled = None
-        if settings.recycle and settings.runs > 1:
-            recycled = yield from _by_runs(population, start, density, random, schedule, settings)
-        elif settings.recycle:
+        if settings.recycle:
             steps = recycle(start, density, random)
             recycled = yield from _by_recycling(steps, population, size, density, random, schedule, settings)
         if recycled is None or not recycled.reliable:
@@ -241,37 +238,6 @@ def _resampled(
     ancestors = systematic(normalised_weights(log_weights), random, size)
     effective = effective_sample_size(log_weights)
     return Population(1.0, coords[ancestors], records[ancestors], effective, (ancestors,)), len(np.unique(ancestors))
-
-
-def _by_runs(
-    population: Population,
-    start: PendingPoints,
-    density: Density,
-    random: np.random.RandomState,
-    schedule: MoveSchedule,
-    settings: Settings,
-) -> Generator[tuple[Population, Report], None, Recycled]:
-    """Several recycling runs, then one run that begins with all their points; the runs are compared at the end."""
-    runs, size = [], len(population.coords)
-    for _ in range(settings.runs):
-        try:
-            run = yield from recycle(start, density, random, whole=False)
-        except StoppedEarly as stop:
-            stop.log_evidence_of_stages = 0.0  # the stages of these runs are not reported
-            raise (stopped_at(runs[0].points, 1.0, 0.0, 0.0) if runs else stop) from None
-        if not run.reliable:
-            yield population, Restart(run.reason)
-            return run
-        runs.append(run)
-    coords, records, mixture = pool_runs(runs, size)
-    share = TARGET_SHARE * size / len(coords)
-    steps = recycle(PendingPoints.known(coords, records), density, random, mixture, size, share)
-
-    def compare(found: Recycled) -> list[Concern]:
-        return check_agreement(runs, found.proposals[-1][1], 1.0 / (share * len(coords)))
-
-    pooled = Population(0.0, coords, records, float(len(coords)))
-    return (yield from _by_recycling(steps, pooled, size, density, random, schedule, settings, compare))
 
 
 def _from_guide(

@@ -43,7 +43,7 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "StartingDensity", "most_running", "pool_runs", "recycle", "stopped_at", "submit_start"]
+__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
@@ -116,7 +116,7 @@ class Recycled(NamedTuple):
     log_evidence, log_evidence_error : float
         Log-evidence from all points except the draws of the check, and its standard error.
     check : EvidenceCheck, optional
-        The check with fresh draws; None if beta = 1 was not reached, or no check was wanted.
+        The check with fresh draws; None if beta = 1 was not reached.
     points : WeightedPoints, optional
         All evaluated points with all proposals; None without draws.
     log_evidence_below_one : float
@@ -150,8 +150,6 @@ def recycle(
     random: np.random.RandomState,
     start: StartingDensity | None = None,
     size: int | None = None,
-    target_share: float | None = None,
-    whole: bool = True,
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
 
@@ -168,12 +166,6 @@ def recycle(
         posterior^beta.
     size : int, optional
         Wanted effective sample size at beta = 1, and number of draws for the check; n by default.
-    target_share : float, optional
-        Wanted effective sample size below beta = 1, as a share of the number n of starting points; `TARGET_SHARE` by
-        default.
-    whole : bool
-        False for a part of a longer annealing: its stages are not reported, and it ends without a check, as soon as the
-        draws at beta = 1 satisfy the rule by which a beta is left.
 
     Yields
     ------
@@ -195,9 +187,7 @@ def recycle(
     # another starting density was fitted by a separate search
     search, basin_rounds = _Search(SEARCH_DRAWS * n if start is None else 0.0), 0
     start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
-    share = TARGET_SHARE if target_share is None else target_share
-    target = max(share * n, POINTS_PER_DIMENSION * (ndim + 1.0))
-    enough_fresh = FRESH_SHARE * target
+    target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
     points, bounds = WeightedPoints(pending, start), find_support_bounds(density.inside, pending.coords)
     beta, efficiencies, increments, checks = 0.0, [], [], 0
     drawn: list[_Drawn] = []  # at the present beta
@@ -214,7 +204,7 @@ def recycle(
         fresh = sum(effective_sample_size(draws.log_weights(start, beta)) for draws in drawn)
         log_weights, last_beta = points.log_weights(beta), beta
         effective = effective_sample_size(log_weights)
-        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= enough_fresh):
+        if beta < 1.0 and effective >= target and (beta == 0.0 or fresh >= FRESH_SHARE * target):
             if points.running(latest=False) > 0:
                 # otherwise a mode with long evaluations would be left out of every proposal
                 density.wait(points.running() - 1)
@@ -225,7 +215,7 @@ def recycle(
             if following == 1.0 and points.running() > 0:  # the draws at beta = 1 are the result
                 density.wait(0)
                 continue
-            beta, drawn, fresh = following, [], 0.0
+            beta, drawn = following, []
             log_weights = points.log_weights(beta)
             effective = effective_sample_size(log_weights)
 
@@ -237,8 +227,7 @@ def recycle(
             acceptance = efficiencies[-1] if efficiencies else effective / n
             stage = Stage(beta, effective, acceptance, 0, int(effective), increments[-1], error)
             population = Population(beta, points.coords, points.records, effective, (), log_weights)
-            if whole:
-                yield population, stage
+            yield population, stage
             yield population, Sweep(acceptance)
 
         # fit a proposal
@@ -265,7 +254,7 @@ def recycle(
             points.update()
             if (few := len(pending.coords)) > 0:
                 points.add(mixture, made * few / len(new), pending)
-            raise stopped_at(points, beta, sum(increments), inherited)
+            raise _stopped_at(points, beta, sum(increments), inherited)
         checking = finished and not exploring
         density.wait(0 if checking else most_running(density, len(new)))
         if exploring:
@@ -273,7 +262,6 @@ def recycle(
             continue
         drawn.append(draws := _Drawn(mixture, made, pending))
         new_weights = draws.log_weights(start, beta)
-        fresh += effective_sample_size(new_weights)
         efficiencies.append(effective_sample_size(new_weights) / max(len(new_weights), 1))
 
         # check
@@ -284,7 +272,7 @@ def recycle(
         reason = _reason(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
         ends = not reason or checks == MOST_CHECKS if checking else bool(reason)
-        if ends or (not whole and beta == 1.0 and effective >= target and fresh >= enough_fresh):
+        if ends:
             if not checking:
                 density.wait(0)
                 points.update()
@@ -293,42 +281,6 @@ def recycle(
             result = _result(drawn if beta == 1.0 else [draws], start, beta)
             return Recycled(reason, *result, log_evidence, error, check, points, sum(increments))
         points.add(mixture, made, pending)
-
-
-def pool_runs(runs: Sequence[Recycled], n_prior: int) -> tuple[np.ndarray, np.ndarray, StartingDensity]:
-    """All points of runs with common draws of the prior, and the density that the points were drawn from.
-
-    A mode that no draw of a run has met is missing in all later proposals of this run, and nothing in the run reveals
-    it. A second run makes other draws. All proposals of the runs and the prior are a mixture with a known density, from
-    which recycling continues to beta = 1, so the result contains what any run has found (Owen & Zhou 2000).
-
-    Parameters
-    ----------
-    runs : sequence of Recycled
-        The runs; the first points of each are the draws of the prior.
-    n_prior : int
-        Number of prior draws.
-
-    Returns
-    -------
-    coords, records : (n, ndim) float, (n,) structured array
-        The draws of the prior once, and the draws of all runs.
-    start : StartingDensity
-        Mixture of the prior and all proposals, by their numbers of draws.
-    """
-    first = runs[0].points
-    coords = np.concatenate([first.coords[:n_prior], *(run.points.coords[n_prior:] for run in runs)])
-    records = np.concatenate([first.records[:n_prior], *(run.points.records[n_prior:] for run in runs)])
-    proposals = [proposal for run in runs for proposal in run.proposals]
-    made = n_prior + sum(count for count, _ in proposals)
-
-    def log_start(points: np.ndarray, records: np.ndarray) -> np.ndarray:
-        total = np.log(n_prior / made) + records["log_prior"]
-        for count, mixture in proposals:
-            total = np.logaddexp(total, np.log(count / made) + log_density(mixture, points))
-        return total
-
-    return coords, records, StartingDensity(made, log_start)
 
 
 class WeightedPoints:
@@ -478,7 +430,7 @@ class _Search:
         return draws + share
 
 
-def stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
+def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
     """All points, weighted by the posterior over the mixture of their densities, when the limit is exceeded at `beta`.
 
     `of_stages`: part of the log-evidence from stages already reported. `inherited`: variance of the log-evidence from

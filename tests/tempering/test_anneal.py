@@ -5,7 +5,7 @@ import pytest
 
 from samplers.estimates.importance import EvidenceCheck
 from samplers.moves.population_moves import MixtureMove
-from samplers.reports import AnnealingResult, Concern, Restart, Stage, Sweep
+from samplers.reports import AnnealingResult, Restart, Stage, Sweep
 from samplers.settings import Settings
 from samplers.tempering import recycling
 from samplers.tempering.anneal import anneal
@@ -143,14 +143,3 @@ def test_a_restart_makes_earlier_stages_void(monkeypatch):
     before, after = reports[:place], [report for report in reports[place:] if isinstance(report, Stage)]
     assert before and all(stage.moves == 0 for stage in before)
     assert after[0].beta < 1.0 and after[-1].beta == 1.0 and all(stage.moves > 0 for stage in after)
-
-
-def test_the_last_population_is_at_beta_1_where_runs_disagree(monkeypatch):
-    """A concern about the runs comes with the result, not with the draws of the prior that they began with."""
-    concern = Concern("the runs disagree", True)
-    monkeypatch.setattr("samplers.tempering.anneal.check_agreement", lambda *_: [concern])
-    steps, _ = steps_of(Settings(recycle=True, runs=2))
-    (population,) = [population for population, report in steps if report is concern]
-    assert population.beta == 1.0
-    z = (population.coords - Gaussian(3, sd=0.02).mean) / Gaussian(3, sd=0.02).sd
-    assert np.max(np.abs(z)) < 6.0

@@ -33,13 +33,12 @@ CHANGES = {
     "chains": ("leaders", {}),
     "burn_in": (3, {"chains": "leaders"}),
     "recycle": (None, {}),  # the other value than that of the path
-    "runs": (2, {}),
     "check_draws": (0, {}),
     "max_failure_share": (0.0, {}),
     "asynchronous": (True, {}),
 }
 ACTS = {
-    "recycling": {"recycle", "runs", "check_draws", "asynchronous"},
+    "recycling": {"recycle", "check_draws", "asynchronous"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
     | {"recycle", "check_draws"},
     "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
@@ -135,7 +134,6 @@ def test_a_setting_of_moves_chooses_moves(settings):
 @pytest.mark.parametrize(
     ("Sampler", "settings", "match"),
     [
-        (SMCSampler, {"runs": 2}, "runs=2 cannot act here"),
         (SMCSampler, {"asynchronous": True}, "asynchronous=True cannot act here"),
         (SMCSampler, {"ess_floor": 10.0}, 'ess_rule="declining"'),
         (TMCMCSampler, {"burn_in": 2, "chains": "equal"}, 'chains="leaders"'),
