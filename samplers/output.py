@@ -26,7 +26,7 @@ from .output_file import FileHeld, open_file, patient_open, read_object, replace
 from .record import Record
 from .reports import AnnealingResult, Stage, warn
 
-__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file", "stored_result"]
+__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file"]
 
 logger = logging.getLogger(__name__)
 
@@ -222,23 +222,6 @@ class Output:
             self.provisional = False
             self._write()
             self.step_stored()
-
-
-def stored_result(backend: Backend) -> tuple[AnnealingResult, Verdict | None]:
-    """Ladder with evidence, and verdict, as a run has stored them; the density is not called.
-
-    Parameters
-    ----------
-    backend : emcee Backend or HDFBackend
-        Of a tempered sampler; it may be open for reading only.
-
-    Returns
-    -------
-    AnnealingResult
-        Empty if the annealing has not ended, or the chain belongs to another kind of sampler.
-    Verdict or None
-    """
-    return _parsed(_read(backend))
 
 
 def _read(backend: Backend) -> dict[str, Any]:

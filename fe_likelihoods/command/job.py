@@ -30,7 +30,6 @@ class Job:
     prediction: dict[str, Any]
     events: dict[str, dict[str, Any]] = field(default_factory=dict)  # keys of the events to predict, by name
     event: str = ""  # to which record and measurements belong; empty for the calibration
-    runs_code: bool = True  # whether Python files and programs that the file names may run
 
     def where(self, section: str) -> str:
         """File and section, for messages."""

@@ -10,24 +10,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..cache.simulation_cache import SimulationCache
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
-from ..models.user_model import UserModel
 from ..priors.distributions import Distribution, HalfNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
-from ..simulation.model import Model, SimulationFailed
+from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job
 from .noises import make_noise
 from .priors import parse_prior
 from .schema import did_you_mean, part_keys
 
-__all__ = ["USER_MODELS", "NotRun", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
+__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
 USER_MODELS = ("function", "opensees", "executable")
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
@@ -187,9 +184,6 @@ def _user_model(job: Job, record: Record | None) -> Model:
     given = dict(job.model)
     names, channels = given.pop("parameters"), _user_channels(job)
     given.pop("channels")
-    if not job.runs_code:
-        sampling = {key: given.get(key) for key in ("dt", "n_steps")}
-        return NotRun(names, channels, **sampling, record=record)
     given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
     common = {"record": record} | given
     if job.kind == "executable":
@@ -210,16 +204,6 @@ def _user_model(job: Job, record: Record | None) -> Model:
     from ..models.function import FunctionModel
 
     return FunctionModel(function, names, channels, **common)
-
-
-class NotRun(UserModel):
-    """A model of the user in a report that runs no code of the user; every simulation fails."""
-
-    def _prepare(self) -> None:
-        self.fingerprint = self._digest("not run")
-
-    def _respond(self, theta: np.ndarray) -> np.ndarray:
-        raise SimulationFailed("this report runs no code that the settings name")
 
 
 def load_function(job: Job, text: str) -> Callable:

@@ -11,11 +11,9 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..prediction.prediction import Prediction
 from ..reporting.advice import Judgement
-from ..reporting.contents import evidence
 from ..reporting.run import FinishedRun
 from ..reporting.table import moments_of
 from ..signals.error_measures import rrmse
-from .models import NotRun
 
 __all__ = ["write_csv", "write_samples", "write_tables"]
 
@@ -45,9 +43,7 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
         "",
         "Relative RMS error of the response (RRMSE):",
     ]
-    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit] or [
-        "  not known: the model was not run"
-    ]
+    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
@@ -69,8 +65,6 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
     if run.tempered:
         value, error = run.sampler.log_evidence, run.sampler.log_evidence_error
         return [f"log-evidence {value:.2f} +- {error:.2f}", str(run.verdict)]
-    if isinstance(run.posterior.likelihood.model, NotRun):
-        return [f"{len(run.samples)} samples; the model was not run.", *evidence(run)]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
@@ -103,10 +97,8 @@ def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
 
 
 def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
-    """RRMSE of every channel at the posterior mean; one simulation. Empty if the model is not run."""
+    """RRMSE of every channel at the posterior mean; one simulation."""
     likelihood = posterior.likelihood
-    if isinstance(likelihood.model, NotRun):
-        return []
     n = len(likelihood.model.parameter_names)
     residuals = (
         likelihood.residuals(samples[:, :n].mean(axis=0))

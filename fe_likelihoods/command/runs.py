@@ -11,7 +11,6 @@ import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,10 +18,10 @@ import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
 from ..prediction.prediction import Prediction
-from ..reporting.advice import judge, judge_run
+from ..reporting.advice import judge_run
 from ..reporting.rehearsal import refuse_chance
-from ..reporting.run import FinishedRun, read_run
-from ..signals.data_faults import CARE, REMARK, WRONG, Finding
+from ..reporting.run import read_run
+from ..signals.data_faults import REMARK
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -34,7 +33,7 @@ from .events import (
     write_events,
 )
 from .job import Job, parse_job, read_job
-from .models import USER_MODELS, NotRun, Problem, make_problem
+from .models import USER_MODELS, Problem, make_problem
 from .results import write_samples, write_tables
 from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
@@ -42,7 +41,6 @@ __all__ = ["CACHE", "Outcome", "default_folder", "is_free", "report_run", "run_j
 
 SETTINGS, ORIGIN, CHAIN = "settings.toml", "origin.json", "run.h5"
 CACHE = "simulations.sqlite"
-WITHOUT_MODEL = "without-model"  # folder in the folder of a run
 CHANGEABLE = ("budget", "events", "prediction")  # sections that do not change what a run has computed so far
 DRAWS = 100  # of predictions
 
@@ -95,9 +93,8 @@ def run_job(
 def report_run(path: Path, runs_code: bool = False) -> Outcome:
     """Make the tables and the report of a stored run, its folder or a file in it, again, without new samples.
 
-    A user's model runs only if `runs_code`; otherwise the report of such a run has no responses and no predictions, and
-    is written to the folder `WITHOUT_MODEL` of the run. ValueError if it is not such a folder, its data are no longer
-    there, or the run has no samples yet.
+    ValueError if it is not such a folder, its data are no longer there, the run has no samples yet, or the model is a
+    user's code and `runs_code` is false.
     """
     folder = path if path.is_dir() else path.parent
     if not (folder / SETTINGS).is_file() or not (folder / CHAIN).is_file():
@@ -107,27 +104,25 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
         )
     origin = _origin(folder)
     job = parse_job((folder / SETTINGS).read_text(encoding="utf-8"), folder / SETTINGS, Path(origin["folder"]))
-    job = replace(job, runs_code=runs_code)
+    if job.kind in USER_MODELS and not runs_code:
+        raise ValueError(
+            f"the model of {folder} is a Python file or program that its settings name, and nothing was run: give "
+            "--run-code if you trust this code"
+        )
     cache = SimulationCache(folder / CACHE) if (folder / CACHE).is_file() else None
     problem = make_problem(job, cache)
-    runs = not isinstance(problem.posterior.likelihood.model, NotRun)
-    sampler = _stored_sampler(job, problem, folder) if runs else _chain_only(folder, problem)
+    sampler = _stored_sampler(job, problem, folder)
     if sampler.iteration <= discarded(job):
         raise ValueError(
             f"the run in {folder} has no samples yet; continue it with: fe-likelihoods run {origin['file']} --out "
             f"{folder}"
         )
     steps = job.sampler.get("steps", STEPS)
-    if runs and not is_emcee(job) and sampler.iteration >= steps:
+    if not is_emcee(job) and sampler.iteration >= steps:
         # the annealing is made again without an evaluation; the chain alone has lost which walkers are copies
         with _without_messages("samplers.tempered"):
             sampler.run_mcmc(None, 0, progress=False)
     file = Path(origin["file"])
-    if not runs:
-        beside = folder / WITHOUT_MODEL
-        beside.mkdir(exist_ok=True)
-        run = read_run(sampler, problem.posterior, discard=discarded(job))
-        return Outcome(beside, sampler, problem, *_write_samples_only(beside, run, _command(file, folder)))
     events = read_events(job, problem)
     return Outcome(folder, sampler, problem, *_write(folder, job, file, sampler, problem, events, False))
 
@@ -212,38 +207,6 @@ def _write(
     for each in described:
         cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
     return (page.name, *tables, samples, *pictures), tuple(cautions), judgement.status != "do not use"
-
-
-def _chain_only(folder: Path, problem: Problem) -> Any:
-    """The chain of a folder in a sampler of emcee, without the evaluations that led to it."""
-    import emcee
-
-    path = folder / CHAIN
-    try:
-        backend = emcee.backends.HDFBackend(str(path), read_only=True)
-        walkers, ndim = backend.shape
-        backend.get_chain(), backend.get_log_prob()
-    except (*DAMAGE, AttributeError, ValueError) as error:
-        raise _damaged(path, error) from error
-    if ndim != problem.posterior.ndim:
-        raise ValueError(f"{path} has {ndim} parameters, {SETTINGS} describes {problem.posterior.ndim}")
-    return emcee.EnsembleSampler(walkers, ndim, problem.posterior, backend=backend)
-
-
-def _write_samples_only(folder: Path, run: FinishedRun, again: str) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """As `_write`, without anything that needs a simulation."""
-    from ..reporting.report import report
-
-    report(run.sampler, None, None, folder / "report.html", discard=run.discard, repeat=again)
-    caution = (
-        "the model is a Python file or program that the settings name, which was not run: the report has no "
-        "responses and no predictions, and evidence and verdict as they are stored. The report of the run itself was "
-        "not changed. `fe-likelihoods report FOLDER --run-code` runs the model and makes that report again; do that "
-        "only with code that you trust"
-    )
-    judgement = judge([Finding("The model was not run", WRONG if run.is_inconclusive else CARE, caution)])
-    files = ("report.html", *write_tables(folder, run, judgement), write_samples(folder, run, None, 0, judgement))
-    return files, (caution,), not run.is_inconclusive
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:

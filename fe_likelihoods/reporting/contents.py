@@ -4,9 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from samplers import Verdict
-from samplers.output import stored_result
-
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
@@ -122,8 +119,6 @@ def _finding(rows: list[ParameterRow], fits: Fits) -> str:
 def _worth(run: FinishedRun) -> str:
     if run.tempered:
         return f"{len(run.samples)} samples, worth about {run.effective_sample_size:.0f} independent ones."
-    if (verdict := stored_result(run.sampler.backend)[1]) is not None:
-        return f"{len(run.samples)} samples. The verdict that the run has stored is “{verdict.status}”."
     if np.isfinite(run.effective_sample_size):
         return (
             f"{len(run.samples)} samples of a Markov chain are worth about {run.effective_sample_size:.0f} independent "
@@ -145,18 +140,10 @@ def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
     return sentences
 
 
-def _stored_verdict(verdict: Verdict | None) -> list[str]:
-    return [] if verdict is None else [f"Verdict of the sampler, as the run has stored it: {verdict}"]
-
-
 def evidence(run: FinishedRun) -> list[str]:
     """The evidence with its check, in sentences."""
     if not run.tempered:
-        result, verdict = stored_result(run.sampler.backend)  # the chain alone of a tempered sampler
-        if not result.finished:
-            return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
-        value, error = result.evidence
-        return [f"Log-evidence {value:.2f} ± {error:.2f}, as the run has stored it.", *_stored_verdict(verdict)]
+        return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
     sampler, check = run.sampler, run.check
     lines = [
         f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}. Only differences between models "
