@@ -58,6 +58,8 @@ NEIGHBOURS = 3
 ROUNDING = 1e-12
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
+# Error of the log-odds above which probabilities of models are called rough.
+LARGE_ERROR_OF_ODDS = 0.5
 # Differences of evidences are reported beyond this many standard errors.
 FAR = 3.0
 

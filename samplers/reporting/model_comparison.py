@@ -14,12 +14,10 @@ import numpy as np
 from scipy.special import expit, logsumexp
 from scipy.stats import norm
 
+from ..judgement.checks import LARGE_ERROR_OF_ODDS
 from .summary import aligned, log_posterior_of, verdict_summary_of
 
 __all__ = ["ModelComparison", "compare_models"]
-
-# Error of the log-odds above which probabilities are reported as rough.
-_LARGE_ERROR = 0.5
 
 
 class ModelComparison(NamedTuple):
@@ -150,7 +148,7 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         upper=expit(odds + reach),
         log_bayes_factor=log_evidence - log_evidence[best],
         log_bayes_factor_error=factor_error,
-        rough=bool(np.any(odds_error[(before > 0.0) & (before < 1.0)] > _LARGE_ERROR)),
+        rough=bool(np.any(odds_error[(before > 0.0) & (before < 1.0)] > LARGE_ERROR_OF_ODDS)),
         summaries=tuple(map(verdict_summary_of, models.values())),
     )
 

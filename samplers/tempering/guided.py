@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..budget import Budget
-from ..estimates.control_variates import SignedSample, signed_sample, unreached_share
+from ..estimates.control_variates import SignedSample, signed_sample
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
     LARGEST_SHAPE,
@@ -33,6 +33,17 @@ from ..estimates.importance import (
     pool_rounds,
     tails_are_light,
     usable,
+)
+from ..judgement.rounds import (
+    LIGHT_TAILS,
+    UNREACHED,
+    UNSETTLED,
+    all_impossible,
+    describe_rounds,
+    hopeless,
+    is_even,
+    is_reliable,
+    reaches,
 )
 from ..reports import GuidedRound, GuideTick, Report
 from .early_stop import StoppedEarly
@@ -50,7 +61,6 @@ __all__ = [
     "lend",
     "start_from_guide",
     "stopped_rounds",
-    "reliable",
 ]
 
 logger = logging.getLogger(__name__)
@@ -60,31 +70,10 @@ logger = logging.getLogger(__name__)
 ROUND_SHARE = 0.6
 # Smallest number of draws in a round. The Pareto shape cannot be estimated from fewer than 25.
 FEWEST_DRAWS = 25
-# A reliable round has at least this effective share, and a Pareto shape below this value, for which the variance of its
-# weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.
-RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
-SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
 # Largest number of rounds, and the number after which enough effective draws suffice: the response is rough then.
 MOST_ROUNDS, PATIENT_ROUNDS = 20, 8
-# Rounds are left out if more than this share of the guide's latest known density was hardly reached by theirs.
-LARGEST_UNREACHED = 0.03
 # They are left out so often at most: known densities of a rough response differ by as much from round to round.
 MOST_LEFT_OUT = 3
-# The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
-# size below 1.5: a round of few draws has an effective share of at least one over their number.
-HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
-UNREACHED = (
-    "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
-    "and standard deviations may be too small. Use a larger limit of simulations"
-)
-UNSETTLED = (
-    "the density that the guide emulates has changed from round to round, in a part of it by more than a factor of "
-    "1000: the response is rough, or the posterior is larger than its draws. Compare with a run of another seed"
-)
-LIGHT_TAILS = (
-    "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
-    "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
-)
 
 
 class Guidance(NamedTuple):
@@ -258,15 +247,6 @@ def let_arrive(
                 guide.observe(arrived, session)
 
 
-def reliable(latest: Round) -> bool:
-    """Whether a fresh round shows that the guide describes the posterior."""
-    share = latest.effective_share
-    if share < RELIABLE_SHARE:
-        return False
-    few = len(latest.log_weights) < FEW_DRAWS
-    return latest.pareto_shape < LARGEST_RELIABLE_SHAPE or (few and share >= SHORT_TAIL_SHARE)
-
-
 def draw_rounds(
     population: Population,
     density: Density,
@@ -346,7 +326,7 @@ def draw_rounds(
         points, log_prob = (np.concatenate(column) for column in zip(*parts, strict=True))
         for _ in guide.refine(points, log_prob, session) if len(points) > 0 else ():
             yield tick(f"after round {made}", True)
-        reaching = [each for each in rounds if _reaches(each, guide.known_density)]
+        reaching = [each for each in rounds if reaches(each, guide.known_density)]
         if len(reaching) < len(rounds) and left_out < MOST_LEFT_OUT:
             logger.info("%d of %d rounds hardly reached a part of the posterior", len(rounds) - len(reaching), made)
             rounds, outcome, left_out = reaching, None, left_out + 1
@@ -356,12 +336,6 @@ def draw_rounds(
             return outcome
         if budget.refused:
             return (yield from judge(0))
-
-
-def _reaches(earlier: Round, latest: KnownDensity | None) -> bool:
-    """Whether the draws of a round reach all of the guide's latest known density."""
-    known = earlier.known
-    return known is None or latest is None or unreached_share(known, latest) <= LARGEST_UNREACHED
 
 
 def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
@@ -379,15 +353,15 @@ def _report(last: Round, pooled: PooledRounds) -> GuidedRound:
 def _outcome(rounds: Sequence[Round], pooled: PooledRounds, size: int, made: int) -> RoundsOfGuide | None:
     """How the rounds end; None if they continue. `made` rounds include those that were left out."""
     last, enough = rounds[-1], pooled.effective_sample_size >= size
-    if enough and reliable(last) and _even(pooled):
-        light = tails_are_light([r for r in rounds if reliable(r)])
+    if enough and is_reliable(last) and is_even(pooled):
+        light = tails_are_light([r for r in rounds if is_reliable(r)])
         return RoundsOfGuide("", LIGHT_TAILS if light else "", pooled, last)
-    if reason := _impossible(rounds) or _hopeless(rounds):
+    if reason := hopeless(rounds):
         return RoundsOfGuide(reason, "", pooled, last)
     usable = enough and last.effective_share >= USABLE_SHARE and pooled.pareto_shape < LARGEST_SHAPE
-    if made < (PATIENT_ROUNDS if usable and _even(pooled) else MOST_ROUNDS):
+    if made < (PATIENT_ROUNDS if usable and is_even(pooled) else MOST_ROUNDS):
         return None
-    shortfall = _describe(last, pooled, made)
+    shortfall = describe_rounds(last, pooled, made)
     return RoundsOfGuide("" if usable else shortfall, shortfall, pooled, last)
 
 
@@ -398,9 +372,9 @@ def _too_few(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide
     """
     if made + len(batches) >= MOST_ROUNDS:
         return False
-    if rounds and reliable(rounds[-1]):
+    if rounds and is_reliable(rounds[-1]):
         return _missing(rounds, batches, size, guide) > 0.0
-    return guide.learns_from_parts and (not _all_impossible(rounds) or any(batch.possible for batch in batches))
+    return guide.learns_from_parts and (not all_impossible(rounds) or any(batch.possible for batch in batches))
 
 
 def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> float:
@@ -409,61 +383,17 @@ def _missing(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide
     return size - pool_rounds(rounds, guide.log_density_error).effective_sample_size - expected
 
 
-def _even(pooled: PooledRounds) -> bool:
-    """Whether the pooled result does not depend on a few weights.
-
-    The early rounds of a poor guide have heavy-tailed weights but a small share in the result, for which the error of
-    the log-evidence accounts. So it is enough that the shape permits a useful mean.
-    """
-    n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
-    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
-    return even and bool(np.isfinite(pooled.log_evidence_error))
-
-
 def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, guide: AdaptedGuide) -> int:
     """Number of draws in the next batch; only the number of draws in the running `batches` matters."""
     first = max(FEWEST_DRAWS, int(np.ceil(FIRST_ROUND_SHARE * size)))
     if not rounds and not batches:
         return first
-    if rounds and _all_impossible(rounds):  # perhaps all simulations fail: find out with few more
+    if rounds and all_impossible(rounds):  # perhaps all simulations fail: find out with few more
         return FEWEST_DRAWS
-    if rounds and reliable(rounds[-1]):
+    if rounds and is_reliable(rounds[-1]):
         missing = _missing(rounds, batches, size, guide)
         return int(np.clip(np.ceil(missing / rounds[-1].effective_share), first, max(size, first)))
     return max(FEWEST_DRAWS, int(np.ceil(ROUND_SHARE * size)))
-
-
-def _all_impossible(rounds: Sequence[Round]) -> bool:
-    """Whether no draw has a finite log-probability."""
-    return all(np.max(r.log_weights) == -np.inf for r in rounds)
-
-
-def _impossible(rounds: Sequence[Round]) -> str:
-    """Reason to give up after two rounds without a possible draw; empty if there is none."""
-    if len(rounds) < 2 or not _all_impossible(rounds):
-        return ""
-    return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
-
-
-def _hopeless(rounds: Sequence[Round]) -> str:
-    """Reason to give up; empty if there is none."""
-    recent = rounds[-HOPELESS_ROUNDS:]
-    share = np.mean([r.effective_share for r in recent])
-    hopeless = share < HOPELESS_SHARE or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
-    if len(recent) < HOPELESS_ROUNDS or not hopeless:
-        return ""
-    return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
-
-
-def _describe(last: Round, pooled: PooledRounds, made: int) -> str:
-    """Text on what the rounds have reached, and what is missing."""
-    return (
-        f"after {made} rounds, the effective sample size of fresh draws is "
-        f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and the "
-        f"effective sample size of all draws is {pooled.effective_sample_size:.0f} with a shape of "
-        f"{pooled.pareto_shape:.2g} (a share of at least {100 * RELIABLE_SHARE:g} %, as many effective draws as "
-        f"walkers, and shapes below {LARGEST_RELIABLE_SHAPE:g} are needed)"
-    )
 
 
 def start_from_guide(

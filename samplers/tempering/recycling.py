@@ -34,6 +34,7 @@ import numpy as np
 
 from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
 from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight
+from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
@@ -68,16 +69,8 @@ MOST_BASINS, BASIN_SHARE = 3, 0.1
 # Before the check, unexplained parts of the target are explored this many times at most, with this number of draws for
 # each part: a mode may have been met late.
 MOST_BASIN_ROUNDS, DRAWS_PER_BASIN = 4, 30
-# Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
-# evaluations), or after 200 rounds without a check at beta = 1.
-SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
 # Draws that contradict a fit also improve it, so a failed check is repeated.
 MOST_CHECKS = 4
-# Smallest efficiency of the check for which the result is used, and the efficiency above which the Pareto shape need
-# not be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape is uncertain for the short tail of even weights.
-RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
-# Largest difference between the log-evidences of the check and of the earlier points for which the result is used.
-LARGEST_DIFFERENCE = 0.25
 # Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
 EXPECTED_GROWTH = 3.0
 # Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
@@ -269,7 +262,7 @@ def recycle(
         if checking:  # every point has arrived
             points.update()
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
-        reason = _reason(check, log_evidence, beta, efficiencies)
+        reason = doubt_recycling(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
         ends = not reason or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
@@ -448,20 +441,3 @@ def _with_even_share(mixture: Mixture, share: float) -> Mixture:
     """The mixture with a share of its weight spread evenly over its components."""
     weights = (1.0 - share) * mixture.weights + share / len(mixture.weights)
     return mixture._replace(weights=weights)
-
-
-def _reason(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
-    """Reason to give up, or not to use the result; empty if there is none."""
-    recent = float(np.mean(efficiencies[-PATIENCE:]))
-    if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
-        return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
-    if check is None:
-        too_long = len(efficiencies) >= MOST_ROUNDS
-        return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
-    if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
-        return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
-    if efficiencies[-1] < RELIABLE_EFFICIENCY:
-        return f"the effective sample size of the check is {100 * efficiencies[-1]:.2g} % of their number"
-    if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
-        return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
-    return ""

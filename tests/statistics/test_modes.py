@@ -8,6 +8,7 @@ from emcee.moves import StretchMove
 from scipy.stats import multivariate_normal
 
 from samplers import SMCSampler, TMCMCSampler
+from samplers.judgement import rounds as judged
 from samplers.moves.population_moves import MixtureMove
 from samplers.tempering import recycling
 from tests.statistics import analytic_posteriors as analytic
@@ -82,7 +83,7 @@ def test_without_components_for_basins_it_is_lost(monkeypatch):
 @pytest.mark.parametrize(("target", "lost"), [(TwoModes, True), (OneMode, False)])
 def test_a_mode_that_moves_lose_after_recycling_found_it_is_reported(target, lost, monkeypatch):
     """Recycling finds both modes, is not trusted, and the stretch moves after it find one."""
-    monkeypatch.setattr(recycling, "RELIABLE_EFFICIENCY", 1.0)
+    monkeypatch.setattr(judged, "RELIABLE_EFFICIENCY", 1.0)
     sampler, share = run(2, target, moves=StretchMove())
     assert share < 0.05
     reported = any("a mode has been lost" in reason for reason in sampler.verdict.reasons)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from samplers.estimates.importance import EvidenceCheck
+from samplers.judgement import rounds as judged
 from samplers.moves.population_moves import MixtureMove
 from samplers.reports import AnnealingResult, Restart, Stage, Sweep
 from samplers.settings import Settings
-from samplers.tempering import recycling
 from samplers.tempering.anneal import anneal
 from samplers.tempering.mutation import MoveSchedule
 from samplers.tempering.pending_points import PendingPoints
@@ -136,7 +136,7 @@ def test_nothing_runs_ahead_of_its_consumer():
 
 def test_a_restart_makes_earlier_stages_void(monkeypatch):
     """Here no check can ever agree, so recycling gives up at beta = 1, and moves start from the prior again."""
-    monkeypatch.setattr(recycling, "LARGEST_DIFFERENCE", 0.0)
+    monkeypatch.setattr(judged, "LARGEST_DIFFERENCE", 0.0)
     reports = [report for _, report in steps_of(Settings(recycle=True))[0] if not isinstance(report, Sweep)]
     (place,) = [i for i, report in enumerate(reports) if isinstance(report, Restart)]
     assert "fresh draws change the log-evidence" in reports[place].reason

@@ -7,7 +7,7 @@ from scipy import stats
 from samplers import SMCSampler
 from samplers.estimates.control_variates import signed_sample, unreached_share
 from samplers.estimates.importance import KnownDensity, Round, pool_rounds
-from samplers.tempering import guided
+from samplers.judgement import rounds as judged
 from tests.contract.targets import Box, Gaussian
 from tests.tempering.guides import FixedGuide
 
@@ -179,7 +179,7 @@ class GrowingGuide(FixedGuide):
 @pytest.mark.parametrize("left_out", [True, False])
 def test_rounds_that_missed_a_part_of_the_posterior_are_left_out(left_out, monkeypatch):
     if not left_out:  # control: such a round makes the evidence too small, in silence
-        monkeypatch.setattr(guided, "LARGEST_UNREACHED", 1.0)
+        monkeypatch.setattr(judged, "LARGEST_UNREACHED", 1.0)
     exact = two_modes([0.5, 0.5])
     box = Box([-4.0, -4.0], [4.0, 4.0], lambda x: exact.log_density(np.atleast_2d(x)).reshape(np.shape(x)[:-1]))
     sampler = SMCSampler(100, 2, box, vectorize=True, seed=4, guide=GrowingGuide(box))

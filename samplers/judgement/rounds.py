@@ -1,0 +1,125 @@
+"""Whether weighted draws are trusted: the check of recycling, and the rounds of a guide.
+
+Their limits are stated here, and the reasons that a user reads when one is exceeded.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..estimates.control_variates import unreached_share
+from ..estimates.importance import LARGEST_SHAPE, EvidenceCheck, KnownDensity, PooledRounds, Round
+
+__all__ = [
+    "LIGHT_TAILS",
+    "UNREACHED",
+    "UNSETTLED",
+    "all_impossible",
+    "describe_rounds",
+    "doubt_recycling",
+    "hopeless",
+    "is_even",
+    "is_reliable",
+    "reaches",
+]
+
+# Recycling is given up when the mean efficiency of the last 6 rounds is smaller than 0.03 (moves then need fewer
+# evaluations), or after 200 rounds without a check at beta = 1.
+SMALLEST_EFFICIENCY, PATIENCE, MOST_ROUNDS = 0.03, 6, 200
+# Smallest efficiency of the check for which the result is used, and the efficiency above which the Pareto shape need
+# not be below 0.7 (Vehtari et al. 2024, JMLR 25(72)): the shape is uncertain for the short tail of even weights.
+RELIABLE_EFFICIENCY, HIGH_EFFICIENCY = 0.25, 0.5
+# Largest difference between the log-evidences of the check and of the earlier points for which the result is used.
+LARGEST_DIFFERENCE = 0.25
+# A reliable round has at least this effective share, and a Pareto shape below this value, for which the variance of its
+# weights is finite. With fewer than 100 draws, the shape is uncertain, and a larger share is enough.
+RELIABLE_SHARE, LARGEST_RELIABLE_SHAPE = 0.5, 0.5
+SHORT_TAIL_SHARE, FEW_DRAWS = 0.75, 100
+# Rounds are left out if more than this share of the guide's latest known density was hardly reached by theirs.
+LARGEST_UNREACHED = 0.03
+# The guide is given up when the mean effective share of the last 4 rounds is below 0.03, or their mean effective sample
+# size below 1.5: a round of few draws has an effective share of at least one over their number.
+HOPELESS_ROUNDS, HOPELESS_SHARE, FEWEST_OF_ROUND = 4, 0.03, 1.5
+UNREACHED = (
+    "the guide learned at the end that the posterior is larger, and its draws hardly reached a part of it: evidence "
+    "and standard deviations may be too small. Use a larger limit of simulations"
+)
+UNSETTLED = (
+    "the density that the guide emulates has changed from round to round, in a part of it by more than a factor of "
+    "1000: the response is rough, or the posterior is larger than its draws. Compare with a run of another seed"
+)
+LIGHT_TAILS = (
+    "the weights of the draws grow towards the tails: the tails of the guide are lighter than the posterior's, so "
+    "standard deviations may be too small. Give the draws of the guide heavier tails, or use no guide"
+)
+
+
+def doubt_recycling(check: EvidenceCheck | None, log_evidence: float, beta: float, efficiencies: list[float]) -> str:
+    """Reason to give up, or not to use the result; empty if there is none."""
+    recent = float(np.mean(efficiencies[-PATIENCE:]))
+    if len(efficiencies) >= PATIENCE and recent < SMALLEST_EFFICIENCY:
+        return f"the effective sample size of fresh draws is {100 * recent:.2g} % of their number"
+    if check is None:
+        too_long = len(efficiencies) >= MOST_ROUNDS
+        return f"only beta = {beta:.3g} was reached in {MOST_ROUNDS} rounds" if too_long else ""
+    if not check.reliable and efficiencies[-1] < HIGH_EFFICIENCY:
+        return f"the weights of fresh draws have a Pareto shape of {check.pareto_shape:.2g}"
+    if efficiencies[-1] < RELIABLE_EFFICIENCY:
+        return f"the effective sample size of the check is {100 * efficiencies[-1]:.2g} % of their number"
+    if abs(check.log_evidence - log_evidence) > LARGEST_DIFFERENCE:
+        return f"fresh draws change the log-evidence by {check.log_evidence - log_evidence:.2g}"
+    return ""
+
+
+def is_reliable(latest: Round) -> bool:
+    """Whether a fresh round shows that the guide describes the posterior."""
+    share = latest.effective_share
+    if share < RELIABLE_SHARE:
+        return False
+    few = len(latest.log_weights) < FEW_DRAWS
+    return latest.pareto_shape < LARGEST_RELIABLE_SHAPE or (few and share >= SHORT_TAIL_SHARE)
+
+
+def is_even(pooled: PooledRounds) -> bool:
+    """Whether the pooled result does not depend on a few weights.
+
+    The early rounds of a poor guide have heavy-tailed weights but a small share in the result, for which the error of
+    the log-evidence accounts. So it is enough that the shape permits a useful mean.
+    """
+    n, share = len(pooled.log_weights), pooled.effective_sample_size / len(pooled.log_weights)
+    even = pooled.pareto_shape < LARGEST_SHAPE or (n < FEW_DRAWS and share >= SHORT_TAIL_SHARE)
+    return even and bool(np.isfinite(pooled.log_evidence_error))
+
+
+def reaches(earlier: Round, latest: KnownDensity | None) -> bool:
+    """Whether the draws of a round reach all of the guide's latest known density."""
+    known = earlier.known
+    return known is None or latest is None or unreached_share(known, latest) <= LARGEST_UNREACHED
+
+
+def all_impossible(rounds: Sequence[Round]) -> bool:
+    """Whether no draw has a finite log-probability."""
+    return all(np.max(r.log_weights) == -np.inf for r in rounds)
+
+
+def hopeless(rounds: Sequence[Round]) -> str:
+    """Why the guide is given up: no possible draw in two rounds, or few effective draws; empty if it is not."""
+    if len(rounds) >= 2 and all_impossible(rounds):
+        return f"none of their first {sum(len(r.coords) for r in rounds)} has a finite log-probability"
+    recent = rounds[-HOPELESS_ROUNDS:]
+    share = np.mean([r.effective_share for r in recent])
+    few = share < HOPELESS_SHARE or np.mean([r.effective_sample_size for r in recent]) < FEWEST_OF_ROUND
+    if len(recent) < HOPELESS_ROUNDS or not few:
+        return ""
+    return f"the effective sample size of the last {len(recent)} rounds is {100 * share:.2g} % of their draws"
+
+
+def describe_rounds(last: Round, pooled: PooledRounds, made: int) -> str:
+    """Text on what the rounds have reached, and what is missing."""
+    return (
+        f"after {made} rounds, the effective sample size of fresh draws is "
+        f"{100 * last.effective_share:.2g} % of their number with a Pareto shape of {last.pareto_shape:.2g}, and the "
+        f"effective sample size of all draws is {pooled.effective_sample_size:.0f} with a shape of "
+        f"{pooled.pareto_shape:.2g} (a share of at least {100 * RELIABLE_SHARE:g} %, as many effective draws as "
+        f"walkers, and shapes below {LARGEST_RELIABLE_SHAPE:g} are needed)"
+    )
