@@ -36,14 +36,9 @@ def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 
 
 
 class FailureLimit(NamedTuple):
-    """When failures stop a run.
+    """The share of the evaluations that may fail before a run stops.
 
-    Attributes
-    ----------
-    share : float
-        Largest share of the evaluations that may fail.
-    nwalkers, ndim : int
-        The share applies after `nwalkers` evaluations; a batch of ndim + 2 points or more may not fail as a whole.
+    It applies after `nwalkers` evaluations; a batch of ndim + 2 points or more may not fail as a whole.
     """
 
     share: float
@@ -72,17 +67,7 @@ class FailureLimit(NamedTuple):
 
 
 class CallingConvention(NamedTuple):
-    """How functions of points are called, as in emcee.
-
-    Attributes
-    ----------
-    vectorize : bool
-        Whether functions take a batch of points instead of one.
-    parameter_names : dict, optional
-        Names and indices of the parameters; functions then take dictionaries.
-    blobs_dtype : dtype, optional
-        dtype of the blobs.
-    """
+    """How functions are called, as in emcee: one point or a batch, arrays or dictionaries; type of blobs."""
 
     vectorize: bool
     parameter_names: Mapping[str, Any] | None = None
@@ -281,21 +266,9 @@ class Evaluator:
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
 
-        Parameters
-        ----------
-        coords : (n, ndim) float
-            The points.
-        observe : callable, optional
-            Called with points directly before they are evaluated. Points of the record are passed in the same parts as
-            when they were evaluated.
-
-        Raises
-        ------
-        ValueError
-            If a coordinate is not finite.
-        BudgetExhausted
-            If the points do not fit into the limit of simulations. With `evaluates_parts`, the first points that fit
-            are evaluated.
+        `observe` is called with points directly before they are evaluated; points of the record are passed in the same
+        parts. Raises ValueError if a coordinate is not finite, and BudgetExhausted if the points do not fit into the
+        limit of simulations. With `evaluates_parts`, the first points that fit are evaluated.
         """
         if not np.all(np.isfinite(coords)):
             raise ValueError("At least one parameter value was infinite or NaN")
@@ -383,10 +356,7 @@ class Evaluator:
     def typed(self, blobs: np.ndarray | None) -> np.ndarray | None:
         """Blobs (n, ...) in the type of all blobs of the run, which the first evaluations have, or which is declared.
 
-        Raises
-        ------
-        ValueError
-            If this type cannot hold one of them.
+        Raises ValueError if this type cannot hold one of them.
         """
         if blobs is None:
             return None

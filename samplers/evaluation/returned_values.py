@@ -45,30 +45,10 @@ def _number(value: Any, name: str) -> float:
 def log_probabilities(
     results: Any, n: int, name: str = "log_prob_fn", blobs_dtype: Any = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Log-densities and blobs of `n` points.
+    """Log-densities (n,), with NaN, and blobs (n, ...) or None, from what a function called `name` has returned.
 
-    Parameters
-    ----------
-    results : array or sequence
-        Values of the function: (n,) numbers, or n sequences (number, blob, ...).
-    n : int
-        Number of points for which the function was called.
-    name : str
-        Name of the function in messages.
-    blobs_dtype : dtype, optional
-        dtype of the blobs, as in emcee; by default a dtype that holds all of them.
-
-    Returns
-    -------
-    log_prob : (n,) float
-        Log-densities; NaN is kept.
-    blobs : (n, ...) array, or None
-        None without blobs.
-
-    Raises
-    ------
-    ValueError
-        If the number of results is not `n`, a result is not a number or is +inf, or `blobs_dtype` cannot hold a blob.
+    `results` are n numbers, or n sequences (number, blob, ...). Raises ValueError if there are not `n` results, one is
+    not a number or is +inf, or `blobs_dtype` cannot hold a blob.
     """
     if hasattr(results, "__array__"):
         results = np.asarray(results)
@@ -113,18 +93,7 @@ def log_densities(results: Any, n: int, name: str) -> np.ndarray:
 
 
 class Failed:
-    """Takes the place of a result if a function raised an exception or reports a fault.
-
-    Parameters
-    ----------
-    error : Exception or str
-        The raised exception, or the reason.
-
-    Attributes
-    ----------
-    reason : str
-        Type and message of the exception, or the reason.
-    """
+    """Takes the place of a result if a function raised an exception or reports a fault; `reason` is text."""
 
     def __init__(self, error: Exception | str):
         self.reason = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
@@ -146,13 +115,6 @@ class ErrorCapturing:
     An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
     posterior whose model has changed. KeyboardInterrupt and SystemExit are raised, even as the cause of another
     exception; SystemExit in a worker process gives `Failed`.
-
-    Parameters
-    ----------
-    function, args, kwargs
-        Called as ``function(points, *args, **kwargs)``.
-    vectorize : bool
-        Whether the function takes a batch of points instead of one.
     """
 
     def __init__(

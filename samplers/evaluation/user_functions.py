@@ -109,19 +109,7 @@ class OptionalAttributes(NamedTuple):
 
 
 class UserFunctions(NamedTuple):
-    """The functions that a user gave to a sampler.
-
-    Attributes
-    ----------
-    name : str
-        "log_prob_fn" or "log_likelihood_fn", whichever was given.
-    function : callable
-        That function.
-    log_prior : callable
-        Log-density of the prior.
-    optional : OptionalAttributes
-        Optional attributes of `function`.
-    """
+    """The log-posterior or log-likelihood of a user (`name` says which), the log-prior, and optional attributes."""
 
     name: str
     function: Callable
@@ -137,11 +125,8 @@ class UserFunctions(NamedTuple):
     ) -> "UserFunctions":
         """Check and combine the arguments of a sampler.
 
-        Raises
-        ------
-        ValueError
-            Unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given, and a log-prior is known; or if
-            `log_prob_fn` is a method called log_likelihood.
+        Raises ValueError unless exactly one of `log_prob_fn` and `log_likelihood_fn` is given and a log-prior is known,
+        or if `log_prob_fn` is a method called log_likelihood.
         """
         if (log_prob_fn is None) == (log_likelihood_fn is None):
             given = "neither" if log_prob_fn is None else "both"
@@ -188,14 +173,9 @@ class UserFunctions(NamedTuple):
         return np.array(self.optional.sample_prior(n, random), dtype=float)
 
     def check_start(self, coords: np.ndarray, log_prior: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Raise ValueError for points that cannot be draws of the prior (`samplers.evaluation.starts`).
+        """Raise ValueError for points (n, ndim) that cannot be draws of the prior (`samplers.evaluation.starts`).
 
-        Parameters
-        ----------
-        coords : (n, ndim) float
-            The points.
-        log_prior : callable
-            Function of points (n, ndim) that returns the log-prior (n,).
+        `log_prior` is a function of points (n, ndim) that returns (n,).
         """
         fresh, names = self._fresh_draws(*coords.shape), list(self.optional.parameter_names or ())
         if fresh is None:

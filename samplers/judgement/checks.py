@@ -69,16 +69,11 @@ def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
 
 
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concern]:
-    """A concern if the log-likelihood has one value at all points that a run begins with, so that it tells nothing.
+    """A concern if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
 
     The posterior is then the prior, or it is where none of these points is, and the value is a penalty or comes from a
     model that ignores its parameters. Beside -inf, one value may be the likelihood of uniform errors, which is right,
     or a penalty: the concern is not grave; for a value of 0, an indicator, there is none.
-
-    Parameters
-    ----------
-    log_prob, log_prior : (n,) float
-        Log-probabilities and log-priors of the first evaluated points, which are draws of the prior or of a guide.
     """
     known = np.isfinite(log_prob)
     if np.count_nonzero(known) < 2:
@@ -165,17 +160,9 @@ def check_annealing(stages: Sequence[Stage], nwalkers: int, ndim: int, correlati
 def check_mode_shares(coords: np.ndarray, founders: np.ndarray, correlation: float) -> list[Concern]:
     """A concern if the moves hardly connect modes that exist or may exist, so that the shares of modes are uncertain.
 
-    All resamplings since the modes separated have changed the shares; the founders show only the latest resamplings.
-
-    Parameters
-    ----------
-    coords : (n, ndim) float
-        The final points.
-    founders : (n,) int
-        Their founders.
-    correlation : float
-        Largest correlation of the final points with their resampled start. Reported between 0.5 and 0.9, or between
-        0.25 and 0.9 with several modes.
+    All resamplings since the modes separated have changed the shares; the `founders` (n,) of the final points `coords`
+    (n, ndim) show only the latest. Reported if the `correlation` with the resampled start is between 0.5 and 0.9, or
+    between 0.25 and 0.9 with several modes.
     """
     if not SEPARATE_MODES < correlation <= HIGH_CORRELATION:
         return []
@@ -232,19 +219,9 @@ def check_fallback(
 ) -> list[Concern]:
     """A concern if annealing by moves lost a part of the posterior that recycling before it had found.
 
-    Recycling may have found more modes although its result was not reliable. Both evidence estimates of recycling must
-    exceed the evidence of the moves: the estimate of their check if it is reliable, else of their stages.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-        All stages of the annealing by moves.
-    check : EvidenceCheck, optional
-        The check after it.
-    log_evidence, error : float
-        Log-evidence of the recycling and its standard error.
-    earlier : EvidenceCheck
-        The check of the recycling.
+    Recycling may have found more modes although its result (`log_evidence`, `error`, and the check `earlier`) was not
+    reliable. Both its estimates of the evidence must exceed the evidence of the moves: the estimate of their `check` if
+    it is reliable, else of their `stages`.
     """
     now, own = sum(stage.log_evidence_increment for stage in stages), stages[-1].log_evidence_error
     if check is not None and check.reliable:
@@ -263,24 +240,12 @@ def check_fallback(
 def check_fit(
     check: EvidenceCheck, mixture: Mixture, points: int, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Concern]:
-    """A concern if the proposal of recycling at beta = 1 describes the posterior poorly.
+    """A concern if the proposal of recycling, fitted to `points` effective points, describes the posterior poorly.
 
     If a bent posterior ends in a narrow tail, neither the points nor the draws of a fitted proposal reach the end of
-    the tail, and their weights are even. The effective sample size is then still smaller than expected for Gaussian
-    modes (`samplers.estimates.importance.expected_efficiency`), and neighbouring draws have similar weights. Large
-    jumps of a likelihood, in contrast, make the weights of neighbours differ. Between these cases the cause is
-    uncertain, and the concern is not grave.
-
-    Parameters
-    ----------
-    check : EvidenceCheck
-        The check with fresh draws of the proposal.
-    mixture : Mixture
-        The proposal.
-    points : int
-        Effective number of points that it was fitted to.
-    coords, log_weights : (n, ndim) float, (n,) float
-        Draws at beta = 1 and their log-weights; the draws of the check come last.
+    the tail, and their weights are even. The effective sample size of the `check` is then still smaller than expected
+    for Gaussian modes, and neighbouring draws `coords` (n, ndim) have similar `log_weights` (n,). Large jumps of a
+    likelihood, in contrast, make the weights of neighbours differ. Between these cases the concern is not grave.
     """
     if not fits_poorly(check, mixture, points):
         return []
@@ -321,21 +286,11 @@ def _neighbour_correlation(coords: np.ndarray, log_weights: np.ndarray) -> float
 def check_shares(
     mixture: Mixture, points: np.ndarray, founders: np.ndarray, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Concern]:
-    """A concern if a part of the posterior has different shares among the final points and among weighted draws.
+    """A concern if a part of the posterior has different shares among final points (n, ndim) and weighted draws.
 
-    The parts are the components of the mixture that the draws come from. Each draw and each point counts for the
-    components by its responsibilities. A difference is reported if it exceeds 0.1 and three standard errors.
-
-    Parameters
-    ----------
-    mixture : Mixture
-        Proposal of the draws, which also covers points of earlier stages.
-    points : (n, ndim) float
-        The final points, equally weighted.
-    founders : (n,) int
-        Their founders (`samplers.estimates.genealogy`).
-    coords, log_weights : (m, ndim) float, (m,) float
-        Draws of the mixture and their log-weights.
+    The draws `coords` (m, ndim) with `log_weights` (m,) come from a `mixture` that also covers points of earlier
+    stages; its components are the parts, and points count for them by responsibilities. A difference is reported if it
+    exceeds 0.1 and three standard errors; `founders` (n,) belong to the points.
     """
     if len(mixture.weights) == 1 or not np.any(log_weights > -np.inf):
         return []

@@ -86,19 +86,10 @@ class NearFailures(NamedTuple):
 
 
 def failures_near(samples: np.ndarray, failed: np.ndarray, succeeded: np.ndarray) -> NearFailures:
-    """Failures in the region of posterior samples, and all distinct points there.
+    """Failures in the region of posterior samples (n, k), and all distinct points there.
 
-    Parameters
-    ----------
-    samples : (n, k) float
-        Samples of the posterior.
-    failed, succeeded : (m, k) float, (l, k) float
-        Points that failed, and points that did not.
-
-    Returns
-    -------
-    NearFailures
-        Without points if fewer than k + 1 samples are different, since such samples have no region.
+    `failed` (m, k) and `succeeded` (l, k) are evaluated points. Fewer than k + 1 different samples have no region, and
+    give no points.
     """
     distinct = np.unique(samples, axis=0)
     if len(distinct) <= samples.shape[1]:
@@ -143,23 +134,12 @@ def judged_failures(
     counts_failures: bool,
     possible: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> NearFailures:
-    """Failures in the region of a run's final points, on which the verdict depends.
+    """Failures in the region of a run's final points (n, ndim), on which the verdict depends.
 
-    Parameters
-    ----------
-    coords, log_prob, failed : (m, ndim) float, (m,) float, (m,) bool
-        All evaluated points in the order of their evaluation, their log-probabilities, and whether the evaluation
-        raised an error or gave NaN; the latest 20 000 points are used.
-    final_coords : (n, ndim) float
-        Samples of the posterior.
-    columns : (k,) int
-        The parameters that a simulation depends on.
-    counts_failures : bool
-        Whether the log-density counts failures by itself. All values of -inf are then failures; otherwise they may have
-        another cause.
-    possible : callable, optional
-        Function of points (n, ndim) that returns whether each point may have a positive density (n,), as far as is
-        known without a simulation. Impossible points lie outside the support and do not count.
+    All evaluated points are given in order, with their `log_prob` (m,) and whether they `failed` (m,); the latest 20
+    000 are used, in the `columns` that a simulation depends on. If the log-density `counts_failures` by itself, all
+    values of -inf are failures. Points that are not `possible`, by a function (n, ndim) -> (n,), lie outside the
+    support and do not count.
     """
     latest = slice(-KEPT_POINTS, None)
     coords, log_prob, failed = coords[latest], log_prob[latest], failed[latest]

@@ -137,11 +137,8 @@ class _FittedMove(MHMove):
     """A Metropolis-Hastings move of the whole ensemble, whose proposal is fitted to weighted points.
 
     Without a calibration (in a plain EnsembleSampler, or in a run that continues a chain without its record), two
-    copies are fitted to one half of the walkers each, and move the other half. A proposal that is fitted to the points
-    that it moves would make their tails too light for many sweeps; these proposals are independent of the points. The
-    halves and both fits do not change until the number of walkers changes: copies of one point are in the same half,
-    and each half has half the distinct points. Each half needs at least ndim + 1 distinct points that span all
-    dimensions (ValueError); with fewer than 5 (ndim + 1) there is a warning, since the proposals may be too narrow.
+    copies are fitted to one half of the walkers each, and move the other half: a proposal that is fitted to the points
+    that it moves would make their tails too light for many sweeps.
     """
 
     def __init__(self):

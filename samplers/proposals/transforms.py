@@ -69,15 +69,9 @@ NEAR = 4.0
 
 
 class SupportBounds(NamedTuple):
-    """Bounds of the parameters.
+    """Lower and upper bounds (ndim,) of the parameters, infinite where there is none, and length scales (ndim,).
 
-    Attributes
-    ----------
-    low, high : ndarray, shape (ndim,)
-        Lower and upper bounds; -inf and inf where there is none.
-    span : ndarray, shape (ndim,)
-        Length scale of each parameter. For a single bound, the distance at which the map changes from logarithmic to
-        linear.
+    For a single bound, the scale is the distance at which the map changes from logarithmic to linear.
     """
 
     low: np.ndarray
@@ -86,19 +80,10 @@ class SupportBounds(NamedTuple):
 
 
 def find_support_bounds(inside: Callable[[np.ndarray], np.ndarray], coords: np.ndarray) -> SupportBounds:
-    """Find the bounds of the support from points in it.
+    """Find the bounds of the support from points (n, ndim) in it, such as draws of the prior.
 
-    Parameters
-    ----------
-    inside : callable
-        Function of points (m, ndim) that returns which points (m,) lie in the support. It is called about 85 times.
-    coords : ndarray, shape (n, ndim)
-        Points in the support, for example draws from the prior.
-
-    Returns
-    -------
-    SupportBounds
-        Each finite bound lies at most one bisection step outside the support, never inside it.
+    `inside` is a function (m, ndim) -> (m,), called about 85 times. Each finite bound lies at most one bisection step
+    outside the support, never inside it.
     """
     ndim = coords.shape[1]
     span = np.ptp(coords, axis=0)
@@ -204,20 +189,7 @@ def from_unbounded(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
 
 
 def log_abs_det_jacobian(bounds: SupportBounds, coords: np.ndarray) -> np.ndarray:
-    """Logarithm of the absolute Jacobian determinant of `to_unbounded`.
-
-    Parameters
-    ----------
-    bounds : SupportBounds
-        Bounds of the parameters.
-    coords : ndarray, shape (n, ndim)
-        Points in the original parameters.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        ``log |dz / dx|``; -inf on and beyond a bound.
-    """
+    """Log-determinant (n,) of the Jacobian of `to_unbounded` at points (n, ndim); -inf on and beyond a bound."""
     total = np.zeros(len(coords))
     for j, below, above in _bounded_parameters(bounds):
         from_low = np.maximum(coords[:, j] - bounds.low[j], 0.0) if below else 1.0
@@ -287,23 +259,11 @@ def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
 
 
 def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
-    """Find shears that remove the curvature of a population, greedily: the most curved pair of parameters first.
+    """Find at most 2 ndim shears that remove the curvature of weighted points (n, ndim), the most curved pair first.
 
     A pair is curved if the squared source explains at least a tenth of the target variance that the linear term leaves,
     and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty includes the
     number of pairs that were searched.
-
-    Parameters
-    ----------
-    coords : ndarray, shape (n, ndim)
-        Points.
-    weights : ndarray, shape (n,)
-        Non-negative weights with sum 1.
-
-    Returns
-    -------
-    tuple of Shear
-        At most ``2 ndim`` shears, in the order of application; empty if nothing is curved.
     """
     effective = 1.0 / (weights @ weights)
     ndim = coords.shape[1]

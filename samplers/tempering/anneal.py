@@ -70,29 +70,11 @@ def anneal(
     settings: Settings,
     guidance: Guidance | None = None,
 ) -> Steps:
-    """Carry draws of the prior to beta = 1.
+    """Carry draws of the prior to beta = 1 by moves, recycling or a guide.
 
-    Parameters
-    ----------
-    population : Population
-        Draws of the prior. They are evaluated if they have no records.
-    density : Density
-        The posterior.
-    random : RandomState
-        Source of random numbers.
-    schedule : MoveSchedule
-        The moves.
-    settings : Settings
-        Settings of the annealing.
-    guidance : Guidance, optional
-        A guide to start from.
-
-    Yields
-    ------
-    population : Population
-        The points as they are now. In the last pair, they are at beta = 1 and equally weighted.
-    report : Report
-        See `samplers.reports`. There is at most one `EvidenceCheck`, before or after the last stage.
+    Draws without records are evaluated. Yields the points as they are now with a report (`samplers.reports`); in the
+    last pair, they are at beta = 1 and equally weighted. There is at most one `EvidenceCheck`, before or after the last
+    stage.
     """
     size, rounds = len(population.coords), None
     try:
@@ -158,27 +140,9 @@ def check_population(
 ) -> tuple[EvidenceCheck, list[Concern]]:
     """Estimate the evidence and the shares of the posterior's parts by fresh draws of a fitted mixture.
 
-    Parameters
-    ----------
-    population : Population
-        The final points, at beta = 1 and equally weighted.
-    density : Density
-        Evaluates the draws.
-    visited : VisitedPoints
-        The points of all stages.
-    log_evidence : float
-        Log-evidence of the stages.
-    random : RandomState
-        Source of random numbers.
-    draws : int, optional
-        Number of draws; by default as many as there are final points.
-
-    Returns
-    -------
-    check : EvidenceCheck
-        The evidence.
-    concerns : list of Concern
-        See `samplers.judgement.checks.check_shares`.
+    `population` are the final points, `visited` the points of all stages, and `log_evidence` belongs to the stages.
+    There are as many draws as final points by default. Returns the check, and concerns about shares
+    (`samplers.judgement.checks.check_shares`).
     """
     coords, n = population.coords, len(population.coords)
     mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))

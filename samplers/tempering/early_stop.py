@@ -14,22 +14,11 @@ class NothingToReport(ValueError):
 
 
 class StoppedEarly(Exception):
-    """The limit of simulations has ended an annealing.
+    """The limit of simulations has ended an annealing at `beta`; the known points have log-weights at beta = 1.
 
-    Parameters
-    ----------
-    population : Population
-        The known points, with log-weights at beta = 1 unless `complete`.
-    log_evidence, error : float
-        Log-evidence of these weights, and its standard error.
-    beta : float
-        Tempering exponent that the points were made for.
-    log_evidence_of_stages : float
-        Part of the log-evidence from stages already reported.
-    complete : bool
-        Whether beta = 1 was reached and its stage reported; the population is then equally weighted.
-    from_guide : bool
-        Whether the points are the draws of a guide.
+    `log_evidence` and `error` belong to these weights; `log_evidence_of_stages` is the part that was already reported.
+    If `complete`, beta = 1 was reached and the population is equally weighted. `from_guide`: the points are draws of a
+    guide.
     """
 
     def __init__(
@@ -66,21 +55,9 @@ def _of_distinct_points(coords: np.ndarray, log_weights: np.ndarray) -> np.ndarr
 def stop_at(
     population: Population, log_evidence: float, error: float, log_evidence_of_stages: float = 0.0
 ) -> StoppedEarly:
-    """Weigh equally weighted points at `population.beta` by the posterior.
+    """The error to be raised: equally weighted points at `population.beta`, weighted by the posterior.
 
-    Parameters
-    ----------
-    population : Population
-        The points.
-    log_evidence, error : float
-        Log-evidence at the beta of the points, and its standard error.
-    log_evidence_of_stages : float
-        Part of the log-evidence from stages already reported.
-
-    Returns
-    -------
-    StoppedEarly
-        To be raised.
+    `log_evidence` and `error` belong to the beta of the points; `log_evidence_of_stages` was already reported.
     """
     records = population.records
     alive = records["log_prob"] > -np.inf

@@ -108,23 +108,10 @@ def lend(
 
 
 class RoundsOfGuide(NamedTuple):
-    """Result of `draw_rounds`.
+    """Result of `draw_rounds`: all draws `pooled`, the last round, and the rounds with a known density (`signed`).
 
-    Attributes
-    ----------
-    reason : str
-        Why the draws cannot be used; empty if they can.
-    shortfall : str
-        What was not reached although the draws can be used, or that their tails are too light, or that they hardly
-        reached a part of the posterior when the limit of simulations ended the rounds; else empty.
-    pooled : PooledRounds, or None
-        All draws; None if the limit of simulations did not allow any.
-    last : Round, or None
-        The last round.
-    stopped : bool
-        Whether the limit of simulations ended the rounds.
-    signed : SignedSample, or None
-        All rounds in which the guide had a known density (`samplers.estimates.control_variates`).
+    `reason` says why the draws cannot be used. `shortfall` says what was not reached although they can be used.
+    `stopped`: the limit of simulations ended the rounds.
     """
 
     reason: str
@@ -144,17 +131,7 @@ class RoundsOfGuide(NamedTuple):
 
 
 class Batch:
-    """Draws from one density of a guide.
-
-    Parameters
-    ----------
-    pending : PendingPoints
-        The draws.
-    log_density : (n,) float
-        Logarithm of the density that they were drawn from.
-    known : KnownDensity, optional
-        Density with known expectations that the guide had when the draws were made.
-    """
+    """Draws of a guide, with the log-density (n,) that they were drawn from, and its known density then."""
 
     def __init__(self, pending: PendingPoints, log_density: np.ndarray, known: KnownDensity | None = None):
         self.pending, self._log_density, self._known = pending, log_density, known
@@ -210,10 +187,7 @@ class Batch:
 def submit_batch(coords: np.ndarray, density: Density, guide: AdaptedGuide, session: GuideSession) -> Batch:
     """Begin to evaluate draws (n, ndim) of the guide; a limit of simulations may allow only the first draws.
 
-    Raises
-    ------
-    ValueError
-        If the density of the guide is zero at one of its own draws.
+    Raises ValueError if the density of the guide is zero at one of its own draws.
     """
     log_density = guide.log_density(coords)
     if np.any(log_density == -np.inf):
@@ -255,22 +229,8 @@ def draw_rounds(
 ) -> Generator[tuple[Population, Report], None, RoundsOfGuide]:
     """Let the guide search, then draw, evaluate and refine until a fresh round is reliable.
 
-    Parameters
-    ----------
-    population : Population
-        Draws of the prior, as many as there are walkers. They are not evaluated.
-    density, random, guidance
-        As in `samplers.tempering.anneal.anneal`.
-
-    Yields
-    ------
-    Population, GuideTick or GuidedRound
-        The draws of the prior with the effective sample size of all rounds so far, and a tick of the progress bar or a
-        round.
-
-    Returns
-    -------
-    RoundsOfGuide
+    `population` are draws of the prior, as many as there are walkers, which are not evaluated. Yields them with the
+    effective sample size of all rounds so far, and a tick of the progress bar or a round.
     """
     guide, session, budget = guidance
     size, population = len(population.coords), population._replace(effective_sample_size=0.0)
@@ -399,24 +359,7 @@ def _next_size(rounds: Sequence[Round], batches: Sequence[Batch], size: int, gui
 def start_from_guide(
     last: Round, prior: Population, density: Density, guide: AdaptedGuide
 ) -> tuple[Population, StartingDensity]:
-    """Points to start recycling from: the last round of the guide and as many draws of the prior.
-
-    Parameters
-    ----------
-    last : Round
-        Draws of the guide, which must not change any more.
-    prior : Population
-        Draws of the prior.
-    density : Density
-        The posterior.
-    guide : AdaptedGuide
-        The guide.
-
-    Returns
-    -------
-    Population, StartingDensity
-        The points, and the mixture that they were drawn from.
-    """
+    """Points to start recycling from, and their density: the guide's last round, and as many draws of the prior."""
     few = prior.coords[: max(len(last.coords), prior.coords.shape[1] + 2)]
     coords = np.concatenate([last.coords, few])
     records = np.concatenate([last.records, density.evaluate(few)])

@@ -56,25 +56,8 @@ def grow_chains(
     All chains first make ``settings.burn_in`` steps; then every step of a chain is a point of the new population. The
     first step moves all chains together, later steps only the chains that are long enough, so the moves must be able to
     move any number of points. The moves are tuned after each step. With a burn-in, sweeps over all points follow if the
-    points are still correlated with the resampled points (`samplers.tempering.mutation.move_together`).
-
-    Parameters
-    ----------
-    population : Population
-        Resampled points, with the beta at which they are moved.
-    ancestors : (n,) int
-        Index of each point before the resampling; equal for copies.
-    density, random, schedule, settings, visited
-        As in `samplers.tempering.mutation.move_together`; of the settings also `burn_in`.
-
-    Yields
-    ------
-    Population, Sweep
-        After each step of the chains; points that a chain has not reached yet are its starting point.
-
-    Returns
-    -------
-    Mutated
+    points are still correlated with the resampled points (`samplers.tempering.mutation.move_together`). `ancestors`
+    (n,) are equal for copies of one point.
     """
     beta, coords, records = population.beta, population.coords, population.records
     model = tempered_model(density, beta, random, visited)

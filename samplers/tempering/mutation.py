@@ -65,15 +65,7 @@ def check_moves(moves: Sequence[Move], chains: str) -> None:
 
 
 class MoveSchedule(NamedTuple):
-    """The moves of a sampler.
-
-    Attributes
-    ----------
-    moves : sequence of emcee Move
-        Mutation kernels.
-    probabilities : (n_moves,) float
-        Probability of each move to be chosen for a sweep.
-    """
+    """The mutation kernels of a sampler, and the probability (n_moves,) of each to be chosen for a sweep."""
 
     moves: Sequence[Move]
     probabilities: np.ndarray
@@ -96,12 +88,8 @@ class MoveSchedule(NamedTuple):
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Let mixture moves propose points in parts of the target that their fits do not cover.
 
-        Parameters
-        ----------
-        coords : (n, ndim) float
-            Points, also from earlier stages.
-        log_target : (n,) float
-            Log-target of the stage, scaled so that the target's integral is about 1.
+        `coords` (n, ndim) are points, also from earlier stages; `log_target` (n,) is scaled so that its integral is
+        about 1.
         """
         for move in self.moves:
             if isinstance(move, MixtureMove):
@@ -115,20 +103,10 @@ class MoveSchedule(NamedTuple):
 
 
 class Mutated(NamedTuple):
-    """A population after its moves at one beta.
+    """A population after its moves at one beta, with the acceptance over all sweeps and their number.
 
-    Attributes
-    ----------
-    population : Population
-        The moved points.
-    acceptance : float
-        Share of accepted proposals over all sweeps.
-    moves : int
-        Number of sweeps.
-    correlation : float
-        Largest correlation left with the resampled population (`StartCorrelation`); 1 if no sweep was made.
-    stopped : bool
-        Whether the limit of simulations ended the moves.
+    `correlation` is the largest one left with the resampled population (`StartCorrelation`), 1 without a sweep;
+    `stopped` says whether the limit of simulations ended the moves.
     """
 
     population: Population
@@ -195,22 +173,10 @@ def tempered_model(
 
 
 class StartCorrelation:
-    """Correlation of a population with the points it started from, sweep by sweep.
+    """Correlation over the walkers between points (n, ndim) after resampling and their values after each sweep.
 
-    The correlation over the walkers between start and present values; the largest absolute value over all parameters
-    and the log-likelihood, on which the next weights depend.
-
-    Parameters
-    ----------
-    coords : (n, ndim) float
-        Points directly after the resampling, with finite log-likelihoods.
-    records : (n,) structured array
-        With the fields log_prob and log_prior.
-
-    Attributes
-    ----------
-    values : list of float
-        The correlation after each sweep.
+    `values` has one entry per sweep: the largest absolute correlation over all parameters and the log-likelihood, on
+    which the next weights depend.
     """
 
     def __init__(self, coords: np.ndarray, records: np.ndarray):
@@ -250,33 +216,10 @@ def move_together(
     visited: VisitedPoints | None = None,
     correlation: StartCorrelation | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Move all points equally often, until they are nearly uncorrelated with their start.
+    """Move equally weighted points equally often, until they are nearly uncorrelated with their start.
 
-    Parameters
-    ----------
-    population : Population
-        Equally weighted points, with the beta at which they are moved.
-    density : Density
-        Evaluates points.
-    random : RandomState
-        Source of random numbers.
-    schedule : MoveSchedule
-        The moves.
-    settings : Settings
-        Length of the moves: `min_moves`, `max_moves` and `max_correlation`.
-    visited : VisitedPoints, optional
-        Points that are evaluated are added to it.
-    correlation : StartCorrelation, optional
-        Correlation with an earlier start, from which the points have already been moved; by default they are the start.
-
-    Yields
-    ------
-    Population, Sweep
-        After each sweep.
-
-    Returns
-    -------
-    Mutated
+    Yields the population after each sweep. Points that are evaluated are added to `visited`. A given `correlation`
+    belongs to an earlier start, from which the points have already been moved.
     """
     beta, records = population.beta, population.records
     model = tempered_model(density, beta, random, visited)

@@ -10,34 +10,14 @@ BISECTIONS = 20
 
 
 def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
-    """Largest next exponent whose incremental weights keep the effective sample size at `target`.
+    """Largest next exponent in (beta, 1] whose incremental weights keep the effective sample size at `target`.
 
-    Points of zero likelihood are lost at any larger exponent, so the target refers to the other points: it is
-    multiplied by the share of finite log-likelihoods. The step is halved until the target is met, and then bisected to
-    a relative tolerance of 1e-6. The bisection uses a fixed dyadic grid, so that rounding errors of the log-likelihood
-    do not change the exponent.
-
-    Parameters
-    ----------
-    log_likelihood : (n,) float
-        At the points of the population; -inf is allowed.
-    beta : float
-        Exponent of the population, 0 <= beta < 1.
-    target : float
-        Effective sample size wanted, 0 < target < n.
-    base : (n,) float, optional
-        Log-weights of the points at `beta`; equal by default. If given, the target is not scaled, and it must be met at
-        `beta`.
-
-    Returns
-    -------
-    float
-        In (beta, 1]; 1 if the full step keeps the target, as with a flat likelihood.
-
-    Raises
-    ------
-    ValueError
-        If no log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300 are.
+    Points of zero likelihood are lost at any larger exponent, so the target is multiplied by the share of finite
+    log-likelihoods (n,). The step is halved until the target is met, and then bisected to a relative tolerance of 1e-6.
+    The bisection uses a fixed dyadic grid, so that rounding errors of the log-likelihood do not change the exponent.
+    With the log-weights `base` (n,) at `beta`, the target is not scaled, and it must be met at `beta`. Raises
+    ValueError if no log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300
+    are.
     """
     top = np.max(log_likelihood)
     if top < LOWEST:

@@ -78,14 +78,9 @@ LARGEST_SHARE_KEPT = 0.9
 
 
 class StartingDensity(NamedTuple):
-    """Density that the starting points were drawn from.
+    """Density that the starting points were drawn from, with the number of draws `made`, also outside the support.
 
-    Attributes
-    ----------
-    made : float
-        Number of draws made from it, including those outside the support of the prior.
-    log_density : callable
-        Function of points (n, ndim) and their records (n,) that returns the logarithm of the density (n,).
+    `log_density` is a function of points (n, ndim) and their records (n,) that returns (n,).
     """
 
     made: float
@@ -93,27 +88,13 @@ class StartingDensity(NamedTuple):
 
 
 class Recycled(NamedTuple):
-    """Result of recycling.
+    """Result of recycling: the draws made at beta = 1 with those of the check, their records and log-weights (n,).
 
-    Attributes
-    ----------
-    reason : str
-        Why the result is not reliable; empty if it is.
-    coords, records : (n, ndim) float, (n,) structured array
-        The draws made at beta = 1, including the draws of the check, and their records (log_prob, log_prior and, where
-        there are any, blobs).
-    log_weights : (n,) float
-        Log-weights of the draws relative to the mixture of their round, which was not fitted to these draws. The rounds
-        are combined by `samplers.estimates.importance.round_shares`, which does not depend on the weights of the same
-        round: otherwise a round with a few large weights in a tail would get a small share, and cut the tail.
-    log_evidence, log_evidence_error : float
-        Log-evidence from all points except the draws of the check, and its standard error.
-    check : EvidenceCheck, optional
-        The check with fresh draws; None if beta = 1 was not reached.
-    points : WeightedPoints, optional
-        All evaluated points with all proposals; None without draws.
-    log_evidence_below_one : float
-        Log-evidence at the last beta below 1; 0 without such a stage.
+    `reason` says why the result is not reliable; it is empty if it is. Each draw is weighted relative to the mixture of
+    its round, which was not fitted to it. Rounds are combined by `samplers.estimates.importance.round_shares`, which
+    does not depend on the weights of the same round: otherwise a round with a few large weights in a tail would get a
+    small share, and cut the tail. `log_evidence` and its error use all points except the draws of the check, which is
+    None if beta = 1 was not reached. `log_evidence_below_one` belongs to the last beta below 1.
     """
 
     reason: str
@@ -146,34 +127,11 @@ def recycle(
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
 
-    Parameters
-    ----------
-    pending : PendingPoints
-        Starting points, most of which have arrived.
-    density : Density
-        Evaluates points.
-    random : RandomState
-        Source of random numbers.
-    start : StartingDensity, optional
-        Density that the points were drawn from; the prior by default. The path to the posterior is start^(1 - beta)
-        posterior^beta.
-    size : int, optional
-        Wanted effective sample size at beta = 1, and number of draws for the check; n by default.
-
-    Yields
-    ------
-    Population, Stage or Sweep
-        For each beta below 1, before its draws are made: all points with their weights, and the stage. Its acceptance
-        is the efficiency of the latest draws. Then the same points and a `Sweep`, as a tick of the progress bar.
-
-    Returns
-    -------
-    Recycled
-
-    Raises
-    ------
-    StoppedEarly
-        If the limit of simulations is exceeded.
+    The path to the posterior is start^(1 - beta) posterior^beta; the start is the prior by default. `size` is the
+    wanted effective sample size at beta = 1 and the number of draws for the check, by default the number of starting
+    points. Yields, for each beta below 1 before its draws are made, all weighted points with the stage, whose
+    acceptance is the efficiency of the latest draws; then a `Sweep`, as a tick of the progress bar. Raises StoppedEarly
+    if the limit of simulations is exceeded.
     """
     n, ndim = pending.coords.shape
     size = n if size is None else size
@@ -277,24 +235,10 @@ def recycle(
 
 
 class WeightedPoints:
-    """All points that have arrived, and the log-mixture over all densities that they were drawn from.
+    """All arrived points (n, ndim), their records, and the log-mixture over all densities they were drawn from.
 
     The mixture counts every submitted draw. While some are running, the sum of the weights is therefore smaller than
-    the evidence.
-
-    Parameters
-    ----------
-    pending : PendingPoints
-        Starting points.
-    start : StartingDensity
-        Density that the starting points were drawn from.
-
-    Attributes
-    ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        The points that had arrived at the last `update`, and their records.
-    proposals : list of (int, Mixture)
-        The proposals in order, and how many draws were made from each.
+    the evidence. `proposals` are the mixtures in order, with the number of draws made from each.
     """
 
     def __init__(self, pending: PendingPoints, start: StartingDensity):
@@ -385,10 +329,7 @@ def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
 def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> PendingPoints:
     """Begin to evaluate the draws (n, ndim) of the prior that an annealing starts from; `whole`: wait for all draws.
 
-    Raises
-    ------
-    StoppedEarly
-        If the limit of simulations does not allow all points.
+    Raises StoppedEarly if the limit of simulations does not allow all points.
     """
     pending = density.submit(coords)
     density.wait(0 if pending.refused or whole else most_running(density, len(coords)))
