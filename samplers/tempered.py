@@ -603,7 +603,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 recording.add(population, report)
                 self._result = recording.result
                 progress.show(recording.result, population, report)
-        recording.check_evidence()
+        recording.check_evidence(population.coords)
         stored, made = self._output.result.ladder, recording.result.ladder
         if [stage._replace(seconds=0.0) for stage in stored] == [stage._replace(seconds=0.0) for stage in made]:
             recording.result = recording.result._replace(ladder=stored)  # with the wall times of the evaluations

@@ -160,8 +160,8 @@ def judged_failures(
 
 
 def check_failed_region(near: NearFailures) -> list[Concern]:
-    """A concern if failures adjoin the final points: grave if they are known to be failures, many and not scattered."""
-    if near.place == "away":
+    """A concern if known failures adjoin the final points: grave if they are many and not scattered."""
+    if near.place == "away" or not near.known:
         return []
     where = f"in the region of the final points, {near.failed} of {near.evaluated} evaluated points"
     if near.place == "scattered":
@@ -176,14 +176,9 @@ def check_failed_region(near: NearFailures) -> list[Concern]:
             "the final points end there abruptly: if so, mend the model there, or exclude the region by the prior if "
             "it is impossible"
         )
-    elif near.known:
+    else:
         message = (
             f"{where} failed: the failures, not the data, end the posterior there, so means and standard deviations "
             "may be wrong. Mend the model there, or exclude the region by the prior if it is impossible"
         )
-    else:
-        message = (
-            f"{where} have a log-probability of -inf, and whether these are failed simulations is not known. If they "
-            "are, they end the posterior, not the data: mend the model there. If not, let log_prior exclude them"
-        )
-    return [Concern(message, near.borders and near.known)]
+    return [Concern(message, near.borders)]

@@ -32,9 +32,7 @@ from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_
 from ..judgement.checks import (
     check_annealing,
     check_fallback,
-    check_fit,
     check_guide_against_recycling,
-    check_mode_shares,
     check_shares,
     describe_unused_guide,
 )
@@ -113,9 +111,7 @@ def _check_moves(
     visited: VisitedPoints,
 ) -> Steps:
     """The evidence check after annealing by moves, and concerns; `recycled`: an unreliable result before the moves."""
-    found = check_annealing(stages, *population.coords.shape, correlation)
-    found += check_mode_shares(population.coords, population.founders[0], correlation)
-    yield from ((population, each) for each in found)
+    yield from ((population, each) for each in check_annealing(stages, correlation))
     check = None
     if settings.check_draws != 0:
         log_evidence = sum(stage.log_evidence_increment for stage in stages)
@@ -180,7 +176,7 @@ def _by_recycling(
     effective = population.effective_sample_size
     if settings.check_draws != 0:
         yield population, found.check
-    for each in (*check_fit(found.check, proposal, size, found.coords, found.log_weights), *compare(found)):
+    for each in compare(found):
         yield population, each
     if distinct < ENOUGH_DISTINCT * size or fits_poorly(found.check, proposal, size):
         moved = yield from move(population, population.founders[0], density, random, schedule, settings)

@@ -2,9 +2,12 @@
 
 import time
 
+import numpy as np
+
 from ..estimates.control_variates import SignedSample
 from ..estimates.importance import EvidenceCheck
 from ..judgement.checks import check_evidence
+from ..judgement.modes import find_modes
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
 from .population import Density, Population
 
@@ -57,11 +60,13 @@ class Recording:
             result = result._replace(founders=population.founders[0])
         self.result = result
 
-    def check_evidence(self) -> None:
-        """Compare the two estimates of the evidence at the end, if there are two."""
-        result = self.result
-        if result.check is None:
-            return
-        for concern in check_evidence(result.log_evidence_ladder, result.ladder[-1].log_evidence_error, result.check):
+    def check_evidence(self, coords: np.ndarray) -> None:
+        """Judge the estimates of the evidence at the end, with the final points (n, ndim)."""
+        result, stop = self.result, self.result.early_stop
+        if stop is not None and not stop.complete:
+            return  # its points are judged by their weights
+        founders = np.arange(len(coords)) if result.founders is None else result.founders
+        several, error = len(find_modes(coords[None], founders)) > 1, result.ladder[-1].log_evidence_error
+        for concern in check_evidence(result.log_evidence_ladder, error, result.check, several):
             warn(concern.message)
             self.result = self.result._replace(findings=(*self.result.findings, concern))

@@ -49,15 +49,17 @@ def run(posterior, Sampler=SMCSampler, nwalkers=N, steps=1, **options):
 @pytest.mark.parametrize(
     "options", [{}, {"recycle": False, "nwalkers": 80}, {"Sampler": TMCMCSampler, "nwalkers": 80}], ids=str
 )
-@pytest.mark.parametrize(("way", "status"), [("nan", "not usable"), ("inf", "usable"), ("counted", "not usable")])
-def test_a_run_that_is_piled_up_against_failures_says_so(way, status, options):
+@pytest.mark.parametrize("way", ["nan", "inf", "counted"])
+def test_a_run_that_is_piled_up_against_failures_says_so(way, options):
+    """With -inf, which may mean impossible parameters as well, it is a question that the run cannot answer."""
     posterior = (Counting if way == "counted" else Cut)(0.7, way)
     sampler = run(posterior, **options)
-    assert sampler.verdict.status == status
     near = sampler.verdict.near_failures
-    (reason,) = (r for r in sampler.verdict.reasons if r.startswith("in the region of the final points"))
-    assert f"{near.failed} of {near.evaluated} evaluated points" in reason and near.borders
-    assert near.known == (status == "not usable")
+    assert near.borders and near.known == (way != "inf")
+    assert (sampler.verdict.status == "not usable") == near.known
+    said = sampler.verdict.reasons if near.known else sampler.verdict.unknown
+    (reason,) = (r for r in said if "in the region of the final points" in r)
+    assert f"{near.failed} of {near.evaluated} evaluated points" in reason
     # the points cannot tell: mean and standard deviation are those of half a Gaussian
     samples = sampler.get_chain(flat=True)[:, 0]
     mean, sd = Gaussian(ndim=2, sd=0.05).mean[0], Gaussian(ndim=2, sd=0.05).sd[0]
