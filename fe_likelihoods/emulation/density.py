@@ -8,7 +8,7 @@ large sample of weighted points (the pool) from it gives the evidence of the emu
 independence Metropolis steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,11 +16,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from samplers.estimates.importance import KnownDensity
+from samplers.estimates.weights import effective_sample_size, log_mean_weight, normalised_weights
+
 from .emulator import ResponseEmulator
 from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import ResponseTarget
 
-__all__ = ["EmulatedPosterior", "KnownDensity", "Region", "effective_sample_size"]
+__all__ = ["EmulatedPosterior", "Region"]
 
 _FREEDOM = 6.0
 _ROUNDS = 6
@@ -54,49 +57,11 @@ class Region(NamedTuple):
     log_evidence: float  # from the Laplace approximation before there is an emulator
 
 
-class KnownDensity(NamedTuple):
-    """The emulated posterior of the parameters, as a density with known expectations.
-
-    Attributes
-    ----------
-    log_density : callable
-        Function of parameters (n, ndim) that returns the logarithm of the normalised density (n,).
-    coords, weights : (m, ndim) float, (m,) float
-        Parameters, and their weights with sum 1.
-    log_density_error : float
-        Standard error of the logarithm of the normalising constant.
-    """
-
-    log_density: Callable[[np.ndarray], np.ndarray]
-    coords: np.ndarray
-    weights: np.ndarray
-    log_density_error: float
-
-
-def effective_sample_size(log_weights: np.ndarray) -> float:
-    """(sum w)^2 / sum w^2 of weights given by their logarithms; 0 if all weights are zero."""
-    top = log_weights.max(initial=-np.inf)
-    if top == -np.inf:
-        return 0.0
-    weights = np.exp(log_weights - top)
-    return float(weights.sum() ** 2 / np.square(weights).sum())
-
-
-def _normalised(log_weights: np.ndarray) -> np.ndarray:
-    weights = np.exp(log_weights - log_weights.max())
-    return weights / weights.sum()
-
-
 def _moments(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (d,) and covariance (d, d) of points (n, d) with normalised weights."""
     mean = weights @ coords
     apart = coords - mean
     return mean, (apart * weights[:, None]).T @ apart
-
-
-def _log_mean(log_weights: np.ndarray) -> float:
-    top = log_weights.max()
-    return float(top + np.log(np.exp(log_weights - top).mean()))
 
 
 class EmulatedPosterior:
@@ -225,11 +190,11 @@ class EmulatedPosterior:
         """Weighted mean and covariance, or None with too few effective points."""
         if effective_sample_size(log_weights) < _ENOUGH_PER_DIMENSION * coords.shape[1]:
             return None
-        mean, covariance = _moments(coords, _normalised(log_weights))
+        mean, covariance = _moments(coords, normalised_weights(log_weights))
         return mean, covariance + _RIDGE * np.diag(np.diag(covariance))
 
     def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> StudentMixture:
-        weights = 0.9 * _normalised(log_shares) + 0.1 / len(regions)
+        weights = 0.9 * normalised_weights(log_shares) + 0.1 / len(regions)
         factors = [factor_of(_WIDENED * region.covariance) for region in regions]
         return StudentMixture(weights, np.array([region.centre for region in regions]), np.array(factors), _FREEDOM)
 
@@ -320,8 +285,8 @@ class EmulatedPosterior:
         # outside the support of the prior, coordinates are infinite
         self._pool[self._log_weights == -np.inf] = 0.0
         self.top = float(self.log_density(self._pool[np.argsort(-self._log_weights)[:1000]]).max())
-        self._weights = _normalised(self._log_weights)
-        self.log_evidence = _log_mean(self._log_weights)
+        self._weights = normalised_weights(self._log_weights)
+        self.log_evidence = log_mean_weight(self._log_weights)
         effective = effective_sample_size(self._log_weights)
         self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / _POOL, 0.0)))
         self.effective_share = effective / _POOL

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from .density import EmulatedPosterior, KnownDensity, Region
+from samplers.estimates.importance import KnownDensity
+
+from .density import EmulatedPosterior, Region
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import (
