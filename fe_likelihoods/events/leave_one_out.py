@@ -32,6 +32,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.weights import effective_sample_size
+from samplers.resampling import systematic
+
 from ..priors.points import as_points
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
@@ -108,7 +111,7 @@ def without_each(
         cut_off = ends_within(posterior, name, others=rest.tests)
         sampled = not even or bool(cut_off)
         if not sampled:
-            samples = hierarchy.samples[_systematic(weights, len(own), rng)]
+            samples = hierarchy.samples[rng.permutation(systematic(weights, rng))]
             log_density, error = _log_mean(own, weights)
         elif sample is None:
             samples, log_density, error = _sample_anew(posterior, k, hierarchy.samples, own, rng)
@@ -135,13 +138,6 @@ def without_each(
             float(np.hypot(error, stored.log_evidence_error)),
         )
     return found
-
-
-def _systematic(weights: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows drawn by systematic resampling, in random order."""
-    cumulative = np.cumsum(weights)
-    positions = (np.arange(size) + rng.random()) / size * cumulative[-1]
-    return rng.permutation(np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1))
 
 
 def _log_mean(log_values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
@@ -185,7 +181,7 @@ def _sample_anew(
     while power > 0.0:
         lower = _next_power(own, power)
         weights = np.exp((lower - power) * (own - own.min()))
-        rows = _systematic(weights, len(own), rng)
+        rows = rng.permutation(systematic(weights, rng))
         new = _ensemble(partial(_log_prob, posterior, k, lower), samples[rows], rng)
         new_own = posterior.log_marginals(new)[:, k]
         ratio, error = _bridge((power - lower) * own, (power - lower) * new_own)
@@ -211,8 +207,7 @@ def _next_power(own: np.ndarray, power: float) -> float:
     """The smallest power whose weights leave half of the samples effective; 0 if possible."""
 
     def share(lower: float) -> float:
-        weights = np.exp((lower - power) * (own - own.min()))
-        return float(weights.sum() ** 2 / (np.square(weights).sum() * len(own)))
+        return effective_sample_size((lower - power) * own) / len(own)
 
     low, high = 0.0, power
     if share(low) >= _SMALLEST_SHARE:
