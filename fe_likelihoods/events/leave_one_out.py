@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.pareto import LARGEST_SHAPE, smoothed_weights
 from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
@@ -40,7 +41,6 @@ from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_checks import ends_within
 from .hierarchy_result import Hierarchy
-from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
 __all__ = ["LeftOut", "without_each"]
 

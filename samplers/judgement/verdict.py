@@ -20,11 +20,11 @@ from ..estimates.genealogy import standard_error_of_mean, worst_effective_sample
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
     LARGEST_ERROR,
-    LARGEST_SHAPE,
     USABLE_SHARE,
     fewest_points,
     usable,
 )
+from ..estimates.pareto import LARGEST_SHAPE
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound
 from .failures import NearFailures, check_failed_region
 from .modes import Mode, find_modes

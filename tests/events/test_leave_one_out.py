@@ -19,7 +19,7 @@ from fe_likelihoods import (
     leave_one_out,
 )
 from fe_likelihoods.events.hierarchy_checks import check_hierarchy
-from fe_likelihoods.events.pareto_smoothing import smoothed_weights
+from samplers.estimates.pareto import smoothed_weights
 
 module = importlib.import_module("fe_likelihoods.events.leave_one_out")
 ERROR, WIDE = 0.2, 2.0  # standard deviations of a measurement and of the prior of a test
