@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import special, stats
 
-from ..estimates.weights import log_mean_weight
+from ..estimates.bridge import log_ratio
 
 __all__ = ["SEED", "compare_with_draws", "draws_to_compare", "log_integral", "spread_by_metropolis"]
 
@@ -26,7 +26,6 @@ METROPOLIS_STEPS = 20
 FEWEST_FOR_METROPOLIS = 32  # signed ranks of fewer points cannot reach the level
 PROPOSED = 10  # draws of a Gaussian per point, for the integral of a density
 FEWEST_FOR_INTEGRAL, POINTS_PER_PARAMETER = 20, 10  # points; with fewer per parameter, the Gaussian has no correlations
-BRIDGE_STEPS = 100
 SEED = 20_131  # the tests use separate random numbers, so that they change no run
 
 
@@ -120,17 +119,10 @@ def spread_by_metropolis(coords: np.ndarray, log_density: Callable[[np.ndarray],
 
 
 def log_integral(coords: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
-    r"""Logarithm of the integral of a density over its support, and its standard error, from draws of it.
+    """Logarithm of the integral of a density over its support, and its standard error, from draws of it.
 
-    Bridge sampling (Meng & Wong 1996, Statistica Sinica 6, 831-860) between the draws :math:`x_i` of the density p and
-    draws :math:`y_j` of a Gaussian q: with the ratios :math:`l = p / q` and shares :math:`s_p, s_q` of the draws, the
-    integral r solves
-
-    .. math::
-
-       r = \frac{\mathrm{mean}_j\; l(y_j) / (s_p l(y_j) + s_q r)}{\mathrm{mean}_i\; 1 / (s_p l(x_i) + s_q r)} .
-
-    The Gaussian is fitted to the other half of the draws.
+    Bridge sampling (`samplers.estimates.bridge`) between the draws and draws of a Gaussian that is fitted to the other
+    half of the draws.
 
     Parameters
     ----------
@@ -157,26 +149,6 @@ def log_integral(coords: np.ndarray, log_density: Callable[[np.ndarray], np.ndar
         except (np.linalg.LinAlgError, ValueError):
             return float("nan"), float("inf")
         proposed = normal.rvs(PROPOSED * len(draws), random_state=random).reshape(-1, ndim)
-        found.append(_bridge(*(log_density(x) - np.atleast_1d(normal.logpdf(x)) for x in (draws, proposed))))
+        found.append(log_ratio(*(log_density(x) - np.atleast_1d(normal.logpdf(x)) for x in (draws, proposed))))
     values, errors = np.array(found).T
     return float(values.mean()), float(0.5 * np.hypot(*np.maximum(errors, 0.5 * abs(values[0] - values[1]))))
-
-
-def _bridge(of_draws: np.ndarray, of_proposed: np.ndarray) -> tuple[float, float]:
-    """Log-integral and its error from log-ratios at draws (n,) and at proposed points (m,), by fixed-point steps."""
-    n, m = len(of_draws), len(of_proposed)
-    share, centre = np.log([n, m]) - np.log(n + m), float(np.median(of_draws))
-    below, above = of_draws - centre, of_proposed - centre  # against overflow
-    value = 0.0
-    for _ in range(BRIDGE_STEPS):
-        at_draws = -np.logaddexp(share[0] + below, share[1] + value)
-        at_proposed = above - np.logaddexp(share[0] + above, share[1] + value)
-        old, value = value, log_mean_weight(at_proposed) - log_mean_weight(at_draws)
-        if not np.isfinite(value) or abs(value - old) < 1e-6:
-            break
-    if not np.isfinite(value):
-        return float("nan"), float("inf")
-    variances = [
-        np.expm1(log_mean_weight(2.0 * x) - 2.0 * log_mean_weight(x)) / len(x) for x in (at_draws, at_proposed)
-    ]
-    return value + centre, float(np.sqrt(sum(variances)))

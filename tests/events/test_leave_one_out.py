@@ -275,21 +275,6 @@ def test_the_density_without_a_test_is_known_where_the_test_is_impossible():
     np.testing.assert_allclose(module._log_prob(posterior, 2, 0.5, points), [-np.inf, rest[1] + 0.5 * own[1]])
 
 
-def test_bridge_between_a_density_and_its_part(rng):
-    """A standard normal density and its part above one: the ratio is the probability of that part."""
-    upper = np.zeros(2000)
-    ratios, errors = [], []
-    for _ in range(50):
-        lower = np.where(rng.standard_normal(2000) > 1.0, 0.0, -np.inf)
-        ratio, error = module._bridge(upper, lower)
-        ratios.append(ratio)
-        errors.append(error)
-    exact = stats.norm.logsf(1.0)
-    assert abs(np.mean(ratios) - exact) < 4.0 * np.std(ratios, ddof=1) / np.sqrt(50)
-    assert np.mean(errors) == pytest.approx(np.std(ratios, ddof=1), rel=0.4)
-    assert np.isnan(module._bridge(upper, np.full(10, -np.inf))).all()
-
-
 @pytest.mark.slow
 def test_a_test_that_the_others_exclude_has_no_predictive_density():
     hierarchy = hierarchy_with_common(1.0, 5.0)
