@@ -15,7 +15,7 @@ from ..estimates.importance import EvidenceCheck, efficiencies, fits_poorly
 from ..estimates.weights import LOWEST, normalised_weights
 from ..proposals.mixture import Mixture, invert_roots, location_and_root, log_responsibilities
 from ..reports import Concern, Stage
-from .modes import find_modes
+from .clusters import find_clusters
 
 __all__ = [
     "check_agreement",
@@ -192,7 +192,7 @@ def check_mode_shares(coords: np.ndarray, founders: np.ndarray, correlation: flo
     """
     if not SEPARATE_MODES < correlation <= HIGH_CORRELATION:
         return []
-    if correlation <= ANY_MODES and len(find_modes(coords[None], founders)) == 1:
+    if correlation <= ANY_MODES and len(find_clusters(coords[None], founders)) == 1:
         return []
     message = (
         f"the walkers are still correlated ({correlation:.2f}) with their resampled start: the shares of separate "

@@ -26,8 +26,8 @@ from ..estimates.importance import (
 )
 from ..estimates.pareto import LARGEST_SHAPE
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound
+from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
-from .modes import Mode, find_modes
 
 __all__ = [
     "CONVERGED",
@@ -182,9 +182,9 @@ class Verdict(_Stored):
         return self._parts.near
 
     @cached_property
-    def modes(self) -> tuple[Mode, ...]:
+    def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""
-        return find_modes(self._chain, self._founders)
+        return find_clusters(self._chain, self._founders)
 
     @cached_property
     def worst_effective_sample_size(self) -> float:
