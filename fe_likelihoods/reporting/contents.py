@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from samplers import Verdict
+from samplers.estimates.pareto import LARGEST_SHAPE
 from samplers.output import stored_result
 
 from ..likelihood.likelihood import FELikelihood
@@ -28,8 +29,6 @@ __all__ = [
     "summary_sentences",
     "verdict_sentences",
 ]
-
-LARGEST_SHAPE = 0.7  # weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024, JMLR 25(72))
 
 
 class DataSet(NamedTuple):
