@@ -140,7 +140,10 @@ class RunResults:
         """
         shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
         groups = 1.0 / np.sum(shares**2)
-        errors = standard_error_of_mean(self.get_chain(discard=discard, thin=thin), self.founders)
+        chain = self.get_chain(discard=discard, thin=thin)
+        if not len(chain):
+            raise ValueError(f"mean_error: expected discard below the number of stored steps; got discard={discard}")
+        errors = standard_error_of_mean(chain, self.founders)
         return errors if len(shares) == 1 else errors * student_factor(groups - 1.0)
 
     def _repr_html_(self) -> str:

@@ -33,6 +33,7 @@ from ..prediction.prediction import Prediction
 from ..prediction.propagation import check_effective_sample_size
 from ..prediction.reliability import (
     Exceedance,
+    check_level,
     exceedance,
     exceedance_probability,
     warn_of_missing_error,
@@ -290,6 +291,7 @@ def damage(
     values = measures.split(prediction.values)
     errors = _ratios_of_measures(ratios, tuple(values))
     effective = float(check_effective_sample_size(effective_sample_size, prediction.effective_sample_size))
+    check_level(level)
     weights = None if prediction.spread is None else prediction.spread.weights
     presence, location = {}, {}
     for state in states:

@@ -8,21 +8,25 @@ large sample of weighted points (the pool) from it gives the evidence of the emu
 independence Metropolis steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from samplers.estimates.importance import KnownDensity
+from samplers.estimates.weights import effective_sample_size, log_mean_weight, normalised_weights
+from samplers.proposals.mixture import Mixture, draw, invert_roots, log_density
+
 from .emulator import ResponseEmulator
-from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import ResponseTarget
 
-__all__ = ["EmulatedPosterior", "KnownDensity", "Region", "effective_sample_size"]
+__all__ = ["EmulatedPosterior", "Region", "factor_of", "student_mixture"]
 
 _FREEDOM = 6.0
+_LARGEST_BLOCK = 100_000  # points times components for which densities are computed together
 _ROUNDS = 6
 _DRAWS = 3000  # per round of the adaptation
 _POOL = 20_000
@@ -54,39 +58,6 @@ class Region(NamedTuple):
     log_evidence: float  # from the Laplace approximation before there is an emulator
 
 
-class KnownDensity(NamedTuple):
-    """The emulated posterior of the parameters, as a density with known expectations.
-
-    Attributes
-    ----------
-    log_density : callable
-        Function of parameters (n, ndim) that returns the logarithm of the normalised density (n,).
-    coords, weights : (m, ndim) float, (m,) float
-        Parameters, and their weights with sum 1.
-    log_density_error : float
-        Standard error of the logarithm of the normalising constant.
-    """
-
-    log_density: Callable[[np.ndarray], np.ndarray]
-    coords: np.ndarray
-    weights: np.ndarray
-    log_density_error: float
-
-
-def effective_sample_size(log_weights: np.ndarray) -> float:
-    """(sum w)^2 / sum w^2 of weights given by their logarithms; 0 if all weights are zero."""
-    top = log_weights.max(initial=-np.inf)
-    if top == -np.inf:
-        return 0.0
-    weights = np.exp(log_weights - top)
-    return float(weights.sum() ** 2 / np.square(weights).sum())
-
-
-def _normalised(log_weights: np.ndarray) -> np.ndarray:
-    weights = np.exp(log_weights - log_weights.max())
-    return weights / weights.sum()
-
-
 def _moments(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (d,) and covariance (d, d) of points (n, d) with normalised weights."""
     mean = weights @ coords
@@ -94,9 +65,18 @@ def _moments(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
     return mean, (apart * weights[:, None]).T @ apart
 
 
-def _log_mean(log_weights: np.ndarray) -> float:
-    top = log_weights.max()
-    return float(top + np.log(np.exp(log_weights - top).mean()))
+def student_mixture(weights: np.ndarray, means: Any, roots: Any, dof: float) -> Mixture:
+    """Mixture of t distributions with weights (k,), means (k, d) and lower Cholesky factors (k, d, d)."""
+    return Mixture(weights, np.array(means), np.array(roots), invert_roots(np.array(roots)), dof)
+
+
+def factor_of(covariance: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor (d, d) of a covariance; variances that rounding made negative become small ones."""
+    sd = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    lower = np.linalg.qr(root.T, mode="r").T
+    return sd[:, None] * lower * np.sign(np.diag(lower))
 
 
 class EmulatedPosterior:
@@ -148,19 +128,20 @@ class EmulatedPosterior:
         return coords
 
     def _propose(
-        self, mixture: StudentMixture, n: int, random: np.random.RandomState
+        self, mixture: Mixture, n: int, random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draws (n, ndim) of a mixture in scaled parameters, their coordinates and their log-weights (n,)."""
-        scaled = draw_mixture(mixture, n, random)
+        scaled = draw(mixture, n, random)
         return scaled, *self._log_weights_of(mixture, scaled)
 
-    def _log_weights_of(self, mixture: StudentMixture, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _log_weights_of(self, mixture: Mixture, scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates (n, ndim) of scaled parameters, and log-weights (n,) over the density of a mixture."""
         coords, log_volume = self._target.unscaled(scaled)
         log_weights = np.full(len(scaled), -np.inf)
         inside = np.flatnonzero(log_volume > -np.inf)
         log_weights[inside] = self.log_density(coords[inside]) + log_volume[inside]
-        log_weights[inside] -= mixture_log_density(mixture, scaled[inside])
+        for rows in np.array_split(inside, len(scaled) * len(mixture.weights) // _LARGEST_BLOCK + 1):
+            log_weights[rows] -= log_density(mixture, scaled[rows])
         return coords, log_weights
 
     def _in_scaled(self, region: Region) -> Region:
@@ -225,13 +206,13 @@ class EmulatedPosterior:
         """Weighted mean and covariance, or None with too few effective points."""
         if effective_sample_size(log_weights) < _ENOUGH_PER_DIMENSION * coords.shape[1]:
             return None
-        mean, covariance = _moments(coords, _normalised(log_weights))
+        mean, covariance = _moments(coords, normalised_weights(log_weights))
         return mean, covariance + _RIDGE * np.diag(np.diag(covariance))
 
-    def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> StudentMixture:
-        weights = 0.9 * _normalised(log_shares) + 0.1 / len(regions)
+    def _mixture_of(self, regions: Sequence[Region], log_shares: np.ndarray) -> Mixture:
+        weights = 0.9 * normalised_weights(log_shares) + 0.1 / len(regions)
         factors = [factor_of(_WIDENED * region.covariance) for region in regions]
-        return StudentMixture(weights, np.array([region.centre for region in regions]), np.array(factors), _FREEDOM)
+        return student_mixture(weights, [region.centre for region in regions], factors, _FREEDOM)
 
     def _adapt(self, random: np.random.RandomState) -> None:
         regions = [self._in_scaled(region) for region in self._regions]
@@ -282,7 +263,7 @@ class EmulatedPosterior:
         apart = self._log_weights_of(self._mixture, scaled)[1] - self._log_weights.max()
         return scaled[apart > _UNREACHED][:_KERNELS]
 
-    def _kernels(self, missed: np.ndarray, random: np.random.RandomState) -> StudentMixture:
+    def _kernels(self, missed: np.ndarray, random: np.random.RandomState) -> Mixture:
         """The mixture with narrow components around weighted points and missed runs (n, ndim), in scaled parameters.
 
         It covers a posterior that no ellipsoid covers. The covariance of a component comes from its nearest points.
@@ -306,22 +287,18 @@ class EmulatedPosterior:
         factors = factor @ np.linalg.cholesky(local)
         base = self._ellipsoids
         weights = np.concatenate([(1.0 - _KERNEL_SHARE) * base.weights, _KERNEL_SHARE * count / count.sum()])
-        return StudentMixture(
-            weights,
-            np.concatenate([base.centres, centres]),
-            np.concatenate([base.factors, factors]),
-            _FREEDOM,
-        )
+        means, roots = np.concatenate([base.means, centres]), np.concatenate([base.roots, factors])
+        return student_mixture(weights, means, roots, _FREEDOM)
 
-    def _fill(self, mixture: StudentMixture, random: np.random.RandomState) -> None:
+    def _fill(self, mixture: Mixture, random: np.random.RandomState) -> None:
         """Draw the pool."""
         self._mixture = mixture
         _, self._pool, self._log_weights = self._propose(mixture, _POOL, random)
         # outside the support of the prior, coordinates are infinite
         self._pool[self._log_weights == -np.inf] = 0.0
         self.top = float(self.log_density(self._pool[np.argsort(-self._log_weights)[:1000]]).max())
-        self._weights = _normalised(self._log_weights)
-        self.log_evidence = _log_mean(self._log_weights)
+        self._weights = normalised_weights(self._log_weights)
+        self.log_evidence = log_mean_weight(self._log_weights)
         effective = effective_sample_size(self._log_weights)
         self.log_evidence_error = float(np.sqrt(max(1.0 / effective - 1.0 / _POOL, 0.0)))
         self.effective_share = effective / _POOL

@@ -19,7 +19,10 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from .density import EmulatedPosterior, KnownDensity, Region
+from samplers.estimates.importance import KnownDensity
+from samplers.proposals.mixture import Mixture, draw, log_density
+
+from .density import EmulatedPosterior, Region, factor_of, student_mixture
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import (
@@ -36,7 +39,6 @@ from .modes import (
     with_mode,
 )
 from .stacked import is_joint
-from .student import StudentMixture, draw_mixture, factor_of, mixture_log_density
 from .target import SCALES, ResponseTarget
 
 __all__ = ["ResponseGuide"]
@@ -135,7 +137,7 @@ class ResponseGuide:
         self._modes: list[Mode] = []
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
         self._emulated: EmulatedPosterior | None = None
-        self._wide: StudentMixture | None = None
+        self._wide: Mixture | None = None
         self._beyond = np.empty((0, self._target.n_structural))  # points beyond the ends of a curved posterior
         self._curves = 0  # times that such points were tried
         self._ridge = False  # whether the data leave a combination of parameters to the prior
@@ -285,7 +287,7 @@ class ResponseGuide:
         parts = np.diff(np.minimum(ends, n + ends[0]))
         coords = [random.standard_normal((parts[2], self._target.ndim))]
         if parts[1]:
-            coords.append(draw_mixture(self._wide, parts[1], random))
+            coords.append(draw(self._wide, parts[1], random))
         if parts[0]:
             coords.append(self._emulated.draw(parts[0], random))
         return self._target.parameters(random.permutation(np.concatenate(coords)))
@@ -483,7 +485,7 @@ class ResponseGuide:
         wide, prior = self._shares()
         total = np.log(prior) + self._target.log_prior(coords)
         if self._wide is not None:
-            total = np.logaddexp(total, np.log(wide) + mixture_log_density(self._wide, coords))
+            total = np.logaddexp(total, np.log(wide) + log_density(self._wide, coords))
         if self._emulated is not None:
             emulated = self._emulated.log_density(coords) - self._emulated.log_evidence
             total = np.logaddexp(total, np.log(1.0 - wide - prior) + emulated)
@@ -501,7 +503,7 @@ class ResponseGuide:
         self._best = max(self._best, mode.log_density)
         return Region(mode.coords, mode.covariance, None, mode.log_evidence)
 
-    def _wide_mixture(self) -> StudentMixture:
+    def _wide_mixture(self) -> Mixture:
         shares = np.array([region.log_evidence for region in self._regions])
         weights = np.exp(shares - shares.max())
         weights = (1.0 - _SMALLEST_WEIGHT) * weights / weights.sum() + _SMALLEST_WEIGHT / len(weights)
@@ -510,7 +512,7 @@ class ResponseGuide:
         covariances = [*(region.covariance for region in self._regions), *(mode.covariance for mode in self._modes)]
         factors = [factor_of(_WIDENED * covariance) for covariance in covariances]
         weights = np.concatenate([(1.0 - _SHARE_OF_MODES) * weights, _SHARE_OF_MODES * weights])
-        return StudentMixture(weights, np.array(centres), np.array(factors), _WIDE_FREEDOM)
+        return student_mixture(weights, centres, factors, _WIDE_FREEDOM)
 
     def _far(self, coords: np.ndarray) -> np.ndarray:
         """Whether structural coordinates (n, d) are away from all regions."""

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.pareto import LARGEST_SHAPE, pareto_shape
+
 from ..text_tables import number, text_table
-from .pareto_smoothing import LARGEST_SHAPE, pareto_shape
 from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
 from .stored_posterior import resampled_description
 
@@ -87,7 +88,8 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
         changes.append(change)
         sizes = np.full(2, np.nan)
         drawn = draw_products(described, center, factor, _DRAWS, rng)
-        shapes = np.array([pareto_shape(row) for row in inverse_prior(described, drawn)])
+        with np.errstate(divide="ignore"):
+            shapes = [pareto_shape(row) for row in np.log(inverse_prior(described, drawn))]
         if weighted:
             weights = sample_weights(described, center, factor)
             square = np.square(weights).sum(axis=1)

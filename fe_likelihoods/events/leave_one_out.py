@@ -20,9 +20,6 @@ References
 ----------
 A. Vehtari, A. Gelman, J. Gabry (2017), Practical Bayesian model evaluation using leave-one-out cross-validation and
 WAIC, Statistics and Computing 27, 1413-1432, doi:10.1007/s11222-016-9696-4.
-
-X.-L. Meng, W. H. Wong (1996), Simulating ratios of normalizing constants via a simple identity: a theoretical
-exploration, Statistica Sinica 6, 831-860.
 """
 
 import warnings
@@ -32,12 +29,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.bridge import log_ratio
+from samplers.estimates.pareto import LARGEST_SHAPE, smoothed_weights
+from samplers.estimates.weights import effective_sample_size
+from samplers.resampling import systematic
+
 from ..priors.points import as_points
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_checks import ends_within
 from .hierarchy_result import Hierarchy
-from .pareto_smoothing import LARGEST_SHAPE, smoothed_weights
 
 __all__ = ["LeftOut", "without_each"]
 
@@ -108,13 +109,13 @@ def without_each(
         cut_off = ends_within(posterior, name, others=rest.tests)
         sampled = not even or bool(cut_off)
         if not sampled:
-            samples = hierarchy.samples[_systematic(weights, len(own), rng)]
+            samples = hierarchy.samples[rng.permutation(systematic(weights, rng))]
             log_density, error = _log_mean(own, weights)
         elif sample is None:
             samples, log_density, error = _sample_anew(posterior, k, hierarchy.samples, own, rng)
         else:
             samples = as_points(sample(rest), rest.parameter_names)
-            log_density, error = _bridge(own, posterior.log_marginals(samples)[:, k])
+            log_density, error = log_ratio(own, posterior.log_marginals(samples)[:, k])
         if np.isnan(log_density):
             warnings.warn(
                 f"leave_one_out: no sample of the population without test {name!r} is possible under this test, whose "
@@ -137,13 +138,6 @@ def without_each(
     return found
 
 
-def _systematic(weights: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows drawn by systematic resampling, in random order."""
-    cumulative = np.cumsum(weights)
-    positions = (np.arange(size) + rng.random()) / size * cumulative[-1]
-    return rng.permutation(np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1))
-
-
 def _log_mean(log_values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
     """Logarithm of a weighted mean of exponentials, and its standard error."""
     largest = log_values.max()
@@ -151,30 +145,6 @@ def _log_mean(log_values: np.ndarray, weights: np.ndarray) -> tuple[float, float
     mean = weights @ values
     error = np.sqrt(np.square(weights * (values - mean)).sum()) / mean
     return float(largest + np.log(mean)), float(error)
-
-
-def _bridge(log_upper: np.ndarray, log_lower: np.ndarray) -> tuple[float, float]:
-    """Log ratio of two normalising constants, and its standard error (Meng and Wong 1996, section 3).
-
-    The densities have the ratio r, up to the wanted constant. Arguments are log r at independent samples of the density
-    with r as a factor (upper) and of the density without it (lower). There r may be zero; if it is zero at all samples,
-    the result is NaN.
-    """
-    from scipy.optimize import brentq  # slow to import
-    from scipy.special import expit
-
-    shift = np.log(len(log_upper) / len(log_lower))
-
-    def shares(log_ratio: float) -> tuple[np.ndarray, np.ndarray]:
-        return expit(log_lower - log_ratio + shift), expit(log_ratio - shift - log_upper)
-
-    possible = log_lower[log_lower > -np.inf]
-    if not possible.size:
-        return np.nan, np.nan
-    ends = [min(log_upper.min(), possible.min()) - 20.0, max(log_upper.max(), possible.max()) + 20.0]
-    log_ratio = brentq(lambda x: np.subtract(*(each.sum() for each in shares(x))), *(np.array(ends) + shift))
-    error = np.sqrt(sum(each.var() / (len(each) * each.mean() ** 2) for each in shares(log_ratio)))
-    return float(log_ratio), float(error)
 
 
 def _sample_anew(
@@ -185,10 +155,10 @@ def _sample_anew(
     while power > 0.0:
         lower = _next_power(own, power)
         weights = np.exp((lower - power) * (own - own.min()))
-        rows = _systematic(weights, len(own), rng)
+        rows = rng.permutation(systematic(weights, rng))
         new = _ensemble(partial(_log_prob, posterior, k, lower), samples[rows], rng)
         new_own = posterior.log_marginals(new)[:, k]
-        ratio, error = _bridge((power - lower) * own, (power - lower) * new_own)
+        ratio, error = log_ratio((power - lower) * own, (power - lower) * new_own)
         # neighbouring ratios share samples and depend on each other: at most twice the variance of independent ones
         log_density, variance = log_density + ratio, variance + 2.0 * error**2
         power, samples, own = lower, new, new_own
@@ -211,8 +181,7 @@ def _next_power(own: np.ndarray, power: float) -> float:
     """The smallest power whose weights leave half of the samples effective; 0 if possible."""
 
     def share(lower: float) -> float:
-        weights = np.exp((lower - power) * (own - own.min()))
-        return float(weights.sum() ** 2 / (np.square(weights).sum() * len(own)))
+        return effective_sample_size((lower - power) * own) / len(own)
 
     low, high = 0.0, power
     if share(low) >= _SMALLEST_SHARE:

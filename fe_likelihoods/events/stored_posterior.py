@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.weights import effective_sample_size
+from samplers.resampling import systematic
+
 from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
@@ -176,7 +179,7 @@ class StoredPosterior:
         effective = self.effective_sample_size
         if effective is None:
             distinct = len(np.unique(points, axis=0))
-            effective = distinct if self.log_weights is None else min(1.0 / np.exp(2.0 * weights).sum(), len(points))
+            effective = distinct if self.log_weights is None else min(effective_sample_size(weights), len(points))
         values = [0.0 if self.log_evidence is None else self.log_evidence, self.log_evidence_error, effective]
         if not np.isfinite(values).all() or values[1] < 0.0 or not 1.0 <= values[2] <= len(points):
             raise ValueError(
@@ -275,7 +278,7 @@ def describe(
     prior, points = on_scale(stored, names, scales)
     rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)
     equal = np.ptp(stored.log_weights) == 0.0
-    rows = _systematic(weights, min(len(points), max_samples), rng)  # evenly spaced rows for equal weights
+    rows = systematic(weights, rng, min(len(points), max_samples))  # evenly spaced rows for equal weights
     mixture = _fit(points[rows], names, stored.effective_sample_size, seed)
     common = _fit_common(points[rows], prior, n_common, stored.effective_sample_size, seed)
     if len(points) > max_samples:
@@ -361,10 +364,3 @@ def _components(mixture: MixtureDistribution) -> tuple[np.ndarray, np.ndarray, n
     normals = list(mixture.prior.distributions.values())
     center, scale = np.array([each.mean for each in normals]), np.array([each.sd for each in normals])
     return np.log(mixture.weights), center + scale * mixture.means, mixture.covariances * np.outer(scale, scale)
-
-
-def _systematic(weights: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Rows drawn by systematic resampling: `size` evenly spaced positions in the cumulative weights."""
-    positions = (np.arange(size) + rng.random()) / size
-    cumulative = np.cumsum(weights)
-    return np.minimum(np.searchsorted(cumulative / cumulative[-1], positions), len(weights) - 1)

@@ -379,11 +379,8 @@ def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
 
 
 def binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Clopper-Pearson interval of a probability, for a share of `effective` trials, which may be no whole number.
-
-    ValueError if the level is not between 0 and 1.
-    """
-    tail = 0.5 * (1.0 - check_level(level))
+    """Clopper-Pearson interval of a probability, for a share of `effective` trials, which may be no whole number."""
+    tail = 0.5 * (1.0 - level)
     share = np.asarray(share, dtype=float)
     hits, misses = share * effective, (1.0 - share) * effective
     # The beta distribution does not exist for a count of zero. The bound is then 0 or 1.

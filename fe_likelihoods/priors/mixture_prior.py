@@ -1,18 +1,16 @@
 """A posterior as the prior of the next step: a mixture of normal distributions fitted to posterior samples.
 
 The samples are mapped to the coordinates in which the first prior is standard normal (`Prior.to_normal`), and a mixture
-is fitted there by expectation maximisation. Bounds of the prior are therefore kept, and correlations are described. The
-number of components minimises the Bayesian information criterion. See ``docs/events.rst``.
-
-References
-----------
-G. Schwarz (1978), Estimating the dimension of a model, Annals of Statistics 6, 461-464, doi:10.1214/aos/1176344136.
+is fitted there (`samplers.proposals.mixture`). Bounds of the prior are therefore kept, and correlations are described.
+See ``docs/events.rst``.
 """
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from samplers.proposals.mixture import Mixture, fit_normals, invert_roots, log_density
 
 from .distributions import RandomState
 from .multivariate import MultivariateDistribution, as_generator
@@ -25,11 +23,7 @@ __all__ = ["MixtureDistribution", "fit_mixture"]
 
 _LOG_TWO_PI = np.log(2.0 * np.pi)
 _LARGEST_SCORE = 12.0  # samples at a bound of the prior have infinite scores
-_ITERATIONS = 100
-_STARTS = 2
-_GAIN = 1e-6  # of the log-likelihood per sample and iteration, below which the maximisation ends
 _REFITS = 16
-_REFIT_ITERATIONS = 20
 _SMALLEST_EIGENVALUE = 1e-10  # of the correlations, below which the samples are linearly dependent
 
 
@@ -85,6 +79,7 @@ class MixtureDistribution(MultivariateDistribution):
             raise ValueError(f"expected positive weights that sum to one; got {self.weights}")
         self.fit_error, self.misfit = float(fit_error), misfit
         self._factors = np.linalg.cholesky(self.covariances)
+        self._mixture = Mixture(self.weights, self.means, self._factors, invert_roots(self._factors), np.inf)
 
     def __repr__(self) -> str:
         return f"MixtureDistribution({self.prior!r}, {self.weights!r}, {self.means!r}, {self.covariances!r})"
@@ -112,7 +107,7 @@ class MixtureDistribution(MultivariateDistribution):
             z = np.where(finite[:, None], z, 0.0)
             # the density of z, times dz / dx = p(x) / phi(z) of every parameter
             slope = base[inside] + 0.5 * np.square(z).sum(axis=1) + 0.5 * self.dim * _LOG_TWO_PI
-            value[inside] = np.where(finite, _log_mixture(z, self.weights, self.means, self._factors) + slope, -np.inf)
+            value[inside] = np.where(finite, log_density(self._mixture, z) + slope, -np.inf)
         return value.reshape(x.shape[:-1])
 
     def from_normal(self, z: np.ndarray) -> np.ndarray:
@@ -149,8 +144,8 @@ class MixtureDistribution(MultivariateDistribution):
     def refitted(self, samples: np.ndarray) -> "MixtureDistribution":
         """The mixture fitted to other samples (n, dim), with as many components, starting from this one."""
         z = np.clip(self.prior.to_normal(samples), -_LARGEST_SCORE, _LARGEST_SCORE)
-        fit, _ = _maximise(z, (self.weights, self.means, self.covariances), _REFIT_ITERATIONS)
-        return MixtureDistribution(self.prior, *fit, self.fit_error)
+        fitted = fit_normals(z, len(z), start=self._mixture)
+        return MixtureDistribution(self.prior, fitted.weights, fitted.means, fitted.covariances, self.fit_error)
 
     def _conditional(self, z: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Shares, means and standard deviations (n, n_components) of coordinate i, given the earlier ones in z."""
@@ -195,7 +190,7 @@ def fit_mixture(
     max_components : int
         Largest number of components.
     seed : int
-        Seed of the starts and of the resampling.
+        Seed of the resampling.
 
     Returns
     -------
@@ -236,26 +231,12 @@ def fit_mixture(
     effective = float(distinct if effective_sample_size is None else effective_sample_size)
     if not 1.0 <= effective:
         raise ValueError(f"effective_sample_size must be 1 or more; got {effective_sample_size!r}")
-    best = None
-    for n_components in range(1, max_components + 1):
-        n_parameters = n_components * (1 + dim + dim * (dim + 1) // 2) - 1
-        if effective < 10 * n_parameters and n_components > 1:
-            break
-        before = best
-        for _ in range(1 if n_components == 1 else _STARTS):
-            fit, log_likelihood = _maximise(z, _start(z, n_components, rng))
-            criterion = -2.0 * log_likelihood * effective / len(z) + n_parameters * np.log(effective)
-            if best is None or criterion < best[0]:
-                best = criterion, fit
-        if best is before:  # more components describe the samples no better
-            break
-    weights, means, covariances = best[1]
-    density = _log_mixture(z, weights, means, np.linalg.cholesky(covariances))
+    fitted = fit_normals(z, effective, int(max_components))
+    density = log_density(fitted, z)
     refits = []
     for _ in range(_REFITS):
         rows = rng.integers(len(z), size=max(round(effective), 2 * dim))
-        again, _ = _maximise(z[rows], best[1], _REFIT_ITERATIONS)
-        refits.append(_log_mixture(z, again[0], again[1], np.linalg.cholesky(again[2])))
+        refits.append(log_density(fit_normals(z[rows], effective, start=fitted), z))
     fit_error = np.sqrt(np.mean(np.var(refits, axis=0, ddof=1)))
     misfit = None
     if log_prob is not None:
@@ -267,7 +248,7 @@ def fit_mixture(
             )
         slope = np.atleast_1d(part.logpdf(chosen)) + 0.5 * np.square(z).sum(axis=1)
         misfit = float(np.std(log_prob - density - slope))
-    return MixtureDistribution(part, weights, means, covariances, fit_error, misfit)
+    return MixtureDistribution(part, fitted.weights, fitted.means, fitted.covariances, fit_error, misfit)
 
 
 def _check_independent(z: np.ndarray, names: Sequence[str]) -> None:
@@ -284,20 +265,6 @@ def _check_independent(z: np.ndarray, names: Sequence[str]) -> None:
         )
 
 
-def _log_mixture(z: np.ndarray, weights: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Logarithm of the density (n,) of a mixture at z (n, dim)."""
-    return np.logaddexp.reduce(_log_terms(z, weights, means, factors), axis=1)
-
-
-def _log_terms(z: np.ndarray, weights: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Logarithms of the weighted densities of the components, (n, n_components)."""
-    inverses = np.linalg.inv(factors)
-    squares = [np.square((z - mean) @ inverse.T).sum(axis=1) for mean, inverse in zip(means, inverses, strict=True)]
-    diagonals = np.diagonal(factors, axis1=1, axis2=2)
-    constants = np.log(weights) - np.log(diagonals).sum(axis=1) - 0.5 * z.shape[1] * _LOG_TWO_PI
-    return constants - 0.5 * np.stack(squares, axis=1)
-
-
 def _mixture_score(t: np.ndarray, shares: np.ndarray, means: np.ndarray, deviations: np.ndarray) -> np.ndarray:
     """Standard normal score of t (n,) under mixtures of one coordinate, accurate in both tails."""
     from scipy.special import ndtr, ndtri  # slow to import, and not needed for densities
@@ -305,43 +272,3 @@ def _mixture_score(t: np.ndarray, shares: np.ndarray, means: np.ndarray, deviati
     scores = (t[:, None] - means) / deviations
     below, above = (shares * ndtr(scores)).sum(axis=1), (shares * ndtr(-scores)).sum(axis=1)
     return np.where(below < above, ndtri(below), -ndtri(above))
-
-
-def _start(z: np.ndarray, n_components: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Start of the maximisation: samples as means, each chosen far from the earlier ones (k-means++)."""
-    covariance = np.atleast_2d(np.cov(z.T))
-    if n_components == 1:
-        return np.ones(1), z.mean(axis=0)[None], covariance[None]
-    scaled = z @ np.linalg.inv(np.linalg.cholesky(covariance)).T
-    rows = [int(rng.integers(len(z)))]
-    while len(rows) < n_components:
-        distance = np.min([np.square(scaled - scaled[row]).sum(axis=1) for row in rows], axis=0)
-        rows.append(int(rng.choice(len(z), p=distance / distance.sum())))
-    return np.full(n_components, 1.0 / n_components), z[rows], np.tile(covariance, (n_components, 1, 1))
-
-
-def _maximise(
-    z: np.ndarray, start: tuple[np.ndarray, np.ndarray, np.ndarray], iterations: int = _ITERATIONS
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float]:
-    """Expectation maximisation; returns weights, means and covariances, and the log-likelihood of the samples."""
-    weights, means, covariances = start
-    floor = 1e-6 * np.diag(np.var(z, axis=0) + 1e-12)  # keeps a component from shrinking to one sample
-    previous = -np.inf
-    for _ in range(iterations):
-        terms = _log_terms(z, weights, means, np.linalg.cholesky(covariances))
-        total = np.logaddexp.reduce(terms, axis=1)
-        log_likelihood = float(total.sum())
-        if log_likelihood - previous < _GAIN * len(z):
-            break
-        previous = log_likelihood
-        shares = np.exp(terms - total[:, None])
-        counts = shares.sum(axis=0) + 1e-10
-        weights = counts / counts.sum()
-        means = shares.T @ z / counts[:, None]
-        covariances = np.stack(
-            [
-                (share[:, None] * (z - mean)).T @ (z - mean) / n + floor
-                for share, mean, n in zip(shares.T, means, counts, strict=True)
-            ]
-        )
-    return (weights, means, covariances), log_likelihood

@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.estimates.pareto import LARGEST_SHAPE
+
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
@@ -25,8 +27,6 @@ __all__ = [
     "summary_sentences",
     "verdict_sentences",
 ]
-
-LARGEST_SHAPE = 0.7  # weights of a larger Pareto shape have no useful mean (Vehtari et al. 2024, JMLR 25(72))
 
 
 class DataSet(NamedTuple):

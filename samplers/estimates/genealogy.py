@@ -78,18 +78,7 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
     -------
     (ndim,) float
         In the units of the parameters; inf if all walkers have one founder.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
     """
-    chain, founders = np.asarray(chain, dtype=float), np.asarray(founders)
-    if chain.ndim != 3 or founders.shape != chain.shape[1:2] or chain.size == 0:
-        raise ValueError(
-            f"expected a chain (nsteps, nwalkers, ndim) and the founder of each walker (nwalkers,); got {chain.shape} "
-            f"and {founders.shape}"
-        )
     sums = _sums_of_groups(chain, founders)
     count = len(sums)
     if count == 1:

@@ -4,8 +4,8 @@ One proposal
 ------------
 A mixture fitted to a population is a proposal for independent points inside the support of the prior. The mean of
 posterior / proposal over the draws estimates the evidence without tempering, and without bias as long as the proposal
-was not fitted to the draws. The largest weights follow a generalised Pareto distribution. If its shape exceeds 0.7,
-points that were not drawn dominate the mean.
+was not fitted to the draws. The Pareto shape of the weights (`samplers.estimates.pareto`) says whether points that were
+not drawn dominate the mean.
 
 Rounds
 ------
@@ -26,8 +26,6 @@ References
 ----------
 Owen, A. B. & Zhou, Y. (2020), The square root rule for adaptive importance sampling, ACM Transactions on Modeling and
 Computer Simulation 30(2), doi:10.1145/3350426 (unbiased combinations of rounds)
-Vehtari, Simpson, Gelman, Yao & Gabry (2024), JMLR 25(72) (Pareto shape)
-Zhang & Stephens (2009), Technometrics 51(3), doi:10.1198/tech.2009.08017 (estimation of the shape)
 """
 
 from collections.abc import Callable, Sequence
@@ -39,6 +37,7 @@ from scipy import stats
 from scipy.special import gammaln
 
 from ..proposals.mixture import Mixture, draw
+from .pareto import LARGEST_SHAPE, pareto_shape, tail_size
 from .weights import effective_sample_size, log_mean_weight, normalised_weights
 
 __all__ = [
@@ -48,13 +47,11 @@ __all__ = [
     "Round",
     "draw_inside",
     "LARGEST_ERROR",
-    "LARGEST_SHAPE",
     "efficiencies",
     "evidence_from_weights",
     "expected_efficiency",
     "fewest_points",
     "fits_poorly",
-    "pareto_shape",
     "pool_rounds",
     "round_shares",
     "tail_growth",
@@ -66,8 +63,6 @@ __all__ = [
 
 # Levels of a normal distribution one and two standard deviations above its median.
 ONE_AND_TWO_SD = (0.8413, 0.9772)
-# Weights with a larger Pareto shape have no useful mean (Vehtari et al. 2024).
-LARGEST_SHAPE = 0.7
 # Log-evidences with a larger standard error distinguish hardly any models, and the same weights give the means.
 LARGEST_ERROR = 0.35
 # Fewer effective points, or fewer per parameter (and one more), do not determine means and covariances.
@@ -177,37 +172,6 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
     log_normal = np.expm1(min((two - one) ** 2, np.log1p(made))) / made if one > -np.inf else 0.0
     error = float(np.sqrt(max(1.0 / effective - 1.0 / made, log_normal)))
     return EvidenceCheck(log_evidence, error, effective, pareto_shape(log_weights), len(log_weights))
-
-
-def pareto_shape(log_weights: np.ndarray) -> float:
-    """Shape of the generalised Pareto distribution of the largest weights, given by their logarithms (n,).
-
-    The largest min(n / 5, 3 sqrt(n)) weights are used. The shape is -inf for weights without a tail, and inf for too
-    few weights.
-    """
-    finite = log_weights[log_weights > -np.inf]
-    n = len(log_weights)
-    count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
-    if count < 5 or len(finite) <= count:
-        return float("inf")
-    ordered = np.sort(np.exp(finite - finite.max()))
-    tail = ordered[-count:] - ordered[-count - 1]
-    if tail[-1] <= 1e-9:
-        return float("-inf")
-    tail = tail[tail > 0.0]
-    count = len(tail)
-    if count < 5:
-        return float("inf")
-    grid = 30 + int(np.sqrt(count))
-    quartile = tail[max(int(count / 4.0 + 0.5) - 1, 0)]
-    theta = 1.0 / tail[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
-    shapes = np.mean(np.log1p(-theta[:, None] * tail), axis=1)
-    profile = count * (np.log(-theta / shapes) - shapes - 1.0)
-    posterior = np.exp(profile - profile.max())
-    theta = float(theta @ posterior / posterior.sum())
-    shape = float(np.mean(np.log1p(-theta * tail)))
-    # a weak prior towards 0.5 stabilises the estimate from few weights (Vehtari et al. 2024)
-    return (count * shape + 5.0) / (count + 10.0)
 
 
 def expected_efficiency(ndim: int, dof: float, components: int, points: float) -> float:
@@ -397,8 +361,7 @@ def tail_shape(log_weights: np.ndarray) -> float:
     if not np.isfinite(shape):
         return max(shape, 0.0)
     ordered = np.sort(normalised_weights(log_weights))
-    n = len(ordered)
-    count = int(min(n / 5.0, 3.0 * np.sqrt(n)))
+    count = tail_size(len(ordered))
     excess = float((ordered[-count:] - ordered[-count - 1]).sum())
     return shape if excess >= SMALLEST_EXCESS else 0.0
 

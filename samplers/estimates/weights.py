@@ -38,7 +38,7 @@ LOWEST = -1.0 / np.finfo(float).eps
 
 def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     """Weights divided by their maximum, and the logarithm of the maximum."""
-    top = float(np.max(log_weights))
+    top = float(np.max(log_weights, initial=-np.inf))
     if top == -np.inf:
         return np.zeros(len(log_weights)), top
     return np.exp(log_weights - top), top
@@ -79,7 +79,7 @@ def coarse_weights(log_weights: np.ndarray) -> np.ndarray:
 
 
 def effective_sample_size(log_weights: np.ndarray) -> float:
-    """(sum w)^2 / sum w^2 from log-weights (n,); 0 if all weights are zero."""
+    """(sum w)^2 / sum w^2 from log-weights (n,); 0 without a positive weight."""
     weights, top = _scaled(log_weights)
     if top == -np.inf:
         return 0.0

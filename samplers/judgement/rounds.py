@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..estimates.control_variates import unreached_share
-from ..estimates.importance import LARGEST_SHAPE, EvidenceCheck, KnownDensity, PooledRounds, Round
+from ..estimates.importance import EvidenceCheck, KnownDensity, PooledRounds, Round
+from ..estimates.pareto import LARGEST_SHAPE
 
 __all__ = [
     "LIGHT_TAILS",

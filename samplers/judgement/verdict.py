@@ -19,14 +19,14 @@ import numpy as np
 from ..estimates.genealogy import standard_error_of_mean, worst_effective_sample_size
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
-    LARGEST_SHAPE,
     USABLE_SHARE,
     fewest_points,
     usable,
 )
+from ..estimates.pareto import LARGEST_SHAPE
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound
+from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
-from .modes import Mode, find_modes
 
 __all__ = [
     "CONVERGED",
@@ -181,9 +181,9 @@ class Verdict(_Stored):
         return self._parts.near
 
     @cached_property
-    def modes(self) -> tuple[Mode, ...]:
+    def modes(self) -> tuple[Cluster, ...]:
         """Modes in which the run has points, with shares and their standard errors, the largest first."""
-        return find_modes(self._chain, self._founders)
+        return find_clusters(self._chain, self._founders)
 
     @cached_property
     def worst_effective_sample_size(self) -> float:

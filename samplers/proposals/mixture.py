@@ -41,6 +41,7 @@ __all__ = [
     "Mixture",
     "draw",
     "fit_mixture",
+    "fit_normals",
     "from_component_space",
     "invert_roots",
     "location_and_root",
@@ -54,11 +55,9 @@ __all__ = [
 DOF = 6.0
 # Fewer degrees of freedom that are tried in this order, for points with heavier tails. They must be above 2.
 HEAVIER = (4.0, 3.0, 2.5)
-# Limits of expectation-maximisation: iterations of a fit, iterations of a trial, and the gain in mean log-likelihood
-# below which a fit stops.
-ITERATIONS = 30
-TRIAL_ITERATIONS = 4
-TOLERANCE = 1e-3
+# Limits of expectation-maximisation: number of iterations, and gain in mean log-likelihood below which it stops. For a
+# proposal, a trial of one, the density of a population, and another such fit that starts near its end.
+PROPOSAL, TRIAL, ACCURATE, AGAIN = (30, 1e-3), (4, 1e-3), (100, 1e-6), (20, 1e-6)
 # Added to the diagonal of the pooled covariance of the whitened points.
 RIDGE = 1e-10
 # Points with less than this share of the mean weight are left out of the fit.
@@ -76,7 +75,7 @@ SMALLEST_SD = 1e-150
 
 
 class Mixture(NamedTuple):
-    """A mixture of K multivariate Student t.
+    """A mixture of K multivariate Student t, or of normal distributions for infinite degrees of freedom.
 
     Attributes
     ----------
@@ -105,6 +104,11 @@ class Mixture(NamedTuple):
     shears: tuple[Shear, ...] = ()
     bounds: SupportBounds | None = None
 
+    @property
+    def covariances(self) -> np.ndarray:
+        """Scale matrices of the components, shape (K, ndim, ndim)."""
+        return self.roots @ self.roots.transpose(0, 2, 1)
+
 
 def _distances(mixture: Mixture, coords: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distances (n, K)."""
@@ -116,15 +120,20 @@ def _component_log_densities(mixture: Mixture, distances: np.ndarray) -> np.ndar
     """Log of weight times density (n, K) of each component, from squared Mahalanobis distances (n, K)."""
     ndim, dof = mixture.means.shape[1], mixture.dof
     log_root = np.log(np.diagonal(mixture.roots, axis1=1, axis2=2)).sum(axis=1)
-    powers = distances / dof
-    np.log1p(powers, out=powers)
-    powers *= 0.5 * (dof + ndim)
+    if dof == math.inf:
+        powers = 0.5 * distances
+    else:
+        powers = distances / dof
+        np.log1p(powers, out=powers)
+        powers *= 0.5 * (dof + ndim)
     return np.log(mixture.weights) + _log_constant(ndim, dof) - log_root - powers
 
 
 @cache
 def _log_constant(ndim: int, dof: float) -> float:
-    """Log density of the standard multivariate Student t at its location."""
+    """Log density of the standard multivariate Student t at its location; the standard normal density for dof = inf."""
+    if dof == math.inf:
+        return -0.5 * ndim * math.log(2.0 * math.pi)
     return float(gammaln(0.5 * (dof + ndim)) - gammaln(0.5 * dof)) - 0.5 * ndim * math.log(dof * math.pi)
 
 
@@ -226,6 +235,21 @@ def fit_mixture(
     return mixture
 
 
+def fit_normals(coords: np.ndarray, effective: float, max_components: int = 6, start: Mixture | None = None) -> Mixture:
+    """Fit a mixture of normal distributions to points (n, ndim) of equal weight, accurately enough for a density.
+
+    `effective` is the number of independent points. The number of components minimises the Bayesian information
+    criterion; with a `start`, it is the number of its components, from which the fit starts.
+    """
+    weights = np.full(len(coords), 1.0 / len(coords))
+    if start is not None:
+        responsibilities = np.exp(log_responsibilities(start, coords))
+        mean, root = location_and_root(coords, weights)
+        white = (coords - mean) @ invert_roots(root[None])[0].T
+        return _unwhitened(_maximise(white, weights, effective, responsibilities, math.inf, AGAIN)[0], mean, root)
+    return _fit_components((), coords, weights, max_components, math.inf, effective, ACCURATE)[0]
+
+
 def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:
     """Fit a mixture, with shears if they improve the criterion; return it with its criterion."""
     shears = find_shears(coords, weights)
@@ -239,7 +263,13 @@ def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: in
 
 
 def _fit_components(
-    shears: tuple[Shear, ...], coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float
+    shears: tuple[Shear, ...],
+    coords: np.ndarray,
+    weights: np.ndarray,
+    max_components: int,
+    dof: float,
+    effective: float | None = None,
+    limits: tuple[int, float] = PROPOSAL,
 ) -> tuple[Mixture, float]:
     """Fit a mixture to points transformed by given shears; return it with its criterion."""
     coords = apply_shears(shears, coords)
@@ -247,10 +277,10 @@ def _fit_components(
     kept = weights > NEGLIGIBLE / len(weights)
     weights = weights[kept] / weights[kept].sum()
     white = (coords[kept] - mean) @ invert_roots(root[None])[0].T
-    effective = 1.0 / (weights @ weights)
+    effective = 1.0 / (weights @ weights) if effective is None else effective
     ndim = white.shape[1]
 
-    best, log_likelihood = _maximise(white, weights, effective, np.ones((len(white), 1)), dof)
+    best, log_likelihood = _maximise(white, weights, effective, np.ones((len(white), 1)), dof, limits)
     best_criterion = _criterion(1, ndim, effective, log_likelihood)
     for count in range(2, max_components + 1):
         if effective < count * (ndim + 2):
@@ -258,21 +288,27 @@ def _fit_components(
         starts = _splits(best, white, weights)
         if not starts:
             break
-        tried = [
-            _maximise(white, weights, effective, responsibilities, dof, TRIAL_ITERATIONS) for responsibilities in starts
-        ]
+        tried = [_maximise(white, weights, effective, responsibilities, dof, TRIAL) for responsibilities in starts]
         found, _ = max(tried, key=lambda trial: trial[1])
-        found, log_likelihood = _maximise(white, weights, effective, np.exp(log_responsibilities(found, white)), dof)
+        found, log_likelihood = _maximise(
+            white, weights, effective, np.exp(log_responsibilities(found, white)), dof, limits
+        )
         criterion = _criterion(len(found.weights), ndim, effective, log_likelihood)
         if criterion >= best_criterion:
             break
         best, best_criterion = found, criterion
-    best, best_criterion = _with_heavier_tails(best, best_criterion, white, weights, effective)
+    if dof < math.inf:
+        best, best_criterion = _with_heavier_tails(best, best_criterion, white, weights, effective)
 
-    roots = root @ best.roots
-    mixture = Mixture(best.weights, mean + best.means @ root.T, roots, invert_roots(roots), best.dof, shears)
+    mixture = _unwhitened(best, mean, root)._replace(shears=shears)
     volume = 2.0 * effective * float(np.sum(np.log(root.diagonal())))
     return mixture, best_criterion + volume + len(shears) * PARAMETERS_PER_SHEAR * math.log(max(effective, 2.0))
+
+
+def _unwhitened(mixture: Mixture, mean: np.ndarray, root: np.ndarray) -> Mixture:
+    """A mixture of points that were whitened with a mean and a root, in the coordinates before."""
+    roots = root @ mixture.roots
+    return Mixture(mixture.weights, mean + mixture.means @ root.T, roots, invert_roots(roots), mixture.dof)
 
 
 def _with_heavier_tails(
@@ -344,23 +380,24 @@ def _maximise(
     effective: float,
     responsibilities: np.ndarray,
     dof: float,
-    iterations: int = ITERATIONS,
+    limits: tuple[int, float] = PROPOSAL,
 ) -> tuple[Mixture, float]:
     """Expectation-maximisation from initial responsibilities (n, K); return the mixture and its mean log-likelihood."""
     ndim = white.shape[1]
     stretch = np.ones_like(responsibilities)
     last = -np.inf
+    iterations, tolerance = limits
     for _ in range(iterations):
         mixture = _components(white, weights, effective, responsibilities, stretch, dof)
         distances = _distances(mixture, white)
         parts = _component_log_densities(mixture, distances)
         total = _log_sum(parts)
         log_likelihood = float(weights @ total)
-        if log_likelihood - last < TOLERANCE:
+        if log_likelihood - last < tolerance:
             break
         last = log_likelihood
         responsibilities = np.exp(parts - total[:, None])
-        stretch = (dof + ndim) / (dof + distances)
+        stretch = (dof + ndim) / (dof + distances) if dof < math.inf else np.ones_like(distances)
     return mixture, log_likelihood
 
 

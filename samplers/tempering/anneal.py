@@ -26,8 +26,8 @@ from ..estimates.importance import (
     draw_inside,
     evidence_from_weights,
     fits_poorly,
-    pareto_shape,
 )
+from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
 from ..judgement.checks import (
     check_annealing,

@@ -25,7 +25,6 @@ from ..budget import Budget
 from ..estimates.control_variates import SignedSample, signed_sample
 from ..estimates.importance import (
     FIRST_ROUND_SHARE,
-    LARGEST_SHAPE,
     USABLE_SHARE,
     KnownDensity,
     PooledRounds,
@@ -34,6 +33,7 @@ from ..estimates.importance import (
     tails_are_light,
     usable,
 )
+from ..estimates.pareto import LARGEST_SHAPE
 from ..judgement.rounds import (
     LIGHT_TAILS,
     UNREACHED,

@@ -7,7 +7,7 @@ import numpy as np
 from ..estimates.control_variates import SignedSample
 from ..estimates.importance import EvidenceCheck
 from ..judgement.checks import check_evidence
-from ..judgement.modes import find_modes
+from ..judgement.clusters import find_clusters
 from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
 from .population import Density, Population
 
@@ -66,7 +66,7 @@ class Recording:
         if stop is not None and not stop.complete:
             return  # its points are judged by their weights
         founders = np.arange(len(coords)) if result.founders is None else result.founders
-        several, error = len(find_modes(coords[None], founders)) > 1, result.ladder[-1].log_evidence_error
+        several, error = len(find_clusters(coords[None], founders)) > 1, result.ladder[-1].log_evidence_error
         for concern in check_evidence(result.log_evidence_ladder, error, result.check, several):
             warn(concern.message)
             self.result = self.result._replace(findings=(*self.result.findings, concern))

@@ -544,6 +544,8 @@ def test_summary_with_the_error_of_the_mean():
     assert np.array_equal(result.mean_error, sampler.mean_error())
     rows = str(result).splitlines()
     assert "MC error" in rows[0] and f"{result.mean_error[2]:.2g}" in rows[3].split()
+    with pytest.raises(ValueError, match="discard below the number of stored steps; got discard=99"):
+        sampler.mean_error(discard=99)
     with pytest.raises(ValueError, match="mean_error must be 3"):
         summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])
 

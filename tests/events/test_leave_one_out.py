@@ -19,7 +19,7 @@ from fe_likelihoods import (
     leave_one_out,
 )
 from fe_likelihoods.events.hierarchy_checks import check_hierarchy
-from fe_likelihoods.events.pareto_smoothing import smoothed_weights
+from samplers.estimates.pareto import smoothed_weights
 
 module = importlib.import_module("fe_likelihoods.events.leave_one_out")
 ERROR, WIDE = 0.2, 2.0  # standard deviations of a measurement and of the prior of a test
@@ -273,21 +273,6 @@ def test_the_density_without_a_test_is_known_where_the_test_is_impossible():
     rest = posterior.without("C").log_prob(points)
     np.testing.assert_allclose(module._log_prob(posterior, 2, 0.0, points), rest)
     np.testing.assert_allclose(module._log_prob(posterior, 2, 0.5, points), [-np.inf, rest[1] + 0.5 * own[1]])
-
-
-def test_bridge_between_a_density_and_its_part(rng):
-    """A standard normal density and its part above one: the ratio is the probability of that part."""
-    upper = np.zeros(2000)
-    ratios, errors = [], []
-    for _ in range(50):
-        lower = np.where(rng.standard_normal(2000) > 1.0, 0.0, -np.inf)
-        ratio, error = module._bridge(upper, lower)
-        ratios.append(ratio)
-        errors.append(error)
-    exact = stats.norm.logsf(1.0)
-    assert abs(np.mean(ratios) - exact) < 4.0 * np.std(ratios, ddof=1) / np.sqrt(50)
-    assert np.mean(errors) == pytest.approx(np.std(ratios, ddof=1), rel=0.4)
-    assert np.isnan(module._bridge(upper, np.full(10, -np.inf))).all()
 
 
 @pytest.mark.slow

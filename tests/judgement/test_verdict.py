@@ -6,7 +6,7 @@ import pytest
 
 from samplers import SMCSampler, compare_models, ladder_table
 from samplers.estimates.genealogy import worst_effective_sample_size
-from samplers.judgement.modes import find_modes
+from samplers.judgement.clusters import find_clusters
 from samplers.judgement.verdict import Verdict
 from tests.statistics import analytic_posteriors as analytic
 
@@ -52,7 +52,7 @@ def test_one_mode_stays_one(posterior):
 def test_walkers_that_agree_in_a_parameter_are_one_mode(rng):
     chain = rng.standard_normal((2, 50, 3))
     chain[:, :, 1] = 4.0
-    (mode,) = find_modes(chain, np.arange(50))
+    (mode,) = find_clusters(chain, np.arange(50))
     assert mode.share == 1.0
     assert mode.sd[1] == 0.0
 

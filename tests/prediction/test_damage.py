@@ -198,6 +198,8 @@ def test_a_limit_may_differ_between_the_samples_of_which_some_failed():
         damage(found, [LimitState("reached", "peak drift", np.ones(3))])
     with pytest.raises(ValueError, match="measures are peak drift, residual drift"):
         damage(found, [LimitState("reached", "bar tension", 0.1)])
+    with pytest.raises(ValueError, match="level must be between 0 and 1; got 95"):
+        damage(found, limits, level=95)
 
 
 def test_a_bridge_on_bearings_has_the_measures_of_its_channels():

@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from samplers import MixtureMove
-from samplers.proposals.mixture import draw, fit_mixture, log_density, log_responsibilities
+from samplers.proposals.mixture import draw, fit_mixture, fit_normals, log_density, log_responsibilities
 from samplers.proposals.transforms import (
     SupportBounds,
     apply_shears,
@@ -263,3 +263,23 @@ def test_a_population_of_few_different_points_gives_finite_mixtures(rng, distinc
     mixture = fit_mixture(coords, weights)
     assert np.isfinite(mixture.means).all() and np.isfinite(mixture.roots).all()
     assert np.isfinite(draw(mixture, 20, np.random.RandomState(1))).all()
+
+
+@pytest.mark.parametrize("copies", [1, 5])
+def test_normal_components_describe_two_groups_of_points_with_copies(copies, rng):
+    """The mean log-density of fresh points is below the true one by what 55 fitted numbers cost: 55 / (2 * 300)."""
+
+    def points(n):
+        return 0.5 * rng.standard_normal((n, 6)) + 4.0 * np.outer(rng.random(n) < 0.3, np.eye(6)[0])
+
+    def log_true(x):
+        shares = (0.7, 0.0), (0.3, 4.0)
+        groups = [np.log(share) + stats.norm(at * np.eye(6)[0], 0.5).logpdf(x).sum(axis=1) for share, at in shares]
+        return np.logaddexp(*groups)
+
+    mixture = fit_normals(np.repeat(points(300), copies, axis=0), 300.0)
+    assert len(mixture.weights) == 2
+    fresh = points(4000)
+    assert (log_true(fresh) - log_density(mixture, fresh)).mean() == pytest.approx(0.09, abs=0.04)
+    again = fit_normals(points(300), 300.0, start=mixture)
+    np.testing.assert_allclose(again.weights, mixture.weights, atol=0.15)

@@ -71,11 +71,8 @@ def test_founders_are_followed_while_there_are_enough(rng):
     assert len(few) == 1 and set(few[0]) == {3, 7}
 
 
-def test_wrong_shapes_are_refused():
-    assert np.all(standard_error_of_mean(np.zeros((2, 5, 3)), np.zeros(5)) == np.inf)
-    for chain, founders in ((np.zeros((5, 3)), np.arange(5)), (np.zeros((2, 5, 3)), np.arange(4))):
-        with pytest.raises(ValueError, match="the founder of each walker"):
-            standard_error_of_mean(chain, founders)
+def test_one_founder_gives_no_error():
+    assert np.all(standard_error_of_mean(np.zeros((2, 5, 3)), np.zeros(5, dtype=int)) == np.inf)
 
 
 def scores(posterior, samplers, stated):

@@ -17,15 +17,15 @@ from scipy.sparse.csgraph import connected_components
 from ..estimates.genealogy import standard_error_of_mean
 from ..proposals.mixture import Mixture, fit_mixture, log_density, log_responsibilities
 
-__all__ = ["Mode", "find_modes"]
+__all__ = ["Cluster", "find_clusters"]
 
 # ratio of the density in the valley between two modes to the density of the lower mode
 DEEPEST_VALLEY = 0.2
 POINTS_OF_LINE = 33
 
 
-class Mode(NamedTuple):
-    """A mode of the posterior.
+class Cluster(NamedTuple):
+    """A mode of the posterior, as a cluster of the points of a run.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Mode(NamedTuple):
     sd: np.ndarray
 
 
-def find_modes(chain: np.ndarray, founders: np.ndarray) -> tuple[Mode, ...]:
+def find_clusters(chain: np.ndarray, founders: np.ndarray) -> tuple[Cluster, ...]:
     """Modes of a chain, the largest first.
 
     Parameters
@@ -55,13 +55,13 @@ def find_modes(chain: np.ndarray, founders: np.ndarray) -> tuple[Mode, ...]:
 
     Returns
     -------
-    tuple of Mode
+    tuple of Cluster
         The shares sum to 1.
     """
     nsteps, nwalkers, ndim = chain.shape
     flat = chain.reshape(-1, ndim)
     if np.any(np.ptp(chain[-1], axis=0) == 0.0):  # nothing to fit: all walkers agree in a parameter
-        return (Mode(1.0, 0.0, flat.mean(axis=0), flat.std(axis=0)),)
+        return (Cluster(1.0, 0.0, flat.mean(axis=0), flat.std(axis=0)),)
     mixture = fit_mixture(chain[-1], np.full(nwalkers, 1.0 / nwalkers))
     groups = _groups(mixture)
     count = groups.max() + 1
@@ -73,7 +73,7 @@ def find_modes(chain: np.ndarray, founders: np.ndarray) -> tuple[Mode, ...]:
         total = weights.sum()
         mean = weights @ flat / total
         sd = np.sqrt(weights @ (flat - mean) ** 2 / total)
-        modes.append(Mode(float(total / len(flat)), float(error), mean, sd))
+        modes.append(Cluster(float(total / len(flat)), float(error), mean, sd))
     return tuple(sorted(modes, key=lambda mode: -mode.share))
 
 

@@ -1,10 +1,17 @@
-"""Smoothed importance weights: known expectations, and the same numbers as arviz."""
+"""Tails of importance weights: known shapes and expectations, and the same numbers as arviz."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from fe_likelihoods.events.pareto_smoothing import smoothed_weights
+from samplers.estimates.pareto import pareto_shape, smoothed_weights
+
+
+def test_pareto_shape_of_known_tails(rng):
+    assert pareto_shape(np.log(rng.pareto(1.0 / 0.8, 20_000))) == pytest.approx(0.8, abs=0.15)
+    assert pareto_shape(np.log(rng.exponential(size=20_000))) == pytest.approx(0.0, abs=0.15)
+    assert pareto_shape(np.zeros(1000)) == -np.inf
+    assert pareto_shape(np.zeros(24)) == np.inf  # too few weights
 
 
 def test_smoothed_weights_and_shape_are_those_of_arviz(rng):
