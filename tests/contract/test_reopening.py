@@ -146,9 +146,9 @@ def interrupted(kind, path):
     return sampler
 
 
-@pytest.mark.parametrize("of", ["backend", "sampler"])
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", MARKED)
+@pytest.mark.parametrize(
+    ("kind", "finished", "of"), covering(list(KINDS), [True, False], ["backend", "sampler"], strength=1)
+)
 def test_reset_begins_anew(kind, finished, of, tmp_path):
     """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
     path = tmp_path / "run.h5"
@@ -173,9 +173,7 @@ def test_reset_begins_anew(kind, finished, of, tmp_path):
         assert same(make(kind, path, Counted("other", centre=0.3)), new)
 
 
-@pytest.mark.parametrize("in_file", [True, False])
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize(("kind", "finished", "in_file"), covering(OURS, [True, False], [True, False], strength=1))
 def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished, in_file, tmp_path):
     path = tmp_path / "run.h5"
     sampler = make(kind, path if in_file else None, Counted(interrupt_at=None if finished else N + 5))
@@ -193,7 +191,7 @@ def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished,
     assert sampler.iteration == 3 and sampler.evaluations > evaluations
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, whole_run):
     whole = whole_run(kind, 2, 2)
     for given in (None, "state", "draws"):
@@ -205,7 +203,7 @@ def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, w
         assert np.array_equal(sampler.get_chain(), whole.get_chain()[2:])
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     sampler = make(kind, tmp_path / "run.h5", Counted())
@@ -218,7 +216,7 @@ def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
     assert sampler.iteration == 1
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", MARKED[1:])
 def test_reset_of_the_backend_of_a_living_sampler(kind, tmp_path, whole_run):
     """The chain goes on as after a reset of the sampler, and its file can be opened again."""
     sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -243,8 +241,7 @@ def test_another_function_on_a_backend_in_memory_is_refused(kind):
         other.run_mcmc(None, 1)
 
 
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "finished"), covering(list(KINDS), [True, False], strength=1))
 def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_path):
     path = tmp_path / "run.h5"
     begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
