@@ -336,12 +336,10 @@ def test_negative_parameters_fail(rng, name):
     [
         ({"record": np.zeros(10)}, "Record"),
         ({"step": 0.3e-3}, "divides the record's 0.005"),
-        ({"step": 0.01}, "divides"),
         ({"step": -1.0}, "positive step"),
         ({"outputs": ("Ub_1", "Ub_3")}, "Ub_3"),
         ({"outputs": 7}, "5, 6 or 10"),
         ({"outputs": ("Ub_1", "Ub_1")}, "once"),
-        ({"outputs": "Ub_1"}, "outputs"),
         ({"parameters": ("fmin",)}, "fmin_1"),
         ({"friction": "smooth"}, "bouc-wen"),
         ({"piers": (Pier(),)}, "two of Pier"),
