@@ -2,6 +2,7 @@
 
 import emcee
 import numpy as np
+import pytest
 
 from fe_likelihoods import (
     Channel,
