@@ -162,7 +162,7 @@ def shaken(theta, record, n_steps):
     return LinearOscillator(record).simulate([*theta, 1.0])[1:, :n_steps]
 
 
-@pytest.mark.parametrize("isolated", [False, True])
+@pytest.mark.parametrize("isolated", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("function", [vibrates, required])
 def test_a_function_of_the_number_of_samples(function, isolated):
     model = FunctionModel(function, ("a",), CHANNEL, 0.02, 300, jacobian=slopes, isolated=isolated)
