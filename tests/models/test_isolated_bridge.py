@@ -290,6 +290,7 @@ def test_fingerprint_changes_with_what_changes_the_response(rng):
     assert model.fingerprint == replace(model).fingerprint
 
 
+@pytest.mark.slow
 def test_thousand_draws_of_the_prior(rng):
     model = IsolatedBridge(shaking(rng, duration=5.0), outputs=("Ub_1", "acc_p1"), step=0.5e-3)
     thetas = np.clip(rng.normal(1.0, 0.5, (1000, 10)), 0.2, 2.5)
