@@ -17,7 +17,10 @@ def test_the_same_script_goes_on_after_every_kill(kind):
     assert not messages
 
 
-@pytest.mark.parametrize(("kind", "places"), [("smc", ["create_dataset blobs", "has_blobs"]), ("reset", ["has_blobs"])])
+@pytest.mark.parametrize(
+    ("kind", "places"),
+    [("smc", ["create_dataset blobs", "has_blobs"]), pytest.param("reset", ["has_blobs"], marks=pytest.mark.slow)],
+)
 def test_a_half_made_dataset_of_blobs_is_made_again(kind, places):
     kills, messages = kill_everywhere(kind, places)
     assert kills >= len(places) and not messages
