@@ -29,6 +29,7 @@ def test_client_agrees_with_quadrature(name, client_named, answer, seed):
     check(client_named(name).run(make_posterior(), seed), answer)
 
 
+@pytest.mark.slow
 def test_wrong_prior_is_detected(client_named, answer, seed):
     """Negative control: a prior with another mean and without its upper bound fails the check."""
     wrong = make_posterior(PRIOR | {"damping": TruncatedNormal(1.0, 0.8, lower=0.7)})

@@ -129,7 +129,7 @@ def shares(n_flat: int, prior: str, rng: np.random.Generator) -> dict[str, Store
     ("prior", "scale", "is_right"),
     [
         pytest.param("uniform", "linear", False, marks=pytest.mark.slow),
-        ("uniform", "logit", False),
+        pytest.param("uniform", "logit", False, marks=pytest.mark.slow),
         ("logit-normal", "logit", True),
     ],
 )

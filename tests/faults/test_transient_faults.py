@@ -356,7 +356,7 @@ class Copies:
         return map(pickle.loads(pickle.dumps(function)), items)
 
 
-@pytest.mark.parametrize("what", ["disk", "death"])
+@pytest.mark.parametrize("what", ["disk", pytest.param("death", marks=pytest.mark.slow)])
 def test_faults_in_the_pool_of_a_sampler_are_in_its_records(what, seed):
     """The records of the posterior are those of its copy in a worker, and a worker that dies has none."""
     points = np.random.default_rng(seed).uniform(0.2, 0.8, size=(20, 3))

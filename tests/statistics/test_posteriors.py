@@ -154,7 +154,7 @@ def test_flat_likelihood(seed):
     assert within(deviations(samplers, [0.5, 1.5]), samplers)
 
 
-@pytest.mark.parametrize("recycle", [recycling, moves])
+@pytest.mark.parametrize("recycle", [recycling, slow_moves])
 def test_very_informative_likelihood(recycle, seed):
     """The posterior is a hundred thousand times narrower than the prior."""
     posterior = Gaussian(2, sd=1e-5)
