@@ -417,6 +417,7 @@ def test_invalid_share_is_refused(share):
         third(max_failure_share=share)
 
 
+@pytest.mark.slow
 def test_sampler_with_a_sandboxed_model_that_crashes_and_hangs(seed):
     """Parts of the prior crash or hang: the run ends, and the report has both reasons."""
     posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))

@@ -196,6 +196,7 @@ def sleeps(theta):
     return line(theta)
 
 
+@pytest.mark.slow
 def test_a_function_that_is_stopped_is_run_again_with_a_longer_limit(tmp_path):
     x = np.array([[0.3, 0.1]])
     short = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.005), tmp_path / "c.sqlite")
