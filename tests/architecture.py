@@ -1,15 +1,11 @@
-"""The structure of the two packages, read from their source: ``python -m tests.architecture [ROOT]``.
+"""Imports within the two packages, read from their source: for `tests.test_architecture`.
 
-Prints the graph of imports of each package and the sizes that grow when a package loses its shape. A node of the graph
-is an entry at the top of the package, a folder or a module. Every import counts: at the top of a module, inside a
-function, and under ``TYPE_CHECKING``. ROOT is the folder of another version of the project, for a comparison.
+A node of a graph is an entry at the top of a package, a folder or a module. Every import counts: at the top of a
+module, inside a function, and under ``TYPE_CHECKING``.
 """
 
-import argparse
 import ast
 import functools
-import graphlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +19,6 @@ __all__ = [
     "ROOT",
     "Graph",
     "Import",
-    "foreign_reads",
     "imports",
     "module_cycles",
     "modules",
@@ -70,41 +65,20 @@ ORDER = {
         ("blobs", "emcee_internals", "interrupts", "resampling"),
     ),
 }
-FOREIGN = ("hasattr", "getattr")
 
 
 class Import(NamedTuple):
-    """One imported name.
-
-    Attributes
-    ----------
-    name : str
-        Full dotted name, ``samplers.tempering.weights.Stage``.
-    at_top : bool
-        Whether it is imported when its module is: neither inside a function nor under ``TYPE_CHECKING``.
-    """
+    """Full name of an import, and whether it is neither inside a function nor under ``TYPE_CHECKING``."""
 
     name: str
     at_top: bool
 
 
 class Graph(NamedTuple):
-    """The imports between the entries of a package.
-
-    Attributes
-    ----------
-    nodes : tuple of str
-    edges : set of (str, str)
-        An entry, and one that it imports from.
-    layers : tuple of tuple of str
-        Entries that import only from layers before their own; empty if there is a cycle.
-    cycles : list of tuple of str
-        Entries that import each other, directly or by way of others.
-    """
+    """The imports between the entries of a package: pairs of an entry and one that it imports from, and circles."""
 
     nodes: tuple[str, ...]
     edges: set[tuple[str, str]]
-    layers: tuple[tuple[str, ...], ...]
     cycles: list[tuple[str, ...]]
 
 
@@ -173,16 +147,7 @@ def package_graph(package: str, root: Path = ROOT) -> Graph:
             if names[0] == package and len(names) > 1 and names[1] != parts[0]:
                 edges.add((parts[0], names[1]))
     edges = {(a, b) for a, b in edges if b in nodes}
-    cycles = _strong_components(sorted(nodes), edges)
-    layers = []
-    if not cycles:
-        sorter = graphlib.TopologicalSorter({node: {b for a, b in edges if a == node} for node in sorted(nodes)})
-        sorter.prepare()
-        while sorter.is_active():
-            ready = tuple(sorted(sorter.get_ready()))
-            layers.append(ready)
-            sorter.done(*ready)
-    return Graph(tuple(sorted(nodes)), edges, tuple(layers), cycles)
+    return Graph(tuple(sorted(nodes)), edges, _strong_components(sorted(nodes), edges))
 
 
 def module_cycles(root: Path = ROOT) -> list[tuple[str, ...]]:
@@ -196,26 +161,6 @@ def module_cycles(root: Path = ROOT) -> list[tuple[str, ...]]:
             if target in names and target != name:
                 edges.add((name, target))
     return _strong_components(sorted(names), edges)
-
-
-def _classes(root: Path) -> Iterator[tuple[str, int, int]]:
-    """Name, number of methods and number of lines of every class."""
-    for path in modules(root):
-        for node in ast.walk(tree_of(path)):
-            if isinstance(node, ast.ClassDef):
-                methods = sum(isinstance(inner, ast.FunctionDef) for inner in node.body)
-                yield f"{path.relative_to(root)}: {node.name}", methods, node.end_lineno - node.lineno + 1
-
-
-def foreign_reads(root: Path = ROOT) -> dict[str, int]:
-    """Calls of hasattr and getattr, by file."""
-    counts = {}
-    for path in modules(root):
-        calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
-        count = sum(isinstance(call.func, ast.Name) and call.func.id in FOREIGN for call in calls)
-        if count:
-            counts[str(path.relative_to(root))] = count
-    return counts
 
 
 def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
@@ -245,40 +190,3 @@ def second_defaults(root: Path = ROOT) -> dict[str, list[str]]:
                 for name in names:
                     places.setdefault(name, []).append(cls.name)
     return {name: places[name] for name in sorted(settings) if len(places[name]) > 1}
-
-
-def main() -> None:
-    """Print the graphs and the sizes."""
-    parser = argparse.ArgumentParser(prog="python -m tests.architecture", description=__doc__)
-    parser.add_argument("root", nargs="?", type=Path, default=ROOT)
-    root = parser.parse_args().root.resolve()
-    for package in PACKAGES:
-        graph = package_graph(package, root)
-        found = f"{len(graph.nodes)} nodes, {len(graph.edges)} edges, {len(graph.layers)} layers, "
-        print(f"{package}: {found}{len(graph.cycles)} cycles")
-        for i, layer in enumerate(graph.layers):
-            print(f"  layer {i}: {', '.join(layer)}")
-        for cycle in graph.cycles:
-            print(f"  cycle of {len(cycle)}: {', '.join(cycle)}")
-    cycles = module_cycles(root)
-    print(
-        f"cycles of modules: {len(cycles)}", *(f"  of {len(cycle)}: {', '.join(cycle)}" for cycle in cycles), sep="\n"
-    )
-    lengths = {str(path.relative_to(root)): len(path.read_text().splitlines()) for path in modules(root)}
-    print(f"modules: {len(lengths)}; the longest:")
-    for name, length in sorted(lengths.items(), key=lambda item: -item[1])[:8]:
-        print(f"  {length:4d} lines  {name}")
-    print("the classes with most methods:")
-    for name, methods, lines in sorted(_classes(root), key=lambda item: -item[1])[:5]:
-        print(f"  {methods:3d} methods, {lines:4d} lines  {name}")
-    print("the longest classes:")
-    for name, methods, lines in sorted(_classes(root), key=lambda item: -item[2])[:5]:
-        print(f"  {methods:3d} methods, {lines:4d} lines  {name}")
-    reads = foreign_reads(root)
-    print(f"calls of {' and '.join(FOREIGN)}: {sum(reads.values())} in {len(reads)} files")
-    doubled = second_defaults(root)
-    print(f"settings with a second default: {len(doubled)}", *(f"({', '.join(doubled)})" for _ in [0] if doubled))
-
-
-if __name__ == "__main__":
-    main()

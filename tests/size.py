@@ -90,10 +90,6 @@ def stack_to(name: str) -> list[str]:
     return files[:found]
 
 
-def is_ours(file: str, *packages: str) -> bool:
-    return any(f"/{package}/" in file for package in packages)
-
-
 def describe(stacks: list[list[str]], package: str) -> str:
     """Frames and distinct files of the deepest stack."""
     stack = max(stacks, key=len)

@@ -41,16 +41,6 @@ def test_api_pages_have_every_module(tmp_path):
     assert documented == {name for name in modules if not name.rpartition(".")[2].startswith("_")}
 
 
-def test_every_page_is_in_a_toctree():
-    generated = {"tutorials/index"}
-    for folder in (DOCS, DOCS / "theory"):
-        pages = {page.stem for page in folder.glob("*.rst")} - {"index"}
-        listed = {entry for page in folder.glob("*.rst") for entry in toctree(page)}
-        listed = {entry for entry in listed if not entry.startswith("api/")} - generated
-        assert {entry for entry in listed if "/" not in entry} == pages
-    assert "theory/index" in toctree(DOCS / "index.rst")
-
-
 def test_the_page_of_names_has_every_public_name_and_no_unknown_one():
     named = re.findall(r"``(\w+)``", (DOCS / "names.rst").read_text())
     public = {*fe_likelihoods.__all__, *samplers.__all__}

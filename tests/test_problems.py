@@ -182,6 +182,7 @@ def test_the_posterior_of_two_events():
     assert rrmse(simulated[:, inside], measured.values[:, inside]).max() < 0.5
 
 
+@pytest.mark.slow
 def test_the_first_example_finds_its_truth_and_can_be_used():
     posterior = bridge_column(data="short")
     truth = bridge_column_data("short").attributes["truth"]
@@ -333,6 +334,7 @@ def test_the_data_of_the_bridge_say_that_they_are_synthetic(name):
     np.testing.assert_allclose(record.acceleration, make_isolated_bridge.table_motion().acceleration, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_noise_of_the_data_of_the_bridge_is_white_and_of_the_stated_level():
     record, measurements, _ = problems.isolated_bridge_data()
     clean = problems.isolated_bridge_measurements(record, noise=0.0, step=0.25e-3)

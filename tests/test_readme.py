@@ -2,16 +2,17 @@
 
 The blocks of a page run one after another as one script, as in a notebook, in an empty working folder. A block with
 the comment ``slow`` on the line before it runs only with the slow tests, and a page of which that is the first line
-runs only there.
+runs only there. Pages that sample run only there as well; names that their blocks import are looked up quickly.
 """
 
+import ast
+import importlib
 import re
 import textwrap
 from pathlib import Path
 
 import pytest
 
-from fe_likelihoods import problems
 from tests.opensees_column import require_opensees
 from tests.scripts import run_script
 
@@ -21,6 +22,10 @@ PAGES = [
     ROOT / "README.md",
     *sorted(p for p in (ROOT / "docs").rglob("*.rst") if p.relative_to(ROOT / "docs").parts[0] not in GENERATED),
 ]
+# two CPU seconds or more
+SAMPLING = {f"docs/{page}.rst" for page in ("arviz", "events", "faq", "few_simulations", "information", "parallel")} | {
+    "docs/predictions.rst"
+}
 MARKDOWN = re.compile(r"(?P<slow><!-- slow -->\n)?```(?P<language>\w+)\n(?P<code>.*?)```", re.DOTALL)
 RESTRUCTURED = re.compile(
     r"(?P<slow>^\.\. slow\n\n)?^\.\. code-block:: (?P<language>\w+)\n(?:   :.*\n)*\n(?P<code>(?:   .*\n|\n)+)",
@@ -33,7 +38,7 @@ def blocks(page: Path, language: str, slow: bool = True) -> list[str]:
     pattern = MARKDOWN if page.suffix == ".md" else RESTRUCTURED
     text = page.read_text()
     found = [match for match in pattern.finditer(text) if match["language"] == language]
-    whole = text.startswith(".. slow\n")
+    whole = text.startswith(".. slow\n") or name_of(page) in SAMPLING
     return [textwrap.dedent(match["code"]) for match in found if slow or not (whole or match["slow"])]
 
 
@@ -72,19 +77,13 @@ def test_slow_python_blocks_run_as_printed(page, tmp_path):
     run(page, tmp_path, slow=True)
 
 
-def test_first_lines_of_the_readme_run_with_another_posterior(tmp_path, monkeypatch, capsys):
-    """With the bridge column, which takes half a minute, they run among the slow tests."""
-    first, own_model, *_ = blocks(ROOT / "README.md", "python")
-    assert 'problems.bridge_column(data="short")' in first
-    script = tmp_path / "own_model.py"
-    script.write_text(own_model.split("sampler =")[0])
-    posterior = run_script(script)["posterior"]
-    monkeypatch.setattr(problems, "bridge_column", lambda data: posterior)
-    (tmp_path / "first.py").write_text(first)
-    variables = run_script(tmp_path / "first.py")
-    assert abs(variables["sampler"].get_chain(flat=True).mean(axis=0)[0] - 1.1) < 0.01  # the true stiffness
-    assert f"log-evidence {variables['sampler'].log_evidence:.1f}" in capsys.readouterr().out
-    assert (tmp_path / "report.html").is_file()
+def test_blocks_import_names_that_exist():
+    for page in PAGES:
+        for code in blocks(page, "python"):
+            for node in ast.walk(ast.parse(code)):
+                if (getattr(node, "module", None) or "").partition(".")[0] in ("fe_likelihoods", "samplers"):
+                    module = importlib.import_module(node.module)
+                    assert all(hasattr(module, alias.name) for alias in node.names), name_of(page)
 
 
 def test_every_python_block_is_found():

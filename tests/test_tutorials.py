@@ -1,6 +1,6 @@
 """Every tutorial runs from top to bottom with ``FAST=1``, saves its figures, and finds known numbers.
 
-Two of them run with the quick tests: 01 and 13.
+Only the first runs with the quick tests.
 """
 
 import ast
@@ -387,6 +387,7 @@ def test_the_sensors_at_the_base_are_chosen_and_six_leave_what_was_predicted(tmp
 # 13
 
 
+@pytest.mark.slow
 def test_damaged_storeys_are_found_and_a_colder_building_causes_no_alarm(tmp_path):
     """The storey, its loss and the temperature are found; two calibrations alone have wrong intervals for others."""
     output = run_tutorial("13_stiffness_loss.py", "--out", str(tmp_path))
@@ -403,6 +404,7 @@ def test_damaged_storeys_are_found_and_a_colder_building_causes_no_alarm(tmp_pat
 # 14
 
 
+@pytest.mark.slow
 def test_noise_is_worth_nothing_and_the_rates_have_their_closed_form(tmp_path):
     output = run_tutorial("14_decisions.py", "--out", str(tmp_path))
     assert "REDUCED SETTING" in output

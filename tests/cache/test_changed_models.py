@@ -20,6 +20,7 @@ from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.faults import ChangedModel
 from fe_likelihoods.simulation.label import ModelLabel, items_of, value_digest
 from fe_likelihoods.simulation.opened import Observed
+from tests.covering import covering
 
 CHANNELS = (Channel("u", "displacement", "m"),)
 TIME = np.linspace(0.0, 1.0, 20)
@@ -158,8 +159,7 @@ OPENED = {
 }
 
 
-@pytest.mark.parametrize("isolated", [False, True])
-@pytest.mark.parametrize("what", OPENED)
+@pytest.mark.parametrize(("what", "isolated"), covering(list(OPENED), [False, True], strength=1))
 def test_what_a_simulation_opens_belongs_to_the_label(workshop, what, isolated):
     """A change in a part of the space, which the usual few rows would not show."""
     sys.modules.pop("late", None)  # of another test; it would be sent by value

@@ -445,7 +445,7 @@ def _simulate_some(likelihood, thetas, results):
     results.put((likelihood.misfit(thetas), likelihood.simulations, likelihood.simulator.disk_hits))
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_other_processes_share_the_file(path, thetas, method):
     if method not in multiprocessing.get_all_start_methods():
         pytest.skip(f"NO {method} ON THIS SYSTEM")
@@ -497,7 +497,7 @@ def test_forks_while_threads_write(path, rng):
     thread.start()
     context = multiprocessing.get_context("fork")
     try:
-        for i in range(15):
+        for i in range(5):
             thetas = rng.normal(size=(5, 2))
             process = context.Process(target=cache.store, args=(f"child {i}", thetas, 8, thetas, [""] * 5, 1.0))
             process.start()

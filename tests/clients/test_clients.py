@@ -10,8 +10,8 @@ from .problem import CRITICAL, PRIOR, exact, make_posterior, reference_log_prob
 from .runs import CLIENTS
 from .scoring import Found, check
 
-# bilby runs the same dynesty; test_adapters compares its priors and its likelihood with the posterior
-SLOW = {"bilby", "nautilus", "pymc-smc", "pymc-mcmc", "pocomc", "uqpy"}
+# emcee and ultranest are quick: test_adapters and test_protocol compare what the others call with the posterior
+SLOW = {"bilby", "dynesty", "nautilus", "pints", "pymc-smc", "pymc-mcmc", "pocomc", "uqpy", "zeus"}
 
 
 def test_quadrature_has_converged_and_is_of_this_posterior(answer):
@@ -29,6 +29,7 @@ def test_client_agrees_with_quadrature(name, client_named, answer, seed):
     check(client_named(name).run(make_posterior(), seed), answer)
 
 
+@pytest.mark.slow
 def test_wrong_prior_is_detected(client_named, answer, seed):
     """Negative control: a prior with another mean and without its upper bound fails the check."""
     wrong = make_posterior(PRIOR | {"damping": TruncatedNormal(1.0, 0.8, lower=0.7)})
@@ -46,13 +47,9 @@ def test_evidence_without_the_failed_runs_is_detected(answer):
     check(without_failures._replace(log_evidence=answer.log_evidence), answer)
 
 
-@pytest.mark.parametrize("method", ["Nelder-Mead", "Powell", "L-BFGS-B"])
-def test_scipy_finds_the_mode(method):
+def test_scipy_finds_the_mode():
     posterior = make_posterior()
-    start = posterior.sample_start(1, 3)[0]
-    found = optimize.minimize(
-        posterior.negative_log_prob, start, method=method, bounds=posterior.prior.bounds, options={"maxiter": 2000}
-    )
+    start, options = posterior.sample_start(1, 3)[0], {"bounds": posterior.prior.bounds, "options": {"maxiter": 2000}}
     reference = optimize.differential_evolution(
         lambda x: min(-reference_log_prob(x), 1e100),
         [(0.4, 2.4), (0.7, 2.0), (0.2, 3.0), (0.005, 0.03)],
@@ -61,4 +58,6 @@ def test_scipy_finds_the_mode(method):
         maxiter=60,
         popsize=8,
     )
-    assert found.fun == pytest.approx(reference.fun, abs=1e-3), found
+    for method in ("Nelder-Mead", "Powell", "L-BFGS-B"):
+        found = optimize.minimize(posterior.negative_log_prob, start, method=method, **options)
+        assert found.fun == pytest.approx(reference.fun, abs=1e-3), method

@@ -44,6 +44,7 @@ def test_ensemble_through_a_pool_is_the_same_chain(name, client_named, pool):
     np.testing.assert_array_equal(chain(pool=pool), chain(vectorize=True))
 
 
+@pytest.mark.slow
 def test_dynesty_through_a_pool(client_named, pool):
     client_named("dynesty")
     import dynesty

@@ -239,6 +239,7 @@ def test_a_run_uses_the_folder_of_a_check_and_what_it_has(folder):
     assert (folder / "results-oscillator" / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_not_read_and_chance_are_told_by_check(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     fixed = "    motion = (0.1 * record.acceleration / abs(record.acceleration).max()).tolist()"
@@ -472,6 +473,7 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     assert "will probably end before beta = 1" in output
 
 
+@pytest.mark.slow
 def test_a_function_in_other_units_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_function(tmp_path, "in_mm", "    return response", "    return 1000.0 * response")

@@ -242,7 +242,7 @@ def test_errors_name_section_and_key_before_the_run(events, old, new, message):
     assert not (events / "r").exists()
 
 
-@pytest.mark.parametrize("step", [0.005, 0.02, 0.04])
+@pytest.mark.parametrize("step", [0.005, 0.04])
 def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, step):
     """The keys `every` and `dt` of the calibration record do not act on the event by count."""
     from fe_likelihoods.command.events import read_events

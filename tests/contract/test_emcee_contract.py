@@ -11,13 +11,17 @@ import pytest
 
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from tests.contract.targets import Gaussian, WithBlobs
+from tests.covering import covering
 
 N, STEPS = 24, 8
 SAMPLERS = [emcee.EnsembleSampler, SMCSampler, TMCMCSampler]
 every = pytest.mark.parametrize("Sampler", SAMPLERS, ids=lambda s: s.__name__)
+stored = pytest.mark.parametrize(
+    ("Sampler", "make_backend"), covering(SAMPLERS, ["memory", "hdf5"], strength=1), indirect=["make_backend"]
+)
 
 
-@pytest.fixture(params=["memory", "hdf5"])
+@pytest.fixture
 def make_backend(request, tmp_path):
     """A function that opens the backend, the same one in each call within a test."""
     memory = emcee.backends.Backend()
@@ -80,8 +84,8 @@ def test_emcees_private_names_exist():
     assert sampler.log_prob_fn.f.ndim == 2
 
 
-@every
-def test_shapes(Sampler, make_backend):
+@stored
+def test_what_is_stored(Sampler, make_backend):
     sampler = run(Sampler, make_backend())
     assert sampler.get_chain().shape == (STEPS, N, 3)
     assert sampler.get_log_prob().shape == (STEPS, N)
@@ -96,16 +100,11 @@ def test_shapes(Sampler, make_backend):
     state = sampler.get_last_sample()
     assert np.array_equal(state.coords, sampler.get_chain()[-1])
     assert np.array_equal(state.log_prob, sampler.get_log_prob()[-1])
-
-
-@every
-def test_stored_log_prob_is_that_of_the_posterior(Sampler, make_backend):
-    sampler, posterior = run(Sampler, make_backend()), Gaussian()
     chain = sampler.get_chain(flat=True)
-    assert np.allclose(sampler.get_log_prob(flat=True), posterior(chain), rtol=1e-13)
+    assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(chain), rtol=1e-13)
 
 
-@every
+@stored
 def test_thin_by_and_store(Sampler, make_backend):
     posterior = Gaussian()
     sampler = Sampler(N, 3, posterior, backend=make_backend())
@@ -119,8 +118,8 @@ def test_thin_by_and_store(Sampler, make_backend):
 
 @every
 @pytest.mark.parametrize("vectorize", [False, True])
-def test_blobs(Sampler, make_backend, vectorize):
-    sampler = run(Sampler, make_backend(), WithBlobs(), vectorize=vectorize)
+def test_blobs(Sampler, vectorize):
+    sampler = run(Sampler, None, WithBlobs(), vectorize=vectorize)
     chain, blobs = sampler.get_chain(), sampler.get_blobs()
     assert blobs.shape == (STEPS, N, 2)
     assert np.allclose(blobs[..., 0], np.sum(chain**2, axis=-1), rtol=1e-13)
@@ -136,7 +135,7 @@ def single(x, posterior):
     return posterior(x), float(x[1])
 
 
-@every
+@stored
 def test_named_text_and_single_blobs(Sampler, make_backend):
     posterior = Gaussian()
     extra = {} if Sampler is emcee.EnsembleSampler else {"log_prior_fn": posterior.log_prior}
@@ -235,7 +234,7 @@ def test_a_broken_function_stops_with_its_reason(Sampler):
         run(Sampler, posterior=Broken())
 
 
-@every
+@stored
 def test_pickle(Sampler, make_backend):
     with ThreadPool(1) as pool:
         sampler = run(Sampler, make_backend(), pool=pool)
@@ -254,7 +253,7 @@ def test_pickle(Sampler, make_backend):
             assert copy.ladder == sampler.ladder
 
 
-@every
+@stored
 def test_random_state(Sampler, make_backend):
     sampler = run(Sampler, make_backend())
     kept = sampler.random_state
@@ -266,7 +265,7 @@ def test_random_state(Sampler, make_backend):
     assert np.array_equal(sampler.run_mcmc(state, 2, store=False).coords, first)
 
 
-@every
+@stored
 def test_reopened_backend_goes_on_bit_by_bit(Sampler, make_backend):
     posterior, whole = Gaussian(), None
     for pieces in ([6], [2, 4]):  # two equal calls would be the same script, started again
@@ -283,7 +282,7 @@ def test_reopened_backend_goes_on_bit_by_bit(Sampler, make_backend):
         assert np.array_equal(chain, whole)
 
 
-@every
+@stored
 def test_sample_is_a_generator_that_stores_as_it_goes(Sampler, make_backend):
     posterior = Gaussian()
     sampler = Sampler(N, 3, posterior, backend=make_backend())

@@ -26,6 +26,7 @@ KINDS = {
 OURS = [kind for kind in KINDS if kind != "EnsembleSampler"]
 SLOW = ("SMCSampler by moves",)  # TMCMCSampler moves as well, among the quick tests
 MARKED = [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS]
+ONE = ["SMCSampler", *(pytest.param(kind, marks=pytest.mark.slow) for kind in OURS[1:])]
 pytestmark = pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")  # 40 walkers are few
 
 
@@ -146,9 +147,9 @@ def interrupted(kind, path):
     return sampler
 
 
-@pytest.mark.parametrize("of", ["backend", "sampler"])
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", MARKED)
+@pytest.mark.parametrize(
+    ("kind", "finished", "of"), covering(list(KINDS), [True, False], ["backend", "sampler"], strength=1)
+)
 def test_reset_begins_anew(kind, finished, of, tmp_path):
     """Also with another posterior and another seed, which a file that is not reset would refuse or ignore."""
     path = tmp_path / "run.h5"
@@ -173,9 +174,7 @@ def test_reset_begins_anew(kind, finished, of, tmp_path):
         assert same(make(kind, path, Counted("other", centre=0.3)), new)
 
 
-@pytest.mark.parametrize("in_file", [True, False])
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize(("kind", "finished", "in_file"), covering(OURS, [True, False], [True, False], strength=1))
 def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished, in_file, tmp_path):
     path = tmp_path / "run.h5"
     sampler = make(kind, path if in_file else None, Counted(interrupt_at=None if finished else N + 5))
@@ -193,7 +192,7 @@ def test_other_draws_after_a_reset_begin_anew_in_the_same_object(kind, finished,
     assert sampler.iteration == 3 and sampler.evaluations > evaluations
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", ONE)
 def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, whole_run):
     whole = whole_run(kind, 2, 2)
     for given in (None, "state", "draws"):
@@ -205,7 +204,7 @@ def test_a_reset_goes_on_with_the_last_state_or_the_same_draws(kind, tmp_path, w
         assert np.array_equal(sampler.get_chain(), whole.get_chain()[2:])
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", ONE)
 def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     sampler = make(kind, tmp_path / "run.h5", Counted())
@@ -218,7 +217,7 @@ def test_a_wrong_start_after_a_reset_discards_nothing(kind, tmp_path):
     assert sampler.iteration == 1
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", ONE)
 def test_reset_of_the_backend_of_a_living_sampler(kind, tmp_path, whole_run):
     """The chain goes on as after a reset of the sampler, and its file can be opened again."""
     sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -243,8 +242,7 @@ def test_another_function_on_a_backend_in_memory_is_refused(kind):
         other.run_mcmc(None, 1)
 
 
-@pytest.mark.parametrize("finished", [True, False])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "finished"), covering(list(KINDS), [True, False], strength=1))
 def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_path):
     path = tmp_path / "run.h5"
     begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
@@ -258,8 +256,7 @@ def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_p
 # ---------------------------------------------------------------- the record makes the file again
 
 
-@pytest.mark.parametrize("fingerprint", ["counted", None])
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize(("kind", "fingerprint"), covering(OURS, ["counted", None], strength=1))
 def test_a_deleted_file_is_made_again_from_the_record(kind, fingerprint, tmp_path, whole_run):
     whole = whole_run(kind, 3)
     path = tmp_path / "run.h5"
@@ -304,7 +301,7 @@ def test_an_interrupt_or_an_error_and_then_the_same_call(what, kind, place, reop
 # ---------------------------------------------------------------- what is refused, and errors
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run):
     path = tmp_path / "run.h5"
     annealing = whole_run(kind, 0).evaluations
@@ -318,7 +315,7 @@ def test_a_run_that_was_cut_short_refuses_other_draws(kind, tmp_path, whole_run)
     assert same(again, whole_run(kind, 2))
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_a_second_annealing_of_a_reopened_run(kind, tmp_path):
     """Other draws begin a new annealing after the steps of the first one; a third sampler goes on with the second."""
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -361,7 +358,7 @@ def test_a_log_prior_of_another_convention_is_named(tmp_path):
         sampler.run_mcmc(np.random.default_rng(1).standard_normal((N, NDIM)), 1)
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_a_file_that_is_only_read(kind, tmp_path):
     whole = begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     before = sorted((path.name, path.read_bytes()) for path in tmp_path.iterdir())
@@ -375,7 +372,7 @@ def test_a_file_that_is_only_read(kind, tmp_path):
 # ---------------------------------------------------------------- idioms of emcee's users
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
     """``np.random.seed``, a sampler, a start from the global generator: the same start after a restart."""
 
@@ -390,7 +387,7 @@ def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
     assert again.iteration == 5 and again.log_prob_fn.f.evaluated
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
     annealing = whole_run(kind, 0).evaluations
     posterior = Counted(interrupt_at=annealing + int(2.5 * N))
@@ -401,7 +398,7 @@ def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
     assert same(sampler, whole_run(kind, 4))
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
     whole = whole_run(kind, 2, 2)
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
@@ -411,7 +408,7 @@ def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
     assert np.array_equal(again.get_chain(), whole.get_chain()[2:])
 
 
-@pytest.mark.parametrize("kind", MARKED[1:])
+@pytest.mark.parametrize("kind", ONE)
 def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
     sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 3)
     for each in (sampler, make(kind, tmp_path / "run.h5", Counted())):

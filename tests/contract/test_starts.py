@@ -21,8 +21,7 @@ def ball(posterior, n=N, scale=0.01, seed=1):
 
 
 @every
-@pytest.mark.parametrize("scale", [0.001, 0.1, 0.5])
-@pytest.mark.parametrize("n", [N, 300])
+@pytest.mark.parametrize(("n", "scale"), [(N, 0.001), (300, 0.5)])
 def test_a_ball_is_refused_before_any_evaluation(Sampler, scale, n):
     posterior = Gaussian()
     sampler = Sampler(n, 3, posterior, vectorize=True, seed=1)

@@ -6,6 +6,7 @@ import pytest
 
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from tests.contract.targets import Box, Gaussian, WithBlobs
+from tests.covering import covering
 from tests.faults.resumable_run import InOrder
 
 N = 24
@@ -70,9 +71,9 @@ def test_as_many_values_as_parameters_may_be_blobs(vectorize, dtype):
 # ---------------------------------------------------------------- log_likelihood_fn
 
 
-@pytest.mark.parametrize("Sampler", [*SAMPLERS, TemperedSampler])
-@pytest.mark.parametrize("vectorize", [False, True])
-@pytest.mark.parametrize("n", [N, 250])
+@pytest.mark.parametrize(
+    ("Sampler", "vectorize", "n"), covering([*SAMPLERS, TemperedSampler], [False, True], [N, 250], strength=1)
+)
 def test_a_log_likelihood_gives_the_run_of_its_posterior(Sampler, vectorize, n):
     posterior = Gaussian()
     expected = run(Sampler, posterior, vectorize=vectorize, n=n)
@@ -249,9 +250,7 @@ def functions_of(how, wrap):
 WAYS = ("point", "batch", "names", "args", "pool", "likelihood")
 
 
-@pytest.mark.parametrize(
-    ("Sampler", "how"), [*((each, how) for each in SAMPLERS for how in WAYS), (SMCSampler, "asynchronous")]
-)
+@pytest.mark.parametrize(("Sampler", "how"), [*covering(SAMPLERS, WAYS, strength=1), (SMCSampler, "asynchronous")])
 def test_a_function_that_changes_its_argument_changes_no_point(Sampler, how, tmp_path):
     """Nor a run that is stopped and goes on from its file."""
     function, settings = functions_of(how, lambda function: lambda x, *args: function(x))

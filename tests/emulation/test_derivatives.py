@@ -95,7 +95,8 @@ def test_a_budget_includes_derivatives(budget):
     assert posterior.report()["simulations"] + counted.calls == search.simulations <= budget
 
 
-@pytest.mark.parametrize("asynchronous", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("asynchronous", [False, True])
 def test_a_run_in_a_pool_is_that_of_one_process(asynchronous):
     runs = []
     for pool in (None, 2):

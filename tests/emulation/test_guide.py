@@ -112,6 +112,7 @@ def test_impossible_guides_are_refused_before_any_simulation():
     assert isinstance(posterior.guide(), ResponseGuide)
 
 
+@pytest.mark.slow
 def test_a_second_sampler_repeats_no_simulation(tmp_path):
     """Neither in the same process nor, with a file, in another one; short parts of the record included."""
     results, counts, log, before = [], [], tmp_path / "log", 0

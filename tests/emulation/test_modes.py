@@ -42,7 +42,13 @@ def _log_density(posterior, coords):
     return float((posterior.log_likelihood(x) + target.log_prior(coords[None]))[0])
 
 
-@pytest.mark.parametrize("noise", ["marginal", "white", "shared", "autoregressive", "sensor", "effective"])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        *("marginal", "autoregressive", "sensor"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("white", "shared", "effective")),
+    ],
+)
 def test_the_mode_is_the_one_of_a_general_optimiser(noise):
     posterior = vibration(noise)
     search = find_modes(posterior, starts=3, seed=1)
@@ -264,10 +270,8 @@ def _rough(theta, size, key):
     return free_vibration(theta) * (1.0 + size * (int.from_bytes(digest, "little") / 2.0**31 - 1.0))
 
 
-@pytest.mark.parametrize(
-    ("size", "cases", "most"),
-    [(2e-4, 5, 3), pytest.param(4e-4, 30, 13, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "cases", "most"), [(2e-4, 5, 3), (4e-4, 30, 13)])
 def test_a_rough_likelihood_rarely_splits_a_mode_and_prolongs_no_search(size, cases, most):
     """Jumps of 2e-4 of the response are jumps of the log-density by about 0.5, and those of 4e-4 by 2.
 

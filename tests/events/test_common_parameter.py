@@ -129,7 +129,7 @@ def shares(n_flat: int, prior: str, rng: np.random.Generator) -> dict[str, Store
     ("prior", "scale", "is_right"),
     [
         pytest.param("uniform", "linear", False, marks=pytest.mark.slow),
-        ("uniform", "logit", False),
+        pytest.param("uniform", "logit", False, marks=pytest.mark.slow),
         ("logit-normal", "logit", True),
     ],
 )
@@ -153,7 +153,7 @@ def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right
         assert not [each for each in check_hierarchy(alone, near[:, :2]).messages if "pile up" in each]
 
 
-@pytest.mark.parametrize("bounds", [None, (0.0, 1.0), (5e-4, 1.0 - 5e-4)])
+@pytest.mark.parametrize("bounds", [None, (5e-4, 1.0 - 5e-4)])
 def test_flat_shares_are_told_with_bounds_of_the_scale_within_those_of_the_prior(bounds):
     """Some draws of the prior are beyond them."""
     low, high = bounds or (0.0, 1.0)
@@ -170,10 +170,8 @@ def test_flat_shares_are_told_with_bounds_of_the_scale_within_those_of_the_prior
     assert "johnsonsb(0.0, 0.6, low, high - low) for scale='logit'" in said
 
 
-@pytest.mark.parametrize(
-    ("counts", "is_right"),
-    [((0,) * 10, False), pytest.param((4, 7, 6, 5, 8, 6, 9, 6, 5, 7), True, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("counts", "is_right"), [((0,) * 10, False), ((4, 7, 6, 5, 8, 6, 9, 6, 5, 7), True)])
 def test_tests_that_pile_up_at_one_bound(counts, is_right, rng):
     """Shares of 20 trials with a flat prior, whose posteriors are beta densities; the population is integrated exactly.
 

@@ -126,6 +126,7 @@ def test_even_tails_of_weights_do_not_hide_a_dominating_test():
     assert np.log(weights @ np.exp(own)) > found.log_density + 1.0
 
 
+@pytest.mark.slow
 def test_another_sampler_can_be_given(beside):
     found = leave_one_out(beside, sample=exact)["T5"]
     check(found, beside.posterior, "T5", ONE_BESIDE[5])

@@ -232,6 +232,7 @@ def calibrated():
     return posteriors, samplers
 
 
+@pytest.mark.slow
 def test_searches_and_guided_runs_find_the_storey(calibrated):
     """Laplace approximation, emulated posterior and chain agree on a well-identified posterior."""
     posteriors, samplers = calibrated

@@ -74,7 +74,8 @@ def theta(what, n=1):
 # workers that die ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 def test_an_item_that_kills_its_worker_fails_alone(workers):
     thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
     with LocalPool(workers) as pool:
@@ -89,15 +90,6 @@ def test_an_item_that_kills_its_worker_fails_alone(workers):
         assert [batch.reasons[row] for row in fine] == [""] * 16
         again = simulate_batch(Treacherous(), thetas[fine], pool)  # the pool still works
         np.testing.assert_array_equal(again.response, batch.response[fine])
-
-
-def test_items_of_killed_workers_are_run_again(tmp_path):
-    thetas = np.concatenate([theta(bad.KILLED, 4), theta(bad.FINE, 4)])
-    with LocalPool(2) as pool:
-        batch = simulate_batch(DiesOnce(tmp_path), thetas, pool)
-    assert len(list(tmp_path.iterdir())) == 4
-    assert batch.reasons == [""] * 8
-    np.testing.assert_array_equal(batch.response, [line(row) for row in thetas])
 
 
 def test_processes_may_die_while_they_load_the_function(tmp_path):
@@ -425,6 +417,7 @@ def test_invalid_share_is_refused(share):
         third(max_failure_share=share)
 
 
+@pytest.mark.slow
 def test_sampler_with_a_sandboxed_model_that_crashes_and_hangs(seed):
     """Parts of the prior crash or hang: the run ends, and the report has both reasons."""
     posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))

@@ -117,7 +117,7 @@ def points_in(data):
 def test_a_record_with_a_changed_byte(whole, chain, tmp_path, caplog):
     """In the name of the format: refused. Elsewhere: what is behind the byte is evaluated again."""
     kind, source, expected = whole
-    for share in np.linspace(0.001, 0.999, 12):
+    for share in np.linspace(0.001, 0.999, 7):
         path = copied(source, tmp_path)
         record_of(path).write_bytes(flipped(record_of(path).read_bytes(), share))
         CHAINS[chain](path)
@@ -295,8 +295,9 @@ def held_open(found):
     return [str(each.message) for each in found if "held open by another program" in str(each.message)]
 
 
-@pytest.mark.parametrize("mode", ["r", "a"])
-@pytest.mark.parametrize("until", ["at once", "step 3", "the end", "after the end"])
+@pytest.mark.parametrize(
+    ("mode", "until"), covering(["r", "a"], ["at once", "step 3", "the end", "after the end"], strength=1)
+)
 def test_a_file_that_another_process_holds_open_ends_no_run(mode, until, whole_smc, tmp_path, monkeypatch):
     """Every bit is the one of a run without it, nothing is evaluated again, and what the other process wrote stays."""
     monkeypatch.setattr(output_file, "SECONDS", 10.0 if until == "at once" else 0.2)
@@ -391,7 +392,11 @@ def limit_files(size):
 
 
 @pytest.mark.parametrize(
-    ("size", "ballast"), [(1_000, 0), (10_000, 0), (30_000, 0), (9_000, 300_000), (20_000, 300_000)]
+    ("size", "ballast"),
+    [
+        *((10_000, 0), (20_000, 300_000)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1_000, 0), (30_000, 0), (9_000, 300_000))),
+    ],
 )
 def test_a_full_disk(size, ballast, tmp_path):
     """Files may not grow: an OSError; a new process goes on when there is space again, and evaluates nothing twice."""

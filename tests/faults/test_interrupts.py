@@ -257,7 +257,7 @@ class Fails(Gaussian):
         return super().__call__(x)
 
 
-@pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.parametrize("asynchronous", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_interrupts_in_pools_of_a_sampler(pool, asynchronous):
     name, pool = pool
     if asynchronous and not hasattr(pool, "submit"):
@@ -289,7 +289,7 @@ def guided_evidence(tmp_path_factory):
     return whole.log_evidence
 
 
-@pytest.mark.parametrize("act", [press_ctrl_c, leave])
+@pytest.mark.parametrize("act", [press_ctrl_c, pytest.param(leave, marks=pytest.mark.slow)])
 def test_a_guided_run_goes_on_after_an_interrupt_in_the_search(act, guided_evidence, tmp_path, monkeypatch):
     signal.signal(signal.SIGINT, leaves)
     simulate, calls = guided_run.Vibration.simulate, []

@@ -7,17 +7,20 @@ from tests.faults.kills import kill
 
 pytestmark = pytest.mark.skipif("not hasattr(__import__('os'), 'fork')", reason="needs os.fork")
 
-QUICK = ("smc", "guided", "asynchronous, guided", "limit", "reset")
+QUICK, SLOW = ("smc", "asynchronous, guided"), ("guided", "limit", "reset")
 
 
-@pytest.mark.parametrize("kind", QUICK)
+@pytest.mark.parametrize("kind", [*QUICK, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW)])
 def test_the_same_script_goes_on_after_every_kill(kind):
     counts, messages = kill(4, [kind], seed=3, show=lambda *_: None)
     assert counts[kind, "kills"] >= 4
     assert not messages
 
 
-@pytest.mark.parametrize(("kind", "places"), [("smc", ["create_dataset blobs", "has_blobs"]), ("reset", ["has_blobs"])])
+@pytest.mark.parametrize(
+    ("kind", "places"),
+    [("smc", ["create_dataset blobs", "has_blobs"]), pytest.param("reset", ["has_blobs"], marks=pytest.mark.slow)],
+)
 def test_a_half_made_dataset_of_blobs_is_made_again(kind, places):
     kills, messages = kill_everywhere(kind, places)
     assert kills >= len(places) and not messages

@@ -196,6 +196,7 @@ def sleeps(theta):
     return line(theta)
 
 
+@pytest.mark.slow
 def test_a_function_that_is_stopped_is_run_again_with_a_longer_limit(tmp_path):
     x = np.array([[0.3, 0.1]])
     short = likelihood_of(FunctionModel(sleeps, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.005), tmp_path / "c.sqlite")
@@ -356,7 +357,7 @@ class Copies:
         return map(pickle.loads(pickle.dumps(function)), items)
 
 
-@pytest.mark.parametrize("what", ["disk", "death"])
+@pytest.mark.parametrize("what", ["disk", pytest.param("death", marks=pytest.mark.slow)])
 def test_faults_in_the_pool_of_a_sampler_are_in_its_records(what, seed):
     """The records of the posterior are those of its copy in a worker, and a worker that dies has none."""
     points = np.random.default_rng(seed).uniform(0.2, 0.8, size=(20, 3))

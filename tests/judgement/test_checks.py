@@ -12,6 +12,7 @@ from samplers.estimates.importance import EvidenceCheck, expected_efficiency
 from samplers.judgement.checks import check_evidence, check_fallback, check_likelihood
 from samplers.proposals.mixture import fit_mixture, log_density
 from samplers.reports import Stage
+from tests.covering import covering
 from tests.statistics import analytic_posteriors as analytic
 from tests.tempering.guides import FixedGuide
 
@@ -143,7 +144,8 @@ def _largest_shares(dimensions, walkers, seeds, Sampler, **settings):
     return found
 
 
-@pytest.mark.parametrize("Sampler", [SMCSampler, pytest.param(TMCMCSampler, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
 def test_modes_that_the_moves_do_not_connect_are_no_converged_result(Sampler):
     """150 walkers in 11 dimensions: shares of modes are wrong by more than 0.1 in about half of the runs."""
     settings = {"recycle": False} if Sampler is SMCSampler else {}
@@ -217,10 +219,10 @@ def test_a_plateau_at_all_draws_of_the_prior_is_not_usable_and_is_named(Sampler,
     assert sampler.verdict.status == "not usable" and "draws of the prior" in str(sampler.verdict)
 
 
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
-@pytest.mark.parametrize("recycle", [True, False])
-def test_nearly_minus_infinity_at_all_draws_is_an_error_as_minus_infinity_is(Sampler, recycle):
-    settings = {"recycle": recycle} if Sampler is SMCSampler else {}
+@pytest.mark.parametrize(
+    ("Sampler", "settings"), [(SMCSampler, {"recycle": True}), (SMCSampler, {"recycle": False}), (TMCMCSampler, {})]
+)
+def test_nearly_minus_infinity_at_all_draws_is_an_error_as_minus_infinity_is(Sampler, settings):
     for value in (-INF, -1e300, -5e29):
         with pytest.raises(ValueError, match="no point|starting points"):
             Sampler(60, 2, Plateau(value), vectorize=True, seed=1, **settings).run_mcmc(None, 1)
@@ -236,9 +238,9 @@ def test_draws_of_a_guide_on_a_plateau_are_not_usable():
         assert sampler.verdict.status == "not usable"
 
 
-@pytest.mark.parametrize("value", [-1e10, -1e300])
-@pytest.mark.parametrize("certain", [False, True])
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+@pytest.mark.parametrize(
+    ("Sampler", "certain", "value"), covering([SMCSampler, TMCMCSampler], [False, True], [-1e10, -1e300], strength=1)
+)
 def test_penalties_at_a_part_of_the_draws_are_a_hard_edge(Sampler, certain, value):
     """Above 0.5, with or without data: 69 % of the draws have the penalty."""
     posterior = Plateau(value, 0.5, certain)

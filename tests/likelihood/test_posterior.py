@@ -476,6 +476,7 @@ def test_an_empty_batch():
 # pools, pickles, clients ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_spawned_processes_give_the_same_bits(posterior, oscillator, measurements, prior):
     x = posterior.sample_prior(12, 3)
     x[5, 1] = 25.0  # overdamped: fails in the worker

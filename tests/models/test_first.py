@@ -71,7 +71,7 @@ def test_fingerprints_of_parts(model, seconds):
             model.first(wrong)
 
 
-@pytest.mark.parametrize("pool", [None, 2])
+@pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_likelihood_of_the_first_part(pool, rng, tmp_path):
     model = LinearOscillator(RECORD)
     values = model.simulate([1.0, 1.0]) + 0.01 * rng.normal(size=(2, model.n_steps))
@@ -162,7 +162,7 @@ def shaken(theta, record, n_steps):
     return LinearOscillator(record).simulate([*theta, 1.0])[1:, :n_steps]
 
 
-@pytest.mark.parametrize("isolated", [False, True])
+@pytest.mark.parametrize("isolated", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("function", [vibrates, required])
 def test_a_function_of_the_number_of_samples(function, isolated):
     model = FunctionModel(function, ("a",), CHANNEL, 0.02, 300, jacobian=slopes, isolated=isolated)

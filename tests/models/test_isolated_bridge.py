@@ -290,6 +290,7 @@ def test_fingerprint_changes_with_what_changes_the_response(rng):
     assert model.fingerprint == replace(model).fingerprint
 
 
+@pytest.mark.slow
 def test_thousand_draws_of_the_prior(rng):
     model = IsolatedBridge(shaking(rng, duration=5.0), outputs=("Ub_1", "acc_p1"), step=0.5e-3)
     thetas = np.clip(rng.normal(1.0, 0.5, (1000, 10)), 0.2, 2.5)
@@ -336,12 +337,10 @@ def test_negative_parameters_fail(rng, name):
     [
         ({"record": np.zeros(10)}, "Record"),
         ({"step": 0.3e-3}, "divides the record's 0.005"),
-        ({"step": 0.01}, "divides"),
         ({"step": -1.0}, "positive step"),
         ({"outputs": ("Ub_1", "Ub_3")}, "Ub_3"),
         ({"outputs": 7}, "5, 6 or 10"),
         ({"outputs": ("Ub_1", "Ub_1")}, "once"),
-        ({"outputs": "Ub_1"}, "outputs"),
         ({"parameters": ("fmin",)}, "fmin_1"),
         ({"friction": "smooth"}, "bouc-wen"),
         ({"piers": (Pier(),)}, "two of Pier"),

@@ -315,7 +315,7 @@ def test_a_script_may_repeat_what_has_failed(script):
     np.testing.assert_allclose(model.simulate([1]), model.simulate([50]), atol=1e-6)
 
 
-@pytest.mark.parametrize("script", ["by name", "object"])
+@pytest.mark.parametrize("script", ["by name", pytest.param("object", marks=pytest.mark.slow)])
 def test_functions_that_the_script_has_imported_by_name_are_watched(script):
     """In a process of its own, since this script imports OpenSees."""
     require_opensees()

@@ -108,7 +108,7 @@ def test_the_likelihood_is_the_multivariate_normal_density(kind, rng):
     assert likelihood([1.1, *(-parameters)]) == -np.inf and likelihood.simulations == 3
 
 
-@pytest.mark.parametrize("kind", ["modulated", "shares in bands"])
+@pytest.mark.parametrize("kind", ["modulated", pytest.param("shares in bands", marks=pytest.mark.slow)])
 def test_the_density_integrates_to_one_over_the_measurements(kind):
     """Shares of the measured channel, the control, do not: their level is computed from the measurements."""
     channel = (CHANNELS[0],)

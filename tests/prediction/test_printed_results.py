@@ -18,8 +18,6 @@ from fe_likelihoods import (
     peak,
     propagate,
 )
-from fe_likelihoods.column_damage.damage import LimitState
-from fe_likelihoods.column_damage.park_ang import ParkAng
 from fe_likelihoods.prediction.fragility_curve import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore, HeldOutScores
 from fe_likelihoods.prediction.score_tables import score_values
@@ -54,16 +52,6 @@ def test_predictions(predicted):
     assert cells(text, 1)[2:4] == ["largest mean", "at [s]"] and "array" not in text
     largest = np.abs(predicted["histories"].mean).max()
     assert abs(float(cells(text, 2)[2])) == pytest.approx(1e2 * largest, rel=5e-3)
-
-
-def test_predictions_in_a_list(predicted):
-    """`repr` is one short line."""
-    histories, value = (repr(predicted[name]) for name in ("histories", "peak"))
-    n = predicted["histories"].mean.shape[1]
-    assert histories == f"<Prediction of shape (1, {n}): channels displacement, 41 samples, without noise>"
-    assert value == "<Prediction of shape (): channels displacement, 41 samples, without noise>"
-    own = propagate(Flexible(RECORD), np.zeros((3, 1)), quantity=lambda response: response.sum(), progress=False)
-    assert repr([own]) == "[<Prediction of shape (): 3 samples, without noise>]"
 
 
 def test_averages_of_models(predicted):
@@ -167,18 +155,6 @@ def test_held_out_scores(predicted, rng):
     assert len({len(cells(text, row)) for row in range(3)}) == 1
     assert text.splitlines()[3].startswith("a: within 90%, 1 of 2: 9 to 91 %; within 50%, 1 of 2: 9 to 91 %")
     assert str(scores["first"]).endswith("log density of the data of the event: 12.5")
-
-
-def test_constants_and_limits():
-    text = str(ParkAng(0.25, 4.0e5, 0.05, "pushed to failure"))
-    assert text == "Park-Ang index: ultimate displacement 250 mm, yield force 400 kN, beta 0.05 (pushed to failure)"
-    assert str(LimitState("wide cracks", "bar tension", 0.015, "Kowalsky")) == (
-        "wide cracks: bar tension beyond 0.015 (Kowalsky)"
-    )
-    assert str(LimitState("yield", "bar tension", np.array([0.002, 0.003]))) == (
-        "yield: bar tension beyond 0.002 to 0.003"
-    )
-    assert str(LimitState("worn", "dissipated energy", 2.5e4)) == "worn: dissipated energy beyond 25 kJ"
 
 
 def test_tables_are_aligned_and_missing_cells_are_dashes():

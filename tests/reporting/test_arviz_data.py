@@ -218,6 +218,7 @@ def oscillator():
     )
 
 
+@pytest.mark.slow
 def test_labels_and_figures(oscillator, tmp_path):
     import matplotlib.pyplot as plt
 

@@ -2,6 +2,7 @@
 
 import emcee
 import numpy as np
+import pytest
 
 from fe_likelihoods import (
     Channel,
@@ -105,6 +106,7 @@ def test_control_few_numbers_may_be_codes():
     assert all("died" not in row.example for row in rows)
 
 
+@pytest.mark.slow
 def test_control_failures_far_from_the_samples_are_no_severe_doubt():
     posterior = posterior_of([1.05, 0.8])
     sampler = run(posterior)

@@ -75,6 +75,7 @@ def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     assert any(remark.startswith("no scores: ") for remark in other.remarks)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the residuals")
 def test_what_is_not_known_of_an_event_is_said_in_words(vibrating, tmp_path, monkeypatch):
     sampler, posterior = vibrating

@@ -88,6 +88,7 @@ def test_a_terminal_shows_a_bar():
     check_last_states([state.strip() for state in re.split(r"[\r\n]+", shown) if state.strip()], numbers)
 
 
+@pytest.mark.slow
 def test_messages_of_the_log_do_not_break_the_bar():
     lines = screen(run_in_a_terminal("talking")[0])
     assert [line for line in lines if line.startswith(("stage", "sweeps"))] == lines[-3:-1]  # the last states alone

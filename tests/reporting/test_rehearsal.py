@@ -75,6 +75,7 @@ def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise,
         assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_coarse_step_limits_the_result_of_a_run(joint):
     """Also where only one of two data sets is computed with the coarse step."""
@@ -99,6 +100,7 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
     assert not [each for each in fine.findings if "coarse" in each.name or "tested" in each.name], str(fine)
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
     """The parameters may be right, but every prediction repeats the calibration; the step is not tested then."""
     posterior = posterior_of(lambda theta, record: central_differences(theta, MOTION, 8)[:, : record.n_steps])

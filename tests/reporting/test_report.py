@@ -243,6 +243,7 @@ def test_moments_are_those_of_the_more_accurate_sample(rng):
     np.testing.assert_array_equal(moments_of(finished).sd, chain.std(axis=0))
 
 
+@pytest.mark.slow
 def test_samplers_without_a_ladder_and_functions_without_data_are_reported(tmp_path):
     target = Gaussian(ndim=2)
     sampler = emcee.EnsembleSampler(20, 2, target, vectorize=True)

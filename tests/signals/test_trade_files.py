@@ -178,8 +178,8 @@ def test_numbers_that_touch(tmp_path, rows, expected):
     np.testing.assert_allclose(read(tmp_path, "a.AT2", text(*header, *rows)).acceleration, G0 * np.array(expected))
 
 
-@pytest.mark.parametrize("place", range(5))
-@pytest.mark.parametrize("mark", ["'", ";", ",", "x", " x ", "..", " ' "])
+@pytest.mark.parametrize("place", [0, 2, 4])
+@pytest.mark.parametrize("mark", ["'", ",", " x ", ".."])
 def test_a_damaged_row_never_shortens_the_samples(tmp_path, place, mark):
     for rows in (ROWS, [" 12.34567100.12345111.00000"] * 5):
         damaged = [*rows[:place], rows[place][:14] + mark + rows[place][14:], *rows[place + 1 :]]
@@ -189,7 +189,7 @@ def test_a_damaged_row_never_shortens_the_samples(tmp_path, place, mark):
         assert intact.n_steps == (39 if rows is ROWS else 15)
 
 
-@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3", "2-1.5.0", "-12.34567100.123456"])
+@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3"])
 def test_numbers_that_may_be_split_in_two_ways_are_refused(tmp_path, row):
     for before in ("1.00000   2.00000", "1.00000   2.00000   3.00000", ""):
         with pytest.raises(ValueError, match="expected"):
@@ -208,7 +208,7 @@ def advised(error):
         yield plain | given | ({"dt": 0.01} if "dt=" in choice else {})
 
 
-@pytest.mark.parametrize("width", range(2, 8))
+@pytest.mark.parametrize("width", [2, 7])
 @pytest.mark.parametrize("times", [True, False])
 def test_arguments_proposed_for_a_table_without_a_header_line_work(tmp_path, width, times):
     path, values = tmp_path / "disp.out", np.random.default_rng(width).normal(size=(9, width)).round(3)
@@ -488,7 +488,7 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
         read_record(path)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_advice_for_uneven_times_of_a_table_works(tmp_path, seed):
     chance = np.random.default_rng(seed)
     times = np.cumsum(chance.choice([0.004, 0.010, 0.011, 0.031], size=50, p=[0.1, 0.5, 0.3, 0.1]))

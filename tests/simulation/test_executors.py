@@ -25,6 +25,7 @@ from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simul
 from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
 
+SLOW = ("one process", "executor", "multiprocessing")  # kinds of pools
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -75,7 +76,9 @@ def pools():
 @pytest.mark.parametrize(
     "make",
     [
-        pytest.param(make, id=name, marks=pytest.mark.slow if name in ("one process", "executor") else ())
+        pytest.param(
+            make, id=name, marks=pytest.mark.slow if name in ("one process", "executor", "multiprocessing") else ()
+        )
         for name, make in pools()
     ],
 )
@@ -358,7 +361,7 @@ def test_models_of_a_prompt():
     assert " ".join(run.stdout.split()) == "True True", run.stderr
 
 
-@pytest.mark.parametrize("system", ["column", "bridge"])
+@pytest.mark.parametrize("system", ["column", pytest.param("bridge", marks=pytest.mark.slow)])
 def test_compiled_models_go_through_a_pool_to_the_same_bits(system, shared_pool):
     """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
     if system == "column":

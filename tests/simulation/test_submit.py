@@ -59,6 +59,7 @@ def check_order_of_arrival(executor, function, tmp_path):
         assert reason == ""
 
 
+@pytest.mark.slow
 def test_items_that_kill_their_process_end_as_with_map(tmp_path, shared_pool):
     thetas = [np.array([what + 0.5, 0.1]) for what in (bad.FINE, bad.CRASHES, bad.FINE, bad.LEAVES, bad.RAISES)]
     with shared_pool(2) as pool:

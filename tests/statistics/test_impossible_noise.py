@@ -64,7 +64,7 @@ def test_impossible_noise_is_no_failure(joint):
     assert sampler.verdict.status == "converged"
 
 
-@pytest.mark.parametrize("vectorize", [True, False])
+@pytest.mark.parametrize("vectorize", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_failures_are_told_from_impossible_noise(vectorize):
     """Both border on the samples, and the failures alone are counted as such."""
     posterior = make_posterior(limit=1.0)

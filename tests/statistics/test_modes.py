@@ -64,7 +64,7 @@ def finish(sampler, posterior):
     return sampler, float(np.mean(np.diff(posterior.parts(sampler.get_chain(flat=True)), axis=0) < 0.0))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_narrow_mode_is_kept(seed):
     sampler, share = run(seed)
     error = np.hypot(sampler.log_evidence_error, 0.03)

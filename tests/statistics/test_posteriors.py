@@ -56,7 +56,7 @@ def evidence_deviation(samplers, truth):
     return (values.mean() - truth) / (values.std(ddof=1) / np.sqrt(len(values)))
 
 
-@pytest.mark.parametrize("mode", EXACT)
+@pytest.mark.parametrize("mode", [pytest.param(m, marks=pytest.mark.slow) if m == "constant" else m for m in EXACT])
 def test_conjugate_gaussian(mode, seed):
     posterior = Gaussian(3, sd=0.1)
     samplers = runs(posterior, seed, **MODES[mode])
@@ -72,10 +72,9 @@ def test_conjugate_gaussian(mode, seed):
         RandomWalkMove(),
         RandomWalkMove(adapt=True, scale=5.0),
         [(MixtureMove(), 0.5), (RandomWalkMove(), 0.5)],
-        emcee.moves.StretchMove(),
         MixtureMove(independence_threshold=1.0),
     ],
-    ids=["walk", "adaptive walk", "weighted", "stretch", "mixture"],
+    ids=["walk", "adaptive walk", "weighted", "mixture"],
 )
 def test_every_kernel(moves, seed):
     posterior = Gaussian(2, sd=0.2)
@@ -155,7 +154,7 @@ def test_flat_likelihood(seed):
     assert within(deviations(samplers, [0.5, 1.5]), samplers)
 
 
-@pytest.mark.parametrize("recycle", [recycling, moves])
+@pytest.mark.parametrize("recycle", [recycling, slow_moves])
 def test_very_informative_likelihood(recycle, seed):
     """The posterior is a hundred thousand times narrower than the prior."""
     posterior = Gaussian(2, sd=1e-5)
@@ -193,7 +192,7 @@ def test_a_constant_changes_no_draw(mode, offset, seed):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("unit", [1e-4, 1e4, 2.0**-14, 2.0**14])
+@pytest.mark.parametrize("unit", [1e-4, 2.0**14])
 def test_units_change_no_draw(mode, unit, seed):
     plain, scaled = plain_run(mode, seed), runs(Gaussian(3, unit=unit), seed, count=1, **MODES[mode])[0]
     if np.log2(unit).is_integer():  # then scaling itself rounds nothing

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import integrate, stats
 
-__all__ = ["correlated", "four_branches", "four_branches_exact", "gammas", "linear", "summarise"]
+__all__ = ["correlated", "four_branches", "four_branches_exact", "linear", "summarise"]
 
 
 def linear(points):
@@ -46,28 +46,6 @@ class correlated:
     def threshold(cls, probability):
         spread = np.linalg.norm(cls.root.T @ cls.weights)
         return cls.mean @ cls.weights + spread * stats.norm.isf(probability)
-
-
-class gammas:
-    """Ten gamma-distributed parameters (shape 3), and their sum."""
-
-    @staticmethod
-    def log_prob(points):
-        inside = (points > 0.0).all(axis=1)
-        logs = np.log(np.where(inside[:, None], points, 1.0))
-        return np.where(inside, np.sum(2.0 * logs - points, axis=1), -np.inf)
-
-    @staticmethod
-    def draws(n, seed):
-        return np.random.default_rng([seed, 1]).gamma(3.0, size=(n, 10))
-
-    @staticmethod
-    def quantity(points):
-        return points.sum(axis=1)
-
-    @staticmethod
-    def threshold(probability):
-        return stats.gamma.isf(probability, 30.0)
 
 
 def summarise(runs, exact):

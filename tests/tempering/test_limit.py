@@ -307,8 +307,10 @@ def test_the_count_is_that_of_a_model_with_responses(where, tmp_path):
     assert np.all(np.abs(difference) < 4.0 * np.hypot(sampler.mean_error(), whole.mean_error()))
 
 
-@pytest.mark.parametrize("path", ["searching guide", "recycling", "moves"])
-@pytest.mark.parametrize("first", ["limited", "killed", "finished"])
+@pytest.mark.parametrize(
+    ("path", "first"),
+    covering(["searching guide", "recycling", "moves"], ["limited", "killed", "finished"], strength=1),
+)
 def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
     """Simulations in the file cost nothing."""
     file = tmp_path / "run.h5"

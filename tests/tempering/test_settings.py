@@ -1,5 +1,6 @@
 """Every setting that a sampler has changes its run; a setting that it does not have, or that cannot act, is refused."""
 
+import functools
 import re
 from dataclasses import fields, replace
 
@@ -88,6 +89,13 @@ def outcome(Sampler, posterior=None, nwalkers=60, **kwargs):
     return sampler.get_chain().tobytes(), stages, sampler.log_evidence_check
 
 
+@functools.cache
+def usual(path, needed):
+    """The outcome of a run without another setting."""
+    Sampler, given = PATHS[path]
+    return outcome(Sampler, **given | dict(needed))
+
+
 def test_the_changes_cover_all_settings():
     assert set(CHANGES) == {field.name for field in fields(Settings)}
 
@@ -98,12 +106,11 @@ def test_a_setting_changes_the_run(name, path):
     Sampler, given = PATHS[path]
     value, needed = CHANGES[name]
     value = not given.get("recycle", False) if name == "recycle" else value
-    posterior = Target(sd=0.02)
+    posterior, before = Target(sd=0.02), usual(path, tuple(needed.items()))
     if name == "asynchronous":  # on five workers, of which the one with the longest run is the last
         posterior = SimulatedCluster(posterior, 5, lambda x: 2.0 + np.cos(50.0 * x[:, 0]))
-    assert outcome(Sampler, posterior, **given | needed) != outcome(
-        Sampler, posterior, **given | needed | {name: value}
-    )
+        assert outcome(Sampler, posterior, **given) == before
+    assert outcome(Sampler, posterior, **given | needed | {name: value}) != before
 
 
 @pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
