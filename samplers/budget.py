@@ -22,18 +22,7 @@ OF_GUIDES = "simulations of guides"  # key in the record
 
 
 class BudgetExhausted(Exception):
-    """A batch does not fit into the limit of simulations.
-
-    Parameters
-    ----------
-    records : (m,) structured array
-        Records of the first m points of the batch, which were evaluated.
-
-    Attributes
-    ----------
-    records : (m,) structured array
-        See above.
-    """
+    """A batch does not fit into the limit; `records` (m,) belong to its first m points, which were evaluated."""
 
     def __init__(self, records: np.ndarray):
         super().__init__("the limit of simulations (max_simulations) does not allow this batch")
@@ -50,33 +39,15 @@ def as_limit(value: Any) -> float | None:
 
 
 class CountsSimulations(Protocol):
-    """An object that makes simulations by itself, such as a guide.
+    """An object that makes simulations by itself, such as a guide."""
 
-    Attributes
-    ----------
-    simulations : float
-        Simulations made so far.
-    """
-
-    simulations: float
+    simulations: float  # made so far
 
 
 class Budget:
-    """Counts simulations and compares them with a limit.
+    """Counts simulations, from the evaluated points of a `record`, and compares them with a `limit` (None: no limit).
 
-    Parameters
-    ----------
-    record : Record
-        The evaluated points.
-    limit : float, optional
-        Largest number of simulations; no limit by default.
-
-    Attributes
-    ----------
-    limit : float, or None
-        The limit.
-    refused : bool
-        Whether `fits` has returned False for the guide in use.
+    `refused` says whether `fits` has returned False for the guide in use.
     """
 
     def __init__(self, record: Record, limit: float | None = None):

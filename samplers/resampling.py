@@ -19,60 +19,23 @@ Random = np.random.RandomState | np.random.Generator
 
 
 def locate(weights: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Index of the item that contains each position of the cumulative weights, scaled to [0, 1).
-
-    Parameters
-    ----------
-    weights : (n,) float
-        Non-negative, not all zero.
-    positions : (m,) float
-        In [0, 1).
-
-    Returns
-    -------
-    (m,) int
-        Indices in [0, n).
-    """
+    """Index (m,) of the item that contains each of the positions (m,) in [0, 1) along the cumulative weights (n,)."""
     cumulative = np.cumsum(weights)
     # a position can be rounded up to 1
     return np.minimum(np.searchsorted(cumulative / cumulative[-1], positions, side="right"), len(weights) - 1)
 
 
 def systematic(weights: np.ndarray, random: Random, size: int | None = None) -> np.ndarray:
-    """Indices at equal distances along the cumulative weights, shifted by one uniform number.
+    """Indices (size,), ascending, at equal distances along the cumulative weights (n,), shifted by one uniform number.
 
-    Parameters
-    ----------
-    weights : (n,) float
-        Non-negative, not all zero.
-    random : RandomState or Generator
-        Source of the uniform number.
-    size : int, optional
-        Number of indices; n by default.
-
-    Returns
-    -------
-    (size,) int
-        Indices in ascending order; index i occurs ``size * weights[i]`` times, rounded up or down.
+    Index i occurs ``size * weights[i]`` times, rounded up or down; `size` is n by default.
     """
     n = len(weights) if size is None else size
     return locate(weights, (np.arange(n) + random.uniform()) / n)
 
 
 def multinomial(weights: np.ndarray, random: Random) -> np.ndarray:
-    """Independent draws.
-
-    Parameters
-    ----------
-    weights : (n,) float
-        Non-negative, with sum 1.
-    random : RandomState or Generator
-        Source of random numbers.
-
-    Returns
-    -------
-    (n,) int
-        Indices of the resampled points, ascending. The other schemes have the same arguments and result.
+    """Independent draws (n,) of indices, ascending, by weights (n,) with sum 1; other schemes have the same arguments.
     """
     return locate(weights, np.sort(random.uniform(size=len(weights))))
 

@@ -53,36 +53,18 @@ COMPARED = 2000
 
 
 class Expectation(NamedTuple):
-    """An expectation under the posterior with its Monte Carlo standard error.
-
-    Attributes
-    ----------
-    value, error : float or array
-        The expectation and its standard error, one number or one per component of the function.
-    """
+    """An expectation under the posterior and its standard error: one number, or one per component of the function."""
 
     value: np.ndarray
     error: np.ndarray
 
 
 class SignedSample(NamedTuple):
-    """Points with weights of both signs, whose weighted sums are expectations under the posterior.
+    """Points with weights of both signs, whose weighted sums are expectations under the posterior."""
 
-    Attributes
-    ----------
-    coords : (m, ndim) float
-        Points of the known densities, and evaluated draws.
-    weights : (m,) float
-        Weights with sum 1; the weights of draws may be negative.
-    rounds : (m,) int
-        Number of the round of a draw, from 1; 0 for a point of a known density.
-    log_evidence, log_evidence_error : float
-        Logarithm of the evidence and its standard error.
-    """
-
-    coords: np.ndarray
-    weights: np.ndarray
-    rounds: np.ndarray
+    coords: np.ndarray  # (m, ndim), points of the known densities, and evaluated draws
+    weights: np.ndarray  # (m,), with sum 1; weights of draws may be negative
+    rounds: np.ndarray  # (m,) int, round of a draw, from 1; 0 for a point of a known density
     log_evidence: float
     log_evidence_error: float
 
@@ -145,13 +127,8 @@ class SignedSample(NamedTuple):
 def signed_sample(rounds: Sequence[Round]) -> SignedSample | None:
     """The signed sample of all rounds with a known density; None if there is none.
 
-    Rounds are independent estimates. Each counts with the inverse of the mean square of its differences.
-
-    Parameters
-    ----------
-    rounds : sequence of Round
-        Rounds of draws. Rounds without a possible draw, or without a draw where the known density is positive, are left
-        out.
+    Rounds are independent estimates. Each counts with the inverse of the mean square of its differences. Rounds without
+    a possible draw, or without a draw where the known density is positive, are left out.
     """
     found = [(r, *_differences(r)) for r in rounds if r.known is not None and _meets_known(r)]
     if not found:

@@ -40,22 +40,11 @@ def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
 def trace_founders(
     founders: Sequence[np.ndarray], ancestors: np.ndarray, min_share: float = MIN_FOUNDER_SHARE
 ) -> tuple[np.ndarray, ...]:
-    """Founders of each point after one more resampling, for several generations of founders.
+    """Founders (n,) of each point after one more resampling, per generation, the oldest generation first.
 
-    Parameters
-    ----------
-    founders : sequence of (n,) int
-        Previous result of this function; empty before the first resampling.
-    ancestors : (n,) int
-        Index of each point before the resampling.
-    min_share : float
-        A generation is dropped once it has fewer than this share of n founders left, or fewer than ten.
-
-    Returns
-    -------
-    tuple of (n,) int
-        Founder of each point, per generation, the oldest generation first. The last generation, the points before this
-        resampling, is always kept.
+    `founders` is the previous result, empty before the first resampling; `ancestors` (n,) are indices of the points
+    before the resampling. A generation is dropped once it has fewer than `min_share` n founders left, or fewer than
+    ten. The last generation, the points before this resampling, is always kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
     fewest = max(min_share * len(ancestors), MIN_FOUNDERS)
@@ -65,19 +54,9 @@ def trace_founders(
 
 
 def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarray:
-    """Standard error of the chain mean when walkers have common founders.
+    """Standard error (ndim,) of the mean of a chain (nsteps, nwalkers, ndim) whose walkers have `founders` (nwalkers,).
 
-    Parameters
-    ----------
-    chain : (nsteps, nwalkers, ndim) float
-        Positions of the walkers.
-    founders : (nwalkers,) int
-        Founder of each walker; the same number for walkers with the same founder.
-
-    Returns
-    -------
-    (ndim,) float
-        In the units of the parameters; inf if all walkers have one founder.
+    Infinite if all walkers have one founder.
     """
     sums = _sums_of_groups(chain, founders)
     count = len(sums)
@@ -89,22 +68,11 @@ def standard_error_of_mean(chain: np.ndarray, founders: np.ndarray) -> np.ndarra
 def worst_effective_sample_size(chain: np.ndarray, founders: np.ndarray) -> float:
     r"""Smallest effective sample size of a chain over all linear combinations of the parameters.
 
-    The effective sample size of a direction is the posterior variance along it divided by the squared standard error of
-    the mean. Errors per parameter do not reveal a bad direction of correlated parameters. The smallest estimate over
-    all directions tends to be too small, by a factor of at least :math:`(1 + \sqrt{d / K})^{-2}` for K groups
-    (Marchenko & Pastur 1967, doi:10.1070/SM1967v001n04ABEH001994).
-
-    Parameters
-    ----------
-    chain : (nsteps, nwalkers, ndim) float
-        Positions of the walkers.
-    founders : (nwalkers,) int
-        Founder of each walker.
-
-    Returns
-    -------
-    float
-        At most nsteps * nwalkers; 0 if all walkers have one founder.
+    The chain (nsteps, nwalkers, ndim) has `founders` (nwalkers,). The effective sample size of a direction is the
+    posterior variance along it divided by the squared standard error of the mean; 0 if all walkers have one founder.
+    Errors per parameter do not reveal a bad direction of correlated parameters. The smallest estimate over all
+    directions tends to be too small, by a factor of at least :math:`(1 + \sqrt{d / K})^{-2}` for K groups (Marchenko &
+    Pastur 1967, doi:10.1070/SM1967v001n04ABEH001994).
     """
     nsteps, nwalkers, ndim = chain.shape
     sums = _sums_of_groups(chain, founders)

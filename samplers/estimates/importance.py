@@ -1,31 +1,15 @@
 r"""Importance sampling: the evidence from weighted draws, and whether their weights are reliable.
 
-One proposal
-------------
-A mixture fitted to a population is a proposal for independent points inside the support of the prior. The mean of
-posterior / proposal over the draws estimates the evidence without tempering, and without bias as long as the proposal
-was not fitted to the draws. The Pareto shape of the weights (`samplers.estimates.pareto`) says whether points that were
-not drawn dominate the mean.
-
-Rounds
-------
-If the proposal changes from round to round, round r has :math:`n_r` independent draws of a density :math:`q_r` that was
-fixed before they were made. Each draw has the weight :math:`w_i = \pi(\theta_i) / q_r(\theta_i)` with the unnormalised
-posterior density :math:`\pi`. The mean weight :math:`\hat Z_r` is an unbiased estimate of the evidence, whatever the
-earlier rounds were like. The rounds are combined as
-:math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
+A proposal is fixed before its draws are made, so the mean of posterior / proposal over the draws estimates the evidence
+without bias. If the proposal changes from round to round, round r has :math:`n_r` draws and the mean weight
+:math:`\hat Z_r`, and the rounds are combined as :math:`\hat Z = \sum_r \alpha_r \hat Z_r`.
 
 The shares :math:`\alpha_r` must not depend on the weights of the same round: a round with one very large weight has a
 small effective sample size, and a smaller share for it would bias the evidence. Therefore :math:`\alpha_r` is
 proportional to the number of draws times the effective share (effective sample size / number of draws) of the
-*previous* round. The first round uses its own effective share.
+*previous* round. The first round uses its own effective share (Owen & Zhou 2020, doi:10.1145/3350426).
 
 The equations are in ``docs/theory/guided`` and ``docs/theory/evidence``.
-
-References
-----------
-Owen, A. B. & Zhou, Y. (2020), The square root rule for adaptive importance sampling, ACM Transactions on Modeling and
-Computer Simulation 30(2), doi:10.1145/3350426 (unbiased combinations of rounds)
 """
 
 from collections.abc import Callable, Sequence
@@ -120,25 +104,9 @@ def usable(effective_sample_size: float, pareto_shape: float, error: float, ndim
 def draw_inside(
     mixture: Mixture, n: int, random: np.random.RandomState, inside: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, int]:
-    """At most `n` draws of a mixture that lie inside a region, and the number of draws made.
+    """At most `n` draws (m, ndim) of a mixture inside a region, and the number of draws made to obtain them.
 
-    Parameters
-    ----------
-    mixture : Mixture
-        Mixture to draw from.
-    n : int
-        Number of draws wanted.
-    random : RandomState
-        Source of random numbers.
-    inside : callable
-        Function of points (m, ndim) that returns whether each lies inside (m,); called up to 50 times.
-
-    Returns
-    -------
-    coords : (at most n, ndim) float
-        The draws inside.
-    made : int
-        Number of draws made to obtain them.
+    `inside` is a function of points (m, ndim) that returns (m,) bool; it is called up to 50 times.
     """
     kept, found, made = [], 0, 0
     for _ in range(ROUNDS):
@@ -175,27 +143,11 @@ def evidence_from_weights(log_weights: np.ndarray, made: int) -> EvidenceCheck:
 
 
 def expected_efficiency(ndim: int, dof: float, components: int, points: float) -> float:
-    r"""Expected effective sample size per draw of a mixture fitted to draws from as many Gaussians.
+    r"""Expected effective sample size per draw, between 0 and 1, of a mixture fitted to draws from as many Gaussians.
 
     Without fitting noise it is :math:`1 / \mathrm{E}[p / q]` for a Gaussian p and the maximum-likelihood Student t q
-    with the same degrees of freedom as the mixture. With K components of d dimensions and n points, each fitted number
-    costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
-
-    Parameters
-    ----------
-    ndim : int
-        Number of parameters.
-    dof : float
-        Degrees of freedom.
-    components : int
-        Number of components.
-    points : float
-        Effective number of points that the mixture was fitted to.
-
-    Returns
-    -------
-    float
-        Between 0 and 1.
+    with the same degrees of freedom as the mixture. With K components of d dimensions and n effective `points`, each
+    fitted number costs about 1 / n: the efficiency is divided by :math:`1 + K d (d + 3) / (2 n)`.
     """
     return _efficiency_without_noise(ndim, dof) / (1.0 + components * ndim * (ndim + 3) / (2.0 * points))
 
@@ -249,44 +201,23 @@ FEWEST_FOR_GROWTH = 8
 
 
 class KnownDensity(NamedTuple):
-    """A normalised density whose expectations are known.
+    """A normalised density whose expectations are known."""
 
-    Attributes
-    ----------
-    log_density : callable
-        Function of points (n, ndim) that returns the logarithm of the normalised density (n,); -inf is allowed.
-    coords, weights : (m, ndim) float, (m,) float
-        Points of this density and their weights, with sum 1.
-    log_density_error : float
-        Standard error of the logarithm of the normalising constant.
-    """
-
+    # log of the normalised density (n,) at points (n, ndim); -inf is allowed
     log_density: Callable[[np.ndarray], np.ndarray]
-    coords: np.ndarray
-    weights: np.ndarray
-    log_density_error: float
+    coords: np.ndarray  # (m, ndim), points of this density
+    weights: np.ndarray  # (m,), with sum 1
+    log_density_error: float  # standard error of the log normalising constant
 
 
 class Round(NamedTuple):
-    """Draws of one proposal density.
+    """Draws of one proposal density, which was fixed before they were made."""
 
-    Attributes
-    ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        The draws and their records (log_prob, log_prior and, where there are any, blobs).
-    log_weights : (n,) float
-        Log-probability minus log-density of the proposal; -inf for impossible points.
-    known : KnownDensity, optional
-        A known density close to the posterior, fixed before the draws were made.
-    log_known : (n,) float, optional
-        Log-density of `known` minus log-density of the proposal.
-    """
-
-    coords: np.ndarray
-    records: np.ndarray
-    log_weights: np.ndarray
-    known: KnownDensity | None = None
-    log_known: np.ndarray | None = None
+    coords: np.ndarray  # (n, ndim)
+    records: np.ndarray  # (n,), fields log_prob, log_prior and, where there are any, blobs
+    log_weights: np.ndarray  # (n,), log_prob minus log-density of the proposal; -inf for impossible points
+    known: KnownDensity | None = None  # close to the posterior, fixed before the draws were made
+    log_known: np.ndarray | None = None  # (n,), log-density of `known` minus log-density of the proposal
 
     @property
     def effective_sample_size(self) -> float:
@@ -305,39 +236,21 @@ class Round(NamedTuple):
 
 
 class PooledRounds(NamedTuple):
-    """All draws of several rounds.
+    """All draws of several rounds."""
 
-    Attributes
-    ----------
-    coords, records : (n, ndim) float, (n,) structured array
-        The draws and their records.
-    log_weights : (n,) float
-        Log-weights, whose sum of exponentials is the evidence.
-    log_evidence, log_evidence_error : float
-        Log-evidence and its standard error.
-    effective_sample_size, pareto_shape : float
-        Effective sample size and `tail_shape` of the weights.
-    """
-
-    coords: np.ndarray
-    records: np.ndarray
-    log_weights: np.ndarray
+    coords: np.ndarray  # (n, ndim)
+    records: np.ndarray  # (n,), as in `Round`
+    log_weights: np.ndarray  # (n,), whose sum of exponentials is the evidence
     log_evidence: float
     log_evidence_error: float
     effective_sample_size: float
-    pareto_shape: float
+    pareto_shape: float  # `tail_shape` of the weights
 
 
 def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.ndarray:
-    """Share of each round in the evidence, with sum 1.
+    """Share of each round in the evidence, with sum 1, from numbers of draws and effective shares per round.
 
-    Parameters
-    ----------
-    sizes : sequence of int
-        Number of draws per round.
-    effective_shares : sequence of float
-        Effective sample size of each round divided by its number of draws. The last one is used only if it is the only
-        one.
+    The last effective share is used only if there is one round.
     """
     lagged = [effective_shares[0], *effective_shares[:-1]]
     # a round after a round without a single effective draw still counts as one point
@@ -346,16 +259,11 @@ def round_shares(sizes: Sequence[int], effective_shares: Sequence[float]) -> np.
 
 
 def tail_shape(log_weights: np.ndarray) -> float:
-    """Pareto shape of the largest weights if they contribute to the mean; 0 if they do not.
+    """Pareto shape of the largest weights, from log-weights (n,), if they contribute to the mean; 0 if they do not.
 
     If a guide describes the posterior nearly exactly, its weights are equal except for small errors, whose shape says
     nothing about the mean. The shape is used only if the largest weights exceed the next weight, in total, by at least
     5 % of the sum over all weights.
-
-    Parameters
-    ----------
-    log_weights : (n,) float
-        Logarithms of the weights, at least one of them finite.
     """
     shape = pareto_shape(log_weights)
     if not np.isfinite(shape):
@@ -367,26 +275,15 @@ def tail_shape(log_weights: np.ndarray) -> float:
 
 
 def tail_growth(rounds: Sequence[Round], part: float = 0.5) -> tuple[float, float]:
-    r"""Slope of the log-weights over minus the log-posterior, among the draws with the lowest posterior.
+    r"""Slope of the log-weights over minus the log-posterior, among a `part` of the draws, and the error of the slope.
 
-    If the posterior :math:`\pi` is proportional to a power :math:`q^c` of the proposal density, the slope is
-    :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the posterior. Draws from light tails
-    do not reach the places with large weights, so all weights may be small. Errors of a proposal, and jumps of a
-    likelihood, do not make the slope positive on average.
+    The part has the lowest posterior. If the posterior :math:`\pi` is proportional to a power :math:`q^c` of the
+    proposal density, the slope is :math:`(1 - c) / c`, which is positive if the proposal has lighter tails than the
+    posterior. Draws from light tails do not reach the places with large weights, so all weights may be small. Errors of
+    a proposal, and jumps of a likelihood, do not make the slope positive on average.
 
-    Parameters
-    ----------
-    rounds : sequence of Round
-        Draws of proposals that were fixed before the draws were made.
-    part : float
-        Share of the draws that is used: the draws with the lowest posterior.
-
-    Returns
-    -------
-    slope, error : float
-        The slope and its error, by least squares; (0, inf) for fewer than 8 draws in the part. The error is the
-        standard error times a factor above 1 for few draws: 4 errors are exceeded with the same probability for any
-        number.
+    The fit is by least squares, and (0, inf) for fewer than 8 draws in the part. The error is the standard error times
+    a factor above 1 for few draws: 4 errors are exceeded with the same probability for any number.
     """
     log_prob = np.concatenate([r.records["log_prob"] for r in rounds])
     log_weights = np.concatenate([r.log_weights for r in rounds])
@@ -413,17 +310,12 @@ def tails_are_light(rounds: Sequence[Round]) -> bool:
 
 
 def tail_variance(log_weights: np.ndarray) -> float:
-    r"""Variance of the log-evidence due to weights larger than all drawn weights.
+    r"""Variance of the log-evidence due to weights larger than all drawn weights, from log-weights (n,).
 
     If the largest weights have a Pareto shape :math:`0 < k < 1`, the mean excess over the largest normalised weight
     :math:`W_{max}` is about :math:`k W_{max} / (1 - k)`, which is taken as a standard error. It is infinite for
     :math:`k \ge 1`. If there are too few weights for an estimate, k is 0.7. With an effective sample size below 5,
     points that were not drawn may have any weight, and the variance is infinite.
-
-    Parameters
-    ----------
-    log_weights : (n,) float
-        Logarithms of the weights, at least one of them finite.
     """
     shape = tail_shape(log_weights)
     shape = SHAPE_OF_FEW if shape == np.inf else shape
@@ -434,23 +326,12 @@ def tail_variance(log_weights: np.ndarray) -> float:
 
 
 def pool_rounds(rounds: Sequence[Round], log_density_error: float = 0.0) -> PooledRounds:
-    r"""Combine rounds.
+    r"""Combine one or more rounds, in order.
 
     The variance of the log-evidence is the sum of three parts: the variance of the mean weights per round,
     :math:`\sum_r \alpha_r^2 s_r^2 / (n_r \hat Z^2)` with the sample variance :math:`s_r^2` of the weights, or the
     variance between the rounds, :math:`\sum_r \alpha_r^2 (\hat Z_r / \hat Z - 1)^2`, if it is larger; `tail_variance`;
-    and the squared error of the proposal's log normalising constant.
-
-    Parameters
-    ----------
-    rounds : sequence of Round
-        At least one, in order.
-    log_density_error : float
-        Standard error of the proposal density's log normalising constant.
-
-    Returns
-    -------
-    PooledRounds
+    and the square of `log_density_error`, the standard error of the proposal's log normalising constant.
     """
     sizes = [len(r.log_weights) for r in rounds]
     shares = round_shares(sizes, [r.effective_share for r in rounds])

@@ -45,22 +45,7 @@ def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
-    """Weights with sum 1.
-
-    Parameters
-    ----------
-    log_weights : (n,) float
-        Logarithms of the weights, with any offset; -inf is allowed.
-
-    Returns
-    -------
-    (n,) float
-        Normalised weights.
-
-    Raises
-    ------
-    ValueError
-        If all weights are zero.
+    """Weights (n,) with sum 1, from log-weights with any offset; -inf is allowed. ValueError if all weights are zero.
     """
     weights, top = _scaled(log_weights)
     if top == -np.inf:
@@ -96,20 +81,13 @@ class EvidenceError:
     r"""Standard error of the log-evidence, accumulated during one run.
 
     Points are grouped by their founder. With :math:`W_{ij}` the normalised weight of point i at stage j, group k
-    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)` to the log-evidence, without the noise of
-    resampling. Groups are independent, thus :math:`\mathrm{Var}(\log Z) \approx \sum_k A_k^2` (Chan & Lai 2013). If
-    moves mix well, it tends to the variance of the mean weight, summed over the stages. If points never move, it is the
-    error of plain importance sampling: poor mixing is not hidden.
+    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)` to the log-evidence, without the noise of resampling.
+    Groups are independent, thus :math:`\mathrm{Var}(\log Z) \approx \sum_k A_k^2` (Chan & Lai 2013). If moves mix well,
+    it tends to the variance of the mean weight, summed over the stages. If points never move, it is the error of plain
+    importance sampling: poor mixing is not hidden.
 
-    The sum is unreliable with few groups. Once fewer founders than `min_founder_share` times the number of points are
-    left, the sums are closed and every point becomes a founder. Closed sums are treated as independent of later sums.
-
-    Parameters
-    ----------
-    n_points : int
-        Number of points.
-    min_founder_share : float
-        Share of `n_points` below which the groups are formed anew.
+    The sum is unreliable with few groups. Once fewer founders than `min_founder_share` times `n_points` are left, the
+    sums are closed and every point becomes a founder. Closed sums are treated as independent of later sums.
     """
 
     def __init__(self, n_points: int, min_founder_share: float = 0.1):
