@@ -1,10 +1,9 @@
 """Evaluation of points that arrive in any order, so that no worker waits for the slowest point of a batch.
 
 Points are submitted to a queue as soon as they are proposed. The record of the run contains the finished points and,
-for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had arrived before it. An interrupted run,
-when repeated, makes the same decisions from the record and continues with the same bits. Points that were running when
-the process ended are submitted again. If Ctrl-C or an error ends the run, finished points are entered in the record
-first.
+for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had arrived before it, so that an
+interrupted run, when repeated, makes the same decisions and continues with the same bits. Points that were running when
+the process ended are submitted again.
 """
 
 import hashlib
@@ -29,14 +28,9 @@ class EvaluationQueue(Protocol):
 
     A queue may also have a method ``ended()``, which returns numbers and values of all points that have ended, without
     waiting, including the points that the last `collect` has returned. It is called before `close`.
-
-    Attributes
-    ----------
-    workers : int or None
-        Number of points that are evaluated at once, if it is known.
     """
 
-    workers: int | None
+    workers: int | None  # number of points that are evaluated at once, if it is known
 
     def submit(self, coords: np.ndarray) -> list[int]:
         """Begin to evaluate points (n, ndim) without waiting; returns a number for each, which is never used again."""
@@ -49,15 +43,7 @@ class EvaluationQueue(Protocol):
 
 
 class AsynchronousEvaluator(Evaluator):
-    """An evaluator whose `submit` returns without waiting.
-
-    Parameters
-    ----------
-    *args, **kwargs
-        As for `samplers.evaluation.evaluator.Evaluator`.
-    open_queue : callable
-        Called without arguments before the first point is submitted; returns an `EvaluationQueue`.
-    """
+    """An evaluator whose `submit` returns without waiting; ``open_queue(pool)`` is called before the first point."""
 
     asynchronous = True
 

@@ -1,11 +1,9 @@
 """Evaluation of a log-density at batches of points: calls, failures, and the records that travel with the points.
 
-`Evaluator` calls a user's function as emcee does (batch, pool or map; dictionaries for named parameters). Points
-outside the support of the prior are not evaluated. A point for which the function raises an exception or returns NaN
-counts as -inf, and its reason is recorded.
-
-A batch is entered in the record of the run (`samplers.record`) when it is finished. If a function takes one point at a
-time, finished points are entered every 0.05 s, so that a killed process loses only the points of this time.
+Functions are called as emcee calls them. A point for which the function raises an exception or returns NaN counts as
+-inf, and its reason is recorded. A batch is entered in the record of the run (`samplers.record`) when it is finished;
+if a function takes one point at a time, finished points are entered every 0.05 s, so that a killed process loses only
+these.
 """
 
 import time
@@ -144,43 +142,13 @@ class Evaluator:
     """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
 
     Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs: a walker
-    carries all three through moves and resampling.
+    carries all three through moves and resampling. Points outside the support of the prior are not evaluated. The
+    log-prior is added to the values of a function whose `name`, also in messages, is "log_likelihood_fn".
 
-    Parameters
-    ----------
-    function : ErrorCapturing
-        The log-density, or the log-likelihood.
-    log_prior_fn : callable
-        The log-prior.
-    convention : CallingConvention
-        How both are called.
-    record : Record, optional
-        Where evaluations are entered and looked up; a new one in memory by default.
-    limit : FailureLimit, optional
-        When failures stop the run; never by default.
-    budget : Budget, optional
-        Limits simulations; no limit by default.
-    name : str
-        Name of the function in messages. The log-prior is added to the values of a "log_likelihood_fn".
-
-    Attributes
-    ----------
-    record, budget
-        See above.
-    evaluates_parts : bool
-        Whether the first points of a batch that does not fit into the limit of simulations are evaluated.
-    evaluations : int
-        Number of points that were asked for, evaluated by this object or found in the record.
-    new_evaluations : int
-        Number of points that this object has evaluated.
-    pool : object with a method map, optional
-        Where functions of one point are called; set by the sampler.
-    observer : Observer, optional
-        Told of points while they are evaluated.
-    on_unknown : callable, optional
-        Called once, before the first evaluation of a point that is not in the record.
-    asynchronous : bool
-        Whether `submit` returns without waiting.
+    `evaluations` counts the points that were asked for, `new_evaluations` those that this object has evaluated instead
+    of finding them in the record. `evaluates_parts` says whether the first points of a batch that does not fit into the
+    limit of simulations are evaluated. `on_unknown` is called once, before the first evaluation of a point that is not
+    in the record. The sampler sets `pool`, where functions of one point are called.
     """
 
     asynchronous = False

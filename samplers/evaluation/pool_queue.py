@@ -42,18 +42,8 @@ def open_queue(
 ) -> Any:
     """The queue of a posterior or of a pool (`samplers.evaluation.asynchronous.EvaluationQueue`).
 
-    Parameters
-    ----------
-    function : callable
-        The user's function.
-    captured : callable
-        The same function, which returns `Failed` instead of raising.
-    as_items : callable
-        Converts points (n, ndim) to a sequence of arguments for the function.
-    queue : callable, optional
-        Opens the queue of a posterior in place of its method ``evaluation_queue``.
-    pool : object, optional
-        The pool.
+    `captured` is the user's `function`, but returns `Failed` instead of raising; `as_items` converts points (n, ndim)
+    to its arguments; `queue` opens the queue of a posterior in place of its method ``evaluation_queue``.
     """
     if _has_queue(function, pool):
         return function.evaluation_queue() if queue is None else queue()
@@ -92,14 +82,9 @@ def map_in(pool: Any) -> Callable:
 class PoolQueue:
     """A function of one point in a pool (`samplers.evaluation.asynchronous.EvaluationQueue`).
 
-    Parameters
-    ----------
-    function : callable
-        Function of a point, which can be sent to the workers and returns `Failed` instead of raising.
-    pool : concurrent.futures.Executor or dask.distributed.Client
-        The pool; the executors of mpi4py and loky are `concurrent.futures.Executor` objects.
-    as_items : callable
-        Converts points (n, ndim) to a sequence of arguments for the function.
+    The function can be sent to the workers, and returns `Failed` instead of raising; `as_items` converts points (n,
+    ndim) to its arguments. The pool is a `concurrent.futures.Executor`, as those of mpi4py and loky are, or a client of
+    dask.
     """
 
     def __init__(self, function: Callable, pool: Any, as_items: Callable[[Any], Sequence]):
@@ -137,12 +122,8 @@ class PoolQueue:
     def collect(self) -> list[tuple[int, Any]]:
         """Wait for a finished point; returns numbers and values of all finished points, in the order of completion.
 
-        Raises
-        ------
-        KeyboardInterrupt, SystemExit
-            If the function has raised it. Points that finished before are returned first, here and below.
-        RuntimeError
-            If no point is running, or the pool cannot continue.
+        Raises KeyboardInterrupt or SystemExit if the function has raised it, and RuntimeError if no point is running or
+        the pool cannot continue. Points that finished before are returned first.
         """
         for ticket in self._handed:
             self._ended.pop(ticket, None)  # first: `ended` may be called if Ctrl-C comes between the two

@@ -17,32 +17,16 @@ logger = logging.getLogger(__name__)
 
 
 class OptionalAttributes(NamedTuple):
-    """Optional attributes of a user's log-posterior or log-likelihood.
+    """Optional attributes of a user's log-posterior or log-likelihood."""
 
-    Attributes
-    ----------
-    log_prior : callable, optional
-        Log-prior of a point or a batch.
-    sample_prior : callable, optional
-        Function of (n, random) that returns n draws of the prior.
-    report : callable, optional
-        Function that returns a dictionary, such as ``{"simulations": 120}``.
-    possible : callable, optional
-        Function of points (n, ndim), always an array, that returns whether each point may have a positive density (n,),
-        as far as is known without a simulation. A value of -inf at other points is not a failed simulation.
-    fast_parameters : sequence of int
-        Indices of parameters whose change needs no simulation, such as noise levels: points that differ only in these
-        count as one simulation.
-    ndim : int, optional
-        Number of parameters.
-    parameter_names : sequence of str
-        Names of the parameters.
-    """
-
-    log_prior: Callable | None
-    sample_prior: Callable | None
-    report: Callable[[], Mapping[str, Any]] | None
+    log_prior: Callable | None  # of a point or a batch
+    sample_prior: Callable | None  # function of (n, random) that returns draws (n, ndim) of the prior
+    report: Callable[[], Mapping[str, Any]] | None  # returns a dictionary, such as {"simulations": 120}
+    # Whether points (n, ndim), always an array, may have a positive density, (n,) bool, as far as is known without a
+    # simulation. A value of -inf at other points is not a failed simulation.
     possible: Callable[[np.ndarray], np.ndarray] | None
+    # Indices of parameters whose change needs no simulation, such as noise levels: points that differ only in these
+    # count as one simulation.
     fast_parameters: Sequence[int]
     ndim: int | None
     parameter_names: Sequence[str]
