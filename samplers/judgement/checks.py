@@ -123,17 +123,9 @@ def check_evidence(
 ) -> list[Concern]:
     """Concerns if the two estimates of the evidence disagree, or if its error is large.
 
-    The limits come from 1277 right and 180 wrong runs with known posteriors: such errors go with wrong means as well.
-    A `check` with even weights that is higher than the stages has found what the stages have lost: it is right.
-
-    Parameters
-    ----------
-    log_evidence, error : float
-        Log-evidence of the stages and its standard error.
-    check : EvidenceCheck, optional
-        The second estimate, from fresh draws; None without.
-    several_modes : bool
-        Whether the final points are in more than one mode.
+    `log_evidence` and `error` belong to the stages, `check` to fresh draws. The limits come from 1277 right and 180
+    wrong runs with known posteriors: such errors go with wrong means as well. A `check` with even weights that is
+    higher than the stages has found what the stages have lost: it is right.
     """
     concerns, believed = [], check is not None and check.reliable
     difference = 0.0 if check is None else abs(log_evidence - check.log_evidence)

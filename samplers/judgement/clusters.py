@@ -1,12 +1,9 @@
-r"""Modes of a finished run: clusters of its final points, with shares and their errors.
+"""Modes of a finished run: clusters of its final points, with shares and their errors.
 
-A mixture of Student t is fitted to the final points (`samplers.proposals.mixture`). Two components belong to the same
-mode if the mixture density along the straight line between their means does not fall below a fifth of its lower end
-value; components in between connect other components. For two equal Gaussian components, this is a distance of about 4
-standard deviations. The share of a mode is the probability that a point belongs to one of its components, averaged over
-the chain.
-
-The mixture describes the points of the run, so a mode that holds no points is not found.
+Two components of a mixture fitted to the final points belong to the same mode if the mixture density along the straight
+line between their means does not fall below a fifth of its lower end value, which for two equal Gaussian components is
+a distance of about 4 standard deviations; components in between connect other components. The share of a mode is the
+probability that a point belongs to one of its components, averaged over the chain. A mode without points is not found.
 """
 
 from typing import NamedTuple
@@ -44,19 +41,10 @@ class Cluster(NamedTuple):
 
 
 def find_clusters(chain: np.ndarray, founders: np.ndarray) -> tuple[Cluster, ...]:
-    """Modes of a chain, the largest first.
+    """Modes of a chain (nsteps, nwalkers, ndim), the largest first, with shares whose sum is 1; the last step defines
+    them.
 
-    Parameters
-    ----------
-    chain : (nsteps, nwalkers, ndim) float
-        Positions of the walkers; the last step defines the modes.
-    founders : (nwalkers,) int
-        Founder of each walker.
-
-    Returns
-    -------
-    tuple of Cluster
-        The shares sum to 1.
+    `founders` (nwalkers,) are the founder of each walker (`samplers.estimates.genealogy`).
     """
     nsteps, nwalkers, ndim = chain.shape
     flat = chain.reshape(-1, ndim)

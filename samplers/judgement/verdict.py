@@ -47,22 +47,12 @@ STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 
 
 class EvidenceEstimate(NamedTuple):
-    """One estimate of the evidence in a run.
+    """One estimate of the evidence in a run."""
 
-    Attributes
-    ----------
-    source : {"stages", "check", "guide"}
-        The tempering stages (with recycling, all evaluated points), fresh draws after the annealing, or a guide.
-    log_evidence, error : float
-        Log-evidence and its standard error.
-    reliable : bool
-        Whether the weights are even enough for the error to be meaningful.
-    """
-
-    source: str
+    source: str  # "stages" (with recycling, all evaluated points), "check" (fresh draws after the annealing) or "guide"
     log_evidence: float
-    error: float
-    reliable: bool
+    error: float  # standard error of `log_evidence`
+    reliable: bool  # whether the weights are even enough for the error to be meaningful
 
 
 class RunParts(NamedTuple):
@@ -238,20 +228,9 @@ def judge(
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
-    Parameters
-    ----------
-    result : AnnealingResult
-        Result of the annealing.
-    nwalkers, ndim : int
-        Size of the ensemble.
-    simulations, searched : float
-        Simulations made, and the part made by the guide for its search.
-    missing_steps : int
-        Steps at beta = 1 that the limit of simulations did not allow.
-    failures : str
-        How many evaluations failed, for the reasons; empty if none did.
-    near : NearFailures, optional
-        Failures in the region of the final points; None if they are not known.
+    `searched` is the part of the `simulations` made by the guide for its search. `missing_steps` at beta = 1 were not
+    allowed by the limit of simulations. `failures` says how many evaluations failed, empty if none did; `near` are
+    failures in the region of the final points, None if they are not known.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]
