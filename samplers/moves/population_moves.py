@@ -1,14 +1,9 @@
-"""Mutation kernels in the form of emcee moves.
+"""Mutation kernels in the form of emcee moves, which also adapt to the population.
 
-A tempered sampler resamples its population and then moves it at the new beta. Any emcee move can do this. The moves in
-this module also adapt to the population: their method ``calibrate(coords, weights, inside)`` is called once per stage
-with the points of the previous stage, their weights at the new beta, and a function that returns which points lie in
-the support of the prior. They propose for all walkers at once.
-
-Proposals are fitted in units of the weighted standard deviations, so parameters with very different magnitudes (2e-4 s
-and 3e10 Pa, for example) cause no numerical problem.
-
-The acceptance probabilities are derived in ``docs/theory/tempering``.
+Their method ``calibrate(coords, weights, inside)`` is called once per stage with the points of the previous stage,
+their weights at the new beta, and a function that returns which points lie in the support of the prior. Proposals are
+for all walkers at once, and fitted in units of the weighted standard deviations, so that very different magnitudes of
+parameters (2e-4 s and 3e10 Pa) cause no numerical problem. Acceptances are derived in ``docs/theory/tempering``.
 """
 
 import copy
@@ -65,17 +60,9 @@ Inside = Callable[[np.ndarray], np.ndarray]
 
 
 def describe(move: Move) -> dict:
-    """Describe a move as plain data: its class and its settings.
+    """A move as plain data: ``{"class": name, setting: value, ...}``, with nested moves in the same form.
 
-    Parameters
-    ----------
-    move : emcee.moves.Move
-        The move. Its settings are its public attributes that are None, bool, int, float, str, moves or lists of moves.
-
-    Returns
-    -------
-    dict
-        ``{"class": name, setting: value, ...}``; nested moves are described in the same way.
+    Its settings are its public attributes that are None, bool, int, float, str, moves or lists of moves.
     """
     settings = {}
     for name, value in sorted(vars(move).items()):
