@@ -98,18 +98,7 @@ class _Quadratic(NamedTuple):
 def cover_basins(
     mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
 ) -> Mixture:
-    """Add components to a mixture for parts of the target that it does not cover.
-
-    Parameters
-    ----------
-    mixture, coords, log_target, most, share
-        As for `find_basins`.
-
-    Returns
-    -------
-    Mixture
-        The mixture itself if it covers all points.
-    """
+    """Add the components of `find_basins`, with the same arguments, to a mixture."""
     return with_components(mixture, find_basins(mixture, coords, log_target, most, share))
 
 
@@ -128,26 +117,11 @@ def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:
 def find_basins(
     mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
 ) -> Mixture | None:
-    """Components for parts of the target that a mixture does not cover.
+    """Components for parts of the target that a mixture, fitted to points (n, ndim), does not cover; None without any.
 
-    Parameters
-    ----------
-    mixture : Mixture
-        A mixture fitted to the points.
-    coords : ndarray, shape (n, ndim)
-        Points.
-    log_target : ndarray, shape (n,)
-        Logarithm of the target, scaled so that its integral is about 1; -inf is allowed.
-    most : int
-        Largest number of components.
-    share : float
-        Smallest weight of a component. For a basin with a larger estimated mass, the weight is larger, up to 0.25.
-
-    Returns
-    -------
-    Mixture or None
-        The components, in the component space of the mixture. Their total weight, at most 0.5, is the share of draws
-        that they should receive. None if the mixture covers all points.
+    `log_target` (n,) is scaled so that the integral of the target is about 1; -inf is allowed. There are at most `most`
+    components, in the component space of the mixture, each with the weight `share` or more: up to 0.25 for a basin with
+    a larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)

@@ -1,20 +1,9 @@
 """Mixtures of multivariate Student t, fitted to weighted points: an approximation of a population as a density.
 
-A few components represent a population with several modes or a curved ridge well enough for proposals. The heavy tails
-keep the ratio of target to proposal bounded if the fit is too narrow. The number of components minimises the Bayesian
-information criterion, with the effective number of weighted points as sample size.
-
-Fits are made in coordinates that whiten the whole population, so very different magnitudes of parameters (2e-4 s and
-3e10 Pa, say) cause no numerical problem. Fits are deterministic: the same points and weights give the same mixture.
-
-Equations, constants and their reasons are in ``docs/theory/proposals``.
-
-References
-----------
-Peel, D. & McLachlan, G. J. (2000), Robust mixture modelling using the t distribution, Statistics and Computing 10,
-doi:10.1023/A:1008981510081 (expectation-maximisation)
-
-Schwarz, G. (1978), Estimating the dimension of a model, Annals of Statistics 6(2), doi:10.1214/aos/1176344136
+Heavy tails keep the ratio of target to proposal bounded if the fit is too narrow. Fits by expectation-maximisation
+(Peel & McLachlan 2000, doi:10.1023/A:1008981510081) are deterministic, in coordinates that whiten the population; the
+number of components minimises the Bayesian information criterion (Schwarz 1978, doi:10.1214/aos/1176344136), with the
+effective number of points as sample size. Equations, constants and their reasons are in ``docs/theory/proposals``.
 """
 
 import math
@@ -77,32 +66,16 @@ SMALLEST_SD = 1e-150
 class Mixture(NamedTuple):
     """A mixture of K multivariate Student t, or of normal distributions for infinite degrees of freedom.
 
-    Attributes
-    ----------
-    weights : ndarray, shape (K,)
-        Weights of the components, with sum 1.
-    means : ndarray, shape (K, ndim)
-        Locations of the components.
-    roots : ndarray, shape (K, ndim, ndim)
-        Lower-triangular roots of the scale matrices (covariance times (dof - 2) / dof).
-    inverses : ndarray, shape (K, ndim, ndim)
-        Inverses of the roots.
-    dof : float
-        Degrees of freedom.
-    shears : tuple of Shear
-        Maps that remove curvature. Components are defined in the space after `bounds` and then `shears` are applied
-        (the component space).
-    bounds : SupportBounds, optional
-        Bounds that are removed by the transformation to the whole real line.
+    Components are defined in the space after `bounds` and then `shears` are applied (the component space).
     """
 
-    weights: np.ndarray
-    means: np.ndarray
-    roots: np.ndarray
-    inverses: np.ndarray
-    dof: float
-    shears: tuple[Shear, ...] = ()
-    bounds: SupportBounds | None = None
+    weights: np.ndarray  # (K,), with sum 1
+    means: np.ndarray  # (K, ndim), locations
+    roots: np.ndarray  # (K, ndim, ndim), lower-triangular roots of the scale matrices, covariance times (dof - 2) / dof
+    inverses: np.ndarray  # (K, ndim, ndim), of the roots
+    dof: float  # degrees of freedom
+    shears: tuple[Shear, ...] = ()  # maps that remove curvature
+    bounds: SupportBounds | None = None  # removed by the transformation to the whole real line
 
     @property
     def covariances(self) -> np.ndarray:
@@ -195,29 +168,15 @@ def fit_mixture(
     bounds: SupportBounds | None = None,
     dof: float = DOF,
 ) -> Mixture:
-    """Fit a mixture; the number of components minimises the Bayesian information criterion.
+    """Fit a mixture to points (n, ndim); the number of components minimises the Bayesian information criterion.
 
     Components are added one at a time, each by splitting an existing component, as long as the criterion improves. Each
-    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then fewer
-    degrees of freedom are tried, for points with heavier tails. If shears (`samplers.proposals.transforms`) improve the
+    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then 4, 3
+    and 2.5 degrees of freedom are tried instead of `dof`, which is above 2, for points with heavier tails. If shears
+    (`samplers.proposals.transforms`), or a transformation that removes `bounds` near the population, improve the
     criterion, the components are fitted to the transformed points.
 
-    Parameters
-    ----------
-    coords : ndarray, shape (n, ndim)
-        Points.
-    weights : ndarray, shape (n,)
-        Non-negative weights with sum 1. Points with less than 1e-3 of the mean weight are left out.
-    max_components : int
-        Largest number of components.
-    bounds : SupportBounds, optional
-        Bounds of the support. A transformation removes bounds near the population if this improves the criterion.
-    dof : float
-        Largest degrees of freedom, above 2. The value with the best criterion among `dof`, 4, 3 and 2.5 is used.
-
-    Returns
-    -------
-    Mixture
+    `weights` (n,) have sum 1; points with less than 1e-3 of the mean weight are left out.
     """
     mixture, criterion = _fit_with_shears(coords, weights, max_components, dof)
     near = None if bounds is None else near_bounds(bounds, coords, weights)
@@ -428,25 +387,11 @@ def _components(
 
 
 def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean and a non-singular root of the weighted covariance.
+    """Weighted mean (ndim,) and a lower-triangular, non-singular root (ndim, ndim) of the weighted covariance.
 
-    The root is the standard deviations times the root of the correlation matrix. With fewer than five effective points
-    per dimension the correlations are poorly determined and are shrunk towards zero. If the matrix is still singular,
-    its diagonal is increased until it is not.
-
-    Parameters
-    ----------
-    coords : ndarray, shape (n, ndim)
-        Points.
-    weights : ndarray, shape (n,)
-        Non-negative weights with sum 1.
-
-    Returns
-    -------
-    mean : ndarray, shape (ndim,)
-        Weighted mean.
-    root : ndarray, shape (ndim, ndim)
-        Lower-triangular root of the covariance.
+    `weights` (n,) have sum 1. The root is the standard deviations times the root of the correlation matrix. With fewer
+    than five effective points per dimension the correlations are poorly determined and are shrunk towards zero. If the
+    matrix is still singular, its diagonal is increased until it is not.
     """
     mean = weights @ coords
     centred = coords - mean

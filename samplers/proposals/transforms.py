@@ -1,39 +1,19 @@
 """Transformations that make a population nearly Gaussian: maps without bounds, and shears without curvature.
 
-Bounds
-------
-A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and a mixture of
-bell-shaped components cannot follow it in many dimensions. A map removes the bound. For a single bound, the map is the
-logarithm of the distance near the bound and linear far from it, which makes an exponential posterior symmetric. Between
-two bounds it is the logit.
+A posterior that is concentrated at a bound, such as a damping ratio near zero, is truncated there, and bell-shaped
+components cannot follow it. The map is the logit between two bounds; for a single bound it is the logarithm of the
+distance near the bound and linear far from it. A sampler knows only whether a point lies in the support, without a
+simulation, so each bound is bracketed and bisected along lines through several points. If the lines disagree, the
+support is not a box, and the parameter is treated as unbounded.
 
-The bounds are found numerically, because a sampler knows only whether a point lies in the support. Evaluating that
-needs no simulation. For each parameter the bounds are bracketed and bisected along lines through several points. If the
-lines disagree, the support is not a box, and the parameter is treated as unbounded. Equations and choices are in
-``docs/theory/proposals``.
-
-Shears
-------
-If the data determine only a combination of parameters, such as the product of two stiffnesses, the posterior is a
-curved ridge that a small number of ellipsoids cannot cover. A shear
+If the data determine only a combination of parameters, such as a product, the posterior is a curved ridge. A shear
 
     x_target <- x_target - a t - b t^2,   t = (x_source - mean) / sd,
 
-removes the curvature. It is a triangular map with unit Jacobian determinant, and its inverse adds what was subtracted.
-Densities therefore carry over without a correction, and a step that is symmetric in the transformed points is symmetric
-in the original points.
-
-Haario, Saksman & Tamminen (1999) use these maps in the opposite direction, to construct banana-shaped targets from
-Gaussians. Parno & Marzouk (2018) describe triangular maps as preconditioners for sampling in general. The greedy
-selection of pairs by the Bayesian information criterion is a choice of this project; see ``docs/theory/proposals``.
-
-References
-----------
-Haario, H., Saksman, E. & Tamminen, J. (1999), Adaptive proposal distribution for random walk Metropolis algorithm,
-Computational Statistics 14, doi:10.1007/s001800050022
-
-Parno, M. D. & Marzouk, Y. M. (2018), Transport map accelerated Markov chain Monte Carlo, SIAM/ASA Journal on
-Uncertainty Quantification 6(2), doi:10.1137/17M1134640
+removes the curvature. Its Jacobian determinant is 1, so densities carry over without a correction, and a step that is
+symmetric in the transformed points is symmetric in the original points. Equations, sources and choices are in
+``docs/theory/proposals`` (Haario, Saksman & Tamminen 1999, doi:10.1007/s001800050022; Parno & Marzouk 2018,
+doi:10.1137/17M1134640).
 """
 
 import math
@@ -215,25 +195,13 @@ DEGENERATE = 1e-6
 
 
 class Shear(NamedTuple):
-    """A map that subtracts ``linear t + quadratic t^2`` from one parameter, where ``t = (x[source] - mean) / sd``.
+    """A map that subtracts ``linear t + quadratic t^2`` from one parameter, where ``t = (x[source] - mean) / sd``."""
 
-    Attributes
-    ----------
-    target : int
-        Index of the parameter that is changed.
-    source : int
-        Index of the parameter that the change depends on.
-    mean, sd : float
-        Mean and standard deviation of the source, in its unit.
-    linear, quadratic : float
-        Coefficients, in the unit of the target.
-    """
-
-    target: int
-    source: int
-    mean: float
+    target: int  # index of the parameter that is changed
+    source: int  # index of the parameter that the change depends on
+    mean: float  # of the source, in its unit, as sd
     sd: float
-    linear: float
+    linear: float  # coefficient in the unit of the target, as quadratic
     quadratic: float
 
 
