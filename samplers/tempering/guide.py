@@ -114,20 +114,7 @@ class Guide(Protocol):
 
 
 class AdaptedGuide:
-    """A user's guide, with `DEFAULTS` for the members that it does not have.
-
-    Parameters
-    ----------
-    guide : Guide
-        The user's guide; a fresh copy of it is used.
-    ndim : int
-        Number of parameters.
-
-    Attributes
-    ----------
-    guide : Guide
-        The copy in use.
-    """
+    """A fresh copy, `guide`, of a user's guide, with `DEFAULTS` for the members that it does not have."""
 
     def __init__(self, guide: Guide, ndim: int):
         fresh = getattr(guide, "fresh", None)

@@ -13,25 +13,11 @@ BASE_FIELDS = [("log_prob", np.float64), ("log_prior", np.float64)]
 
 
 class PendingPoints:
-    """Points (n, ndim) and their known records.
+    """Points (n, ndim) that were submitted, and their known records.
 
-    Parameters
-    ----------
-    coords : (n, ndim) float
-        The points.
-    log_prior : (n,) float
-        Their log-prior, -inf outside the support of the prior.
-    refused : bool
-        Whether the limit of simulations refused some of the points; `coords` are the submitted points.
-
-    Attributes
-    ----------
-    coords, refused
-        See above.
-    base : (n,) structured array
-        Records with log_prior = `log_prior` and log_prob = -inf, known from the beginning.
-    arrived : (n,) bool
-        Which points have arrived.
+    `refused` says whether the limit of simulations refused further points. `base` (n,) are records with log_prior,
+    which is -inf outside the support, and log_prob = -inf, known from the beginning; `arrived` (n,) bool are the points
+    with all records.
     """
 
     def __init__(self, coords: np.ndarray, log_prior: np.ndarray, refused: bool = False):

@@ -14,18 +14,11 @@ __all__ = ["Density", "Population", "check_size", "check_start"]
 class Density(Protocol):
     """A posterior density with its prior, as annealing evaluates it.
 
-    Attributes
-    ----------
-    evaluations : int
-        Number of points evaluated so far.
-    workers : int
-        Number of points that are evaluated at once, if `submit` returns without waiting; else 0.
-    map : callable
-        The map, ``map`` or ``pool.map``, for emcee moves that evaluate points by themselves.
+    `map` is ``map`` or ``pool.map``, for emcee moves that evaluate points by themselves.
     """
 
-    evaluations: int
-    workers: int
+    evaluations: int  # number of points evaluated so far
+    workers: int  # number of points that are evaluated at once, if `submit` returns without waiting; else 0
 
     @property
     def map(self) -> Callable: ...
@@ -50,30 +43,14 @@ class Density(Protocol):
 
 
 class Population(NamedTuple):
-    """Points at one beta.
+    """Points at one beta."""
 
-    Attributes
-    ----------
-    beta : float
-        Tempering exponent, 0 for draws of the prior and 1 for draws of the posterior.
-    coords : (n, ndim) float
-        The points.
-    records : (n,) structured array, or None
-        Fields log_prob, log_prior and, where there are any, blobs. None: the points have not been evaluated.
-    effective_sample_size : float
-        Effective sample size of the weights that led to this population.
-    founders : tuple of (n,) int
-        See `samplers.estimates.genealogy.trace_founders`; empty before the first resampling.
-    log_weights : (n,) float, optional
-        Logarithms of the weights at `beta`; None for equally weighted points.
-    """
-
-    beta: float
-    coords: np.ndarray
-    records: np.ndarray | None
-    effective_sample_size: float
-    founders: tuple[np.ndarray, ...] = ()
-    log_weights: np.ndarray | None = None
+    beta: float  # 0 for draws of the prior, 1 for draws of the posterior
+    coords: np.ndarray  # (n, ndim)
+    records: np.ndarray | None  # (n,), fields log_prob, log_prior and, where there are any, blobs; None: not evaluated
+    effective_sample_size: float  # of the weights that led to this population
+    founders: tuple[np.ndarray, ...] = ()  # of (n,) int, see `samplers.estimates.genealogy.trace_founders`
+    log_weights: np.ndarray | None = None  # (n,), at `beta`; None for equally weighted points
 
 
 def check_size(nwalkers: int, ndim: int) -> None:

@@ -15,18 +15,7 @@ __all__ = ["Recording"]
 
 
 class Recording:
-    """The result of an annealing so far.
-
-    Parameters
-    ----------
-    density : Density
-        Counts the evaluations.
-
-    Attributes
-    ----------
-    result : AnnealingResult
-        Everything found so far.
-    """
+    """The result of an annealing so far; the density counts the evaluations."""
 
     def __init__(self, density: Density):
         self.result, self._density = AnnealingResult(), density

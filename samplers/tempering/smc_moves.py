@@ -54,44 +54,12 @@ def anneal_by_moves(
     settings: Settings,
     visited: VisitedPoints,
 ) -> Generator[tuple[Population, Stage | Sweep | Concern], None, tuple[Population, list[Stage], float]]:
-    """Carry evaluated draws of the prior to beta = 1.
+    """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to `visited`.
 
-    Parameters
-    ----------
-    population : Population
-        Draws of the prior, with their records.
-    density : Density
-        The posterior.
-    random : RandomState
-        Source of random numbers.
-    schedule : MoveSchedule
-        The moves.
-    settings : Settings
-        Effective sample size, resampling scheme and length of the moves.
-    visited : VisitedPoints
-        All evaluated points; points that are evaluated here are added.
-
-    Yields
-    ------
-    population : Population
-        The points as they are now.
-    report : Sweep, Stage or Concern
-        `Sweep`: the points have been moved once. `Stage`: a stage is finished. `Concern`: the stage is collapsed or
-        stuck.
-
-    Returns
-    -------
-    population : Population
-        The points at beta = 1.
-    stages : list of Stage
-        All stages.
-    correlation : float
-        Correlation of the points with their start after the moves of the last stage.
-
-    Raises
-    ------
-    StoppedEarly
-        If the limit of simulations is exceeded.
+    Yields the points as they are now with a report: a `Sweep` when they have been moved once, a `Stage` when a stage is
+    finished, a `Concern` if it is collapsed or stuck. Returns the points at beta = 1, all stages, and the correlation
+    of the points with their start after the moves of the last stage. Raises StoppedEarly if the limit of simulations is
+    exceeded.
     """
     n, ndim = population.coords.shape
     target, stages, error = float(n), [], EvidenceError(n)
