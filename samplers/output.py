@@ -36,26 +36,11 @@ STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
 class Output:
-    """Data stored with the chain of a backend.
+    """Data stored with the chain of an initialised backend; a checksum of each stored step is noted in the record.
 
-    Parameters
-    ----------
-    backend : emcee Backend or HDFBackend
-        Initialised.
-    record : Record
-        Where a checksum of each stored step is noted.
-
-    Attributes
-    ----------
-    result : AnnealingResult
-        The stored ladder and evidence; empty if there are none.
-    verdict : Verdict, or None
-        The stored verdict.
-    first_step : int
-        Number of steps that were stored before the last annealing.
-    provisional : bool
-        Whether the last step is the estimate of a run that the limit of simulations ended, and is replaced when the run
-        continues.
+    `result` and `verdict` are what is stored (empty, None: nothing). `first_step` steps were stored before the last
+    annealing. `provisional` says whether the last step is the estimate of a run that the limit of simulations ended,
+    and is replaced when the run continues.
     """
 
     def __init__(self, backend: Backend, record: Record):
@@ -289,13 +274,10 @@ def is_whole(backend: HDFBackend, record: Record) -> bool:
 
 
 def run_of_file(backend: HDFBackend) -> str | None:
-    """The run that the file of a backend belongs to.
+    """The run that the file of a backend belongs to; the empty string for a chain without a run.
 
-    Returns
-    -------
-    str or None
-        "damaged" for a chain that cannot be read completely, the empty string for a chain without a run, None if there
-        is no file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
+    It is "damaged" for a chain that cannot be read completely, and None if there is no file, the file is empty, or it
+    has no chain with this name, or an incomplete one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None

@@ -33,12 +33,8 @@ class FileHeld(ValueError):
 class PatientOpen:
     """Takes the place of the method ``open`` of an emcee `HDFBackend`, through which all its methods use the file.
 
-    Attributes
-    ----------
-    goes_on : bool
-        Whether a file that is held open is replaced by its copy in memory; `FileHeld` is raised otherwise.
-    is_behind : bool
-        Whether the copy in memory has a chain that the file does not have.
+    If `goes_on`, a file that is held open is replaced by its copy in memory; `FileHeld` is raised otherwise.
+    `is_behind` says whether the copy has a chain that the file does not have.
     """
 
     def __init__(self, backend: HDFBackend):

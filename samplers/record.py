@@ -58,24 +58,12 @@ _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDi
 
 
 class EvaluatedBatch(NamedTuple):
-    """Points that were evaluated.
+    """Points that were evaluated."""
 
-    Attributes
-    ----------
-    coords : (n, ndim) float
-        The points.
-    log_prob : (n,) float
-        Their log-probabilities; NaN where the evaluation failed.
-    blobs : (n, ...) array, or None
-        Their blobs.
-    reasons : dict of int to str
-        Reason of each failure, by row.
-    """
-
-    coords: np.ndarray
-    log_prob: np.ndarray
-    blobs: np.ndarray | None
-    reasons: dict[int, str]
+    coords: np.ndarray  # (n, ndim)
+    log_prob: np.ndarray  # (n,), NaN where the evaluation failed
+    blobs: np.ndarray | None  # (n, ...)
+    reasons: dict[int, str]  # of each failure, by row
 
     def rows(self, rows: Sequence[int]) -> "EvaluatedBatch":
         """The batch of some rows."""
@@ -104,41 +92,19 @@ class _Place(NamedTuple):
 
 
 class RunStart(NamedTuple):
-    """Start of an annealing.
+    """Start of an annealing."""
 
-    Attributes
-    ----------
-    header : dict
-        Settings and identity of the run, as JSON returns them.
-    coords : (nwalkers, ndim) float
-        Draws of the prior, or of the start density.
-    random_state : tuple
-        State of the random generator, as `numpy.random.RandomState.get_state` returns it.
-    """
-
-    header: dict
-    coords: np.ndarray
-    random_state: tuple
+    header: dict  # settings and identity of the run, as JSON returns them
+    coords: np.ndarray  # (nwalkers, ndim), draws of the prior, or of the start density
+    random_state: tuple  # as `numpy.random.RandomState.get_state` returns it
 
 
 class Record:
-    """Evaluations and remembered arrays of a run.
+    """Evaluations and remembered arrays of a run, in a file that is written and locked from `begin` or `open` on.
 
-    Parameters
-    ----------
-    path : Path, optional
-        The file, which is read if it exists. It is written and locked from `begin` or `open` on.
-    slow : sequence of int, optional
-        Indices of the parameters that a simulation depends on; all by default.
-
-    Attributes
-    ----------
-    start : RunStart, or None
-        Start of the last annealing.
-    count : int
-        Number of evaluated points.
-    failed : list of (point, reason)
-        Failed evaluations, in the order of evaluation.
+    `slow` are indices of the parameters that a simulation depends on, all by default. `start` belongs to the last
+    annealing, None before it. `count` is the number of evaluated points; `failed` are points that failed, with reasons,
+    in the order of evaluation.
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):

@@ -37,14 +37,8 @@ NOT_COMPARED = ("run", "seed", "of_earlier_guides", "log_prior")
 def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequence[int]) -> Record:
     """The record of the run in a backend's file; the HDF5 file is made if it is missing or damaged.
 
-    Parameters
-    ----------
-    backend : emcee Backend or HDFBackend, optional
-        Without a file that can be written, the record is kept in memory.
-    nwalkers, ndim : int
-        Size of the ensemble.
-    slow : sequence of int
-        Indices of the parameters that a simulation depends on.
+    Without a file that can be written, the record is kept in memory. `slow` are indices of the parameters that a
+    simulation depends on.
     """
     if not isinstance(backend, HDFBackend) or backend.read_only:
         return Record(slow=slow)
@@ -102,22 +96,10 @@ def describe_run(
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """The start of a run, as plain data.
+    """The start of a run as plain data, with the entries `described`.
 
-    Parameters
-    ----------
-    function : callable
-        The log-density; identified by its attribute ``fingerprint``, if it has one.
-    described : dict
-        Further entries.
-    settings : Settings
-        Settings of the sampler.
-    moves : sequence of Move
-        The moves.
-    probabilities : sequence of float
-        Probability of each move to be chosen.
-    guide : Guide, optional
-        The guide; identified by its attribute ``fingerprint``, or else by its class.
+    The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
+    function without one not at all.
     """
     plain = {name: _plain(value) for name, value in asdict(settings).items()}
     return {
@@ -146,12 +128,7 @@ def differences(stored: dict, ours: dict) -> list[str]:
 def points_to_compare(record: Record, last: State | None) -> EvaluatedBatch | None:
     """One or two points at which a log-density without a fingerprint is compared with a stored run; None without any.
 
-    Parameters
-    ----------
-    record : Record
-        The record of the run.
-    last : State, optional
-        The last stored step, for a chain without a record.
+    A chain without a record has the `last` stored step only.
     """
     if record.count > 0 or last is None:
         return record.best_and_first()

@@ -45,18 +45,10 @@ def warn(message: str) -> None:
 
 
 class Concern(NamedTuple):
-    """A reason why the result may be wrong.
+    """A reason why the result may be wrong."""
 
-    Attributes
-    ----------
-    message : str
-        The finding, and what to do.
-    grave : bool
-        Whether the numbers may be wrong by more than their stated errors.
-    """
-
-    message: str
-    grave: bool
+    message: str  # the finding, and what to do
+    grave: bool  # whether the numbers may be wrong by more than their stated errors
 
 
 class Stage(NamedTuple):
@@ -97,48 +89,24 @@ class Stage(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """One sweep of the ensemble, or one stage of recycling: a tick of the progress bar.
+    """One sweep of the ensemble, or one stage of recycling: a tick of the progress bar."""
 
-    Attributes
-    ----------
-    acceptance : float
-        Share of accepted proposals; with recycling, the efficiency of the latest draws.
-    """
-
-    acceptance: float
+    acceptance: float  # share of accepted proposals; with recycling, the efficiency of the latest draws
 
 
 class Restart(NamedTuple):
-    """Annealing starts again: the stages reported so far are void.
-
-    Attributes
-    ----------
-    reason : str
-        Why the result of these stages is not reliable.
-    """
+    """Annealing starts again: the stages reported so far are void, for the reason given."""
 
     reason: str
 
 
 class GuideTick(NamedTuple):
-    """A tick of the progress bar while a guide is in use.
+    """A tick of the progress bar while a guide is in use."""
 
-    Attributes
-    ----------
-    phase : str
-        Activity of the guide: "search", "round 3", or "after round 3" while it learns.
-    simulations : float
-        Simulations so far.
-    target : int
-        Wanted effective sample size of all rounds; the population has the present effective sample size.
-    finished : bool
-        Whether a batch is finished; False when a phase begins.
-    """
-
-    phase: str
-    simulations: float
-    target: int
-    finished: bool
+    phase: str  # "search", "round 3", or "after round 3" while the guide learns
+    simulations: float  # so far
+    target: int  # wanted effective sample size of all rounds; the population has the present one
+    finished: bool  # whether a batch is finished; False when a phase begins
 
 
 class GuidedRound(NamedTuple):
@@ -167,22 +135,12 @@ class GuidedRound(NamedTuple):
 
 
 class GuidedStart(NamedTuple):
-    """Result of a guide's rounds.
+    """Result of a guide's rounds."""
 
-    Attributes
-    ----------
-    reason : str
-        Why the guide's draws are not used as posterior draws; empty if they are.
-    shortfall : str
-        What the rounds did not reach although their draws are used, or that the guide's tails are too light; else
-        empty.
-    pareto_shape : float
-        Pareto shape of the largest weights of all rounds.
-    """
-
-    reason: str
+    reason: str  # why the guide's draws are not used as posterior draws; empty if they are
+    # what the rounds did not reach although their draws are used, or that its tails are too light; else empty
     shortfall: str
-    pareto_shape: float
+    pareto_shape: float  # of the largest weights of all rounds
 
     @property
     def used(self) -> bool:
@@ -191,28 +149,14 @@ class GuidedStart(NamedTuple):
 
 
 class EarlyStop(NamedTuple):
-    """The limit of simulations ended the annealing.
+    """The limit of simulations ended the annealing."""
 
-    Attributes
-    ----------
-    beta : float
-        Tempering exponent of the points from which the population was made; 1 after a complete annealing.
-    points : int
-        Number of these points.
-    effective_sample_size, pareto_shape : float
-        Effective sample size of the weights at beta = 1, and Pareto shape of the largest weights.
-    complete : bool
-        Whether the annealing was complete; only moves or a check at beta = 1 are then missing.
-    from_guide : bool
-        Whether the points are the draws of a guide.
-    """
-
-    beta: float
-    points: int
-    effective_sample_size: float
-    pareto_shape: float
-    complete: bool = False
-    from_guide: bool = False
+    beta: float  # of the points from which the population was made; 1 after a complete annealing
+    points: int  # number of these points
+    effective_sample_size: float  # of the weights at beta = 1
+    pareto_shape: float  # of the largest weights at beta = 1
+    complete: bool = False  # whether only moves or a check at beta = 1 are missing
+    from_guide: bool = False  # whether the points are the draws of a guide
 
 
 Report = (
@@ -221,47 +165,20 @@ Report = (
 
 
 class AnnealingResult(NamedTuple):
-    """Result of an annealing so far.
-
-    Attributes
-    ----------
-    ladder : tuple of Stage
-        The sequence of tempering stages.
-    check : EvidenceCheck, optional
-        The independent estimate of the evidence.
-    founders : (nwalkers,) int, optional
-        Founder of each walker (`samplers.estimates.genealogy`); None if unknown.
-    rounds : tuple of GuidedRound
-        Rounds of the guide.
-    start : GuidedStart, optional
-        Result of these rounds; None without a guide.
-    signed : SignedSample, optional
-        Known and evaluated points of these rounds for accurate expectations; None if the guide knows none.
-    early_stop : EarlyStop, optional
-        How the limit of simulations ended the annealing; None if it did not.
-    concerns : tuple of str
-        Reasons of the guide why parts of the posterior may be missing.
-    refusals : tuple of str
-        Reasons of the guide why the result is not to be used.
-    basis : str
-        How the guide searched for parts of the posterior; empty if it does not say.
-    findings : tuple of Concern
-        Findings of the checks.
-    independent_points : float, optional
-        Effective sample size of the walkers when beta = 1 was reached; None for a result that was read from a backend.
-    """
+    """Result of an annealing so far."""
 
     ladder: tuple[Stage, ...] = ()
-    check: EvidenceCheck | None = None
-    founders: np.ndarray | None = None
+    check: EvidenceCheck | None = None  # independent estimate of the evidence
+    founders: np.ndarray | None = None  # (nwalkers,) int, see `samplers.estimates.genealogy`; None if unknown
     rounds: tuple[GuidedRound, ...] = ()
-    start: GuidedStart | None = None
-    signed: SignedSample | None = None
-    early_stop: EarlyStop | None = None
-    concerns: tuple[str, ...] = ()
-    refusals: tuple[str, ...] = ()
-    basis: str = ""
-    findings: tuple[Concern, ...] = ()
+    start: GuidedStart | None = None  # result of the rounds; None without a guide
+    signed: SignedSample | None = None  # known and evaluated points of the rounds; None if the guide knows no density
+    early_stop: EarlyStop | None = None  # how the limit of simulations ended the annealing; None if it did not
+    concerns: tuple[str, ...] = ()  # reasons of the guide why parts of the posterior may be missing
+    refusals: tuple[str, ...] = ()  # reasons of the guide why the result is not to be used
+    basis: str = ""  # how the guide searched for parts of the posterior; empty if it does not say
+    findings: tuple[Concern, ...] = ()  # of the checks
+    # effective sample size of the walkers when beta = 1 was reached; None for a result read from a backend
     independent_points: float | None = None
 
     @property
