@@ -35,7 +35,7 @@ def systematic(weights: np.ndarray, random: Random, size: int | None = None) -> 
 
 
 def multinomial(weights: np.ndarray, random: Random) -> np.ndarray:
-    """Independent draws (n,) of indices, ascending, by weights (n,) with sum 1; other schemes have the same arguments."""
+    """Independent draws (n,) of indices, ascending, by weights (n,) with sum 1; other schemes have these arguments."""
     return locate(weights, np.sort(random.uniform(size=len(weights))))
 
 

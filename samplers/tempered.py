@@ -111,7 +111,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
         For a keyword that is not a setting.
     """
 
-    # the settings that a sampler has
     setting_names: tuple[str, ...] = tuple(field.name for field in fields(Settings))
 
     def __init__(

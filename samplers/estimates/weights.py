@@ -45,7 +45,7 @@ def _scaled(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def normalised_weights(log_weights: np.ndarray) -> np.ndarray:
-    """Weights (n,) with sum 1, from log-weights with any offset; -inf is allowed. ValueError if all weights are zero."""
+    """Weights (n,) with sum 1, from log-weights with any offset, -inf allowed; ValueError if all weights are zero."""
     weights, top = _scaled(log_weights)
     if top == -np.inf:
         raise ValueError(f"every weight is zero: no point has a finite log-likelihood; {WHERE_TO_LOOK}")

@@ -11,7 +11,7 @@ For every component of the mixture, a quadratic
     log p(z) = a + g z - z A z / 2
 
 is fitted to the points of the component, in the coordinates that standardise the component, by least trimmed squares,
-which ignores a minority of the points.
+which ignores a minority of the points (Rousseeuw & Van Driessen 2006, doi:10.1007/s10618-005-0024-4).
 
 1. Points clearly above the quadratics of all components belong to another basin. A second quadratic is fitted to the
    highest of these points, its neighbours, and all points that agree with them. Its mode, at a limited distance, is the
@@ -23,17 +23,9 @@ which ignores a minority of the points.
 2. If most points agree with the first quadratic, but its mode and A^-1 are far from mean and covariance of the
    component, which were estimated from few effective points, a component is made from the quadratic too.
 
-The new components only decide where draws are made. The weights of the draws are exact for any proposal. Constants were
-chosen by trials on two and three modes (``python -m benchmarks truth``).
-
-References
-----------
-Raftery, A. E. & Bao, L. (2010), Estimating and projecting trends in HIV/AIDS generalized epidemics using incremental
-mixture importance sampling, Biometrics 66(4), doi:10.1111/j.1541-0420.2010.01399.x (components at points of large
-weight)
-
-Rousseeuw, P. J. & Van Driessen, K. (2006), Computing LTS regression for large data sets, Data Mining and Knowledge
-Discovery 12, doi:10.1007/s10618-005-0024-4 (least trimmed squares)
+The new components, at points of large weight as in Raftery & Bao (2010, doi:10.1111/j.1541-0420.2010.01399.x), only
+decide where draws are made. The weights of the draws are exact for any proposal. Constants were chosen by trials on two
+and three modes (``python -m benchmarks truth``).
 """
 
 import math
