@@ -18,16 +18,10 @@ __all__ = ["bar_stresses"]
 
 
 def bar_stresses(steel: tuple, options: tuple, histories: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Stress of new bars under several strain histories.
+    """Stresses (n,) of new bars under several strain histories (n,).
 
-    Parameters
-    ----------
-    steel : tuple
-        fy, fu, Es, Esh in any unit of stress, eps_sh, eps_u.
-    options : tuple
-        Further arguments of the material, such as ``("-CMFatigue", cf, alpha, cd)``.
-    histories : sequence of ndarray (n,)
-        Strains.
+    `steel` is fy, fu, Es, Esh in any unit of stress, eps_sh, eps_u; `options` are further arguments of the material,
+    such as ``("-CMFatigue", cf, alpha, cd)``.
     """
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder, "job"), Path(folder, "result")

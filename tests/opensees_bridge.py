@@ -36,18 +36,10 @@ BEAM, SLIDER, RUBBER, DAMPER = 1, 2, 3, 4  # its elements
 
 
 class Run(NamedTuple):
-    """Result of one run.
+    """Result of one run."""
 
-    Attributes
-    ----------
-    response : ndarray[12, n]
-        Rows as `scipy_bridge.CHANNELS` [SI]; shorter than the record if OpenSees did not converge.
-    seconds : float
-        CPU time of the analysis alone.
-    """
-
-    response: np.ndarray
-    seconds: float
+    response: np.ndarray  # (12, n), rows as `scipy_bridge.CHANNELS` [SI]; shorter if OpenSees did not converge
+    seconds: float  # CPU time of the analysis alone
 
 
 def run(
@@ -58,24 +50,10 @@ def run(
     step: float,
     tolerance: float = 1e-10,
 ) -> Run:
-    """Simulate the bridge from rest.
+    """Simulate the bridge, at its parameters and without half loop (``loop=(0.0,)``), from rest.
 
-    Parameters
-    ----------
-    bridge : Definition
-        At its parameters, without half loop (``loop=(0.0,)``).
-    acceleration : ndarray[n]
-        Acceleration of the table [m/s²].
-    dt : float
-        Step of the samples and of the response [s].
-    step : float
-        Integration step [s], which divides `dt`.
-    tolerance : float
-        Norm of the last displacement increment [m and rad].
-
-    Returns
-    -------
-    Run
+    `acceleration` (n,) is the table's [m/s²], `dt` the step of the samples and of the response [s], `step` the
+    integration step [s], which divides `dt`, and `tolerance` the norm of the last displacement increment [m and rad].
     """
     if any(bridge.loop):
         raise ValueError(f"OpenSees has no half loop for the rubber: expected loop=(0.0,); got {bridge.loop}")

@@ -137,23 +137,10 @@ Recorders = Sequence[tuple]  # arguments of eleResponse, with the index of the v
 def shake(
     column: PeerColumn, acceleration: np.ndarray, dt: float, tolerance: float = 1e-10, recorders: Recorders = ()
 ) -> Shake:
-    """Apply gravity, then a base acceleration, in a separate process.
+    """Apply gravity, then a base acceleration (n,) [in/s²] with step `dt` [s], in a separate process.
 
-    Parameters
-    ----------
-    column : PeerColumn
-    acceleration : ndarray[n]
-        [in/s²]
-    dt : float
-        Step [s].
-    tolerance : float
-        Norm of the last displacement increment [in and rad].
-    recorders : sequence of tuple
-        Responses of elements that are recorded after every step.
-
-    Returns
-    -------
-    Shake
+    `tolerance` is the norm of the last displacement increment [in and rad]; `recorders` are responses of elements that
+    are recorded after every step.
     """
     return _in_process("_shake", column, np.asarray(acceleration, dtype=float), dt, tolerance, tuple(recorders))
 

@@ -220,34 +220,13 @@ def solve(
     vertical: np.ndarray | None = None,
     overshoot: float = 1e-8,
 ) -> Solution:
-    """Simulate the bridge from rest.
+    """Simulate the bridge at its parameters (``Definition().at(theta)``) from rest.
 
-    Parameters
-    ----------
-    bridge : Definition
-        At its parameters: ``Definition().at(theta)``.
-    acceleration : ndarray[n]
-        Acceleration of the table [m/s²].
-    dt : float
-        Step of the samples [s].
-    friction : str
-        "bouc-wen" or "elastic-plastic".
-    method : str
-        Name of a method of `solve_ivp`; explicit methods are very slow for elastic-plastic friction.
-    tolerance : float
-        Relative tolerance; the absolute one is a tenth of it, times the typical size of each state.
-    every : int
-        One output per so many samples of the record.
-    p_delta : bool
-        Whether the weights act on the deformed piers.
-    vertical : ndarray[n], optional
-        Vertical acceleration of the table [m/s²], which changes the load on the bearings.
-    overshoot : float
-        Relaxation time [s] of the elastic-plastic law; LSODA may not progress with much shorter ones.
-
-    Returns
-    -------
-    Solution
+    `acceleration` (n,) and `vertical` (n,), which changes the load on the bearings, belong to the table [m/s²], with
+    step `dt` [s]; there is one output per `every` samples. `friction` is "bouc-wen" or "elastic-plastic", whose
+    relaxation time is `overshoot` [s]: LSODA may not progress with much shorter ones, and explicit methods of
+    `solve_ivp` are very slow for it. `tolerance` is relative; the absolute one is a tenth of it, times the typical size
+    of each state. With `p_delta`, weights act on the deformed piers.
     """
     motion = np.ascontiguousarray(acceleration, dtype=float)
     lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)

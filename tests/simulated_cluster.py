@@ -23,27 +23,10 @@ take_without_clock = running_simulations.take_all
 
 
 class SimulatedCluster:
-    """A log-density on simulated workers.
+    """A log-density on simulated workers; `target` is the log-density of a batch of points (n, ndim).
 
-    Parameters
-    ----------
-    target : object
-        Log-density of a batch of points (n, ndim), with ndim, log_prior and sample_prior.
-    workers : int
-        Number of workers.
-    length : callable
-        Function of points (n, ndim) that returns how long their evaluations take (n,).
-
-    Attributes
-    ----------
-    workers : int
-        See above.
-    now : float
-        Time of the clock.
-    busy : float
-        Time of all evaluations so far.
-    evaluations : int
-        Their number.
+    `length` is a function of points (n, ndim) that returns how long their evaluations take (n,). `now` is the time of
+    the clock, `busy` the time of all evaluations so far, `evaluations` their number.
     """
 
     def __init__(self, target, workers: int, length: Callable[[np.ndarray], np.ndarray]):
@@ -100,19 +83,9 @@ class SimulatedCluster:
 class SimulatedPool(PoolExecutor):
     """A pool of a likelihood on simulated workers, which evaluates the responses of its model.
 
-    Parameters
-    ----------
-    workers : int
-        Number of workers.
-    length : callable
-        Function of parameters (n_parameters,) that returns how long a simulation of the whole record takes.
-    n_steps : int
-        Samples of the whole record; a part of it takes its share of the time.
-
-    Attributes
-    ----------
-    n_workers, now, busy, simulations
-        As of a `SimulatedCluster`; `simulations` counts parts of a record as fractions.
+    `length` is a function of parameters (n_parameters,) that returns how long a simulation of the whole record, of
+    `n_steps`, takes; a part of it takes its share of the time, and counts as a fraction in `simulations`. Other
+    attributes are as of a `SimulatedCluster`.
     """
 
     n_workers = 0

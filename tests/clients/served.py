@@ -97,16 +97,9 @@ KINDS = {
 
 
 class Process:
-    """A server in a process of its own, which accepts connections when this object is made.
+    """A server in another process, which accepts connections when this object is made.
 
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`, or ``"reference"``.
-    port : int
-        0 for a free one.
-    folder : path
-        Of the files of `held_line`.
+    The kind is one of `KINDS`, or "reference"; port 0 is a free one; `folder` has the files of `held_line`.
     """
 
     def __init__(self, kind, port=0, folder="."):

@@ -56,16 +56,10 @@ def vibration(noise="marginal", function=free_vibration, seed=1, truth=TRUTH, da
 
 
 class Shortened:
-    """A model of one displacement that can be shortened.
+    """A model of one displacement that can be shortened to `n_steps` of the `whole` record.
 
-    Parameters
-    ----------
-    respond : callable
-        Function of theta (d,) and phase (n,), from 0 to 1 over the whole record, that returns the displacement (n,).
-    parameter_names : tuple of str
-        Names.
-    whole, n_steps : int
-        Samples of the whole record, and of this part.
+    `respond` is a function of theta (d,) and phase (n,), from 0 to 1 over the whole record, that returns the
+    displacement (n,).
     """
 
     channels = (Channel("top", "displacement", "mm"),)

@@ -42,32 +42,18 @@ _KINDS = {
 
 
 class Problem(NamedTuple):
-    """Tests with known likelihoods.
+    """Tests with known likelihoods."""
 
-    Attributes
-    ----------
-    logarithmic : bool
-        Scale of the population.
-    prior : str
-        Prior of the stored samples: "wide", "narrow", "positive", "box", or "far": that of the first test is narrow
-        and beside the population, those of the others are wide.
-    source : str
-        Where the samples come from: "independent", "repeated", "weighted" or "chain".
-    n_samples : int
-        Number of samples per test.
-    centers, errors : (n_parameters, n_tests, 2) ndarray
-        Means and standard deviations of the two normal densities of each likelihood, on the scale of the population.
-    shares : (n_tests,) ndarray
-        Share of the first of them.
-    """
-
-    logarithmic: bool
+    logarithmic: bool  # scale of the population
+    # Of the stored samples: "wide", "narrow", "positive", "box", or "far": the prior of the first test is narrow and
+    # beside the population, the priors of the others are wide.
     prior: str
-    source: str
-    n_samples: int
+    source: str  # of the samples: "independent", "repeated", "weighted" or "chain"
+    n_samples: int  # per test
+    # (n_parameters, n_tests, 2), means of the two normal densities of each likelihood, on the scale of the population
     centers: np.ndarray
-    errors: np.ndarray
-    shares: np.ndarray
+    errors: np.ndarray  # (n_parameters, n_tests, 2), their standard deviations
+    shares: np.ndarray  # (n_tests,), of the first of them
 
 
 class Result(NamedTuple):

@@ -62,20 +62,10 @@ TOP = Channel("top", "absolute acceleration", "g")
 
 
 class Case(NamedTuple):
-    """A reader and valid files for it.
+    """A reader and valid files for it."""
 
-    Attributes
-    ----------
-    name : str
-        Suffix of the files, with which the table names the reader.
-    read : callable
-        Function of the path.
-    files : list of bytes
-        Valid files.
-    """
-
-    name: str
-    read: Callable
+    name: str  # suffix of the files, with which the table names the reader
+    read: Callable  # function of the path
     files: list[bytes]
 
 

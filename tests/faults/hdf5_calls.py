@@ -28,10 +28,7 @@ CHANGES = [
 def count_changes(at=None):
     """Count the calls of this process that change an HDF5 file, and kill it after the call number `at`.
 
-    Returns
-    -------
-    list of str
-        The calls so far, by method and name of what is changed.
+    Returns the calls so far, by method and name of what is changed.
     """
     calls = []
 
@@ -85,12 +82,7 @@ def kill_after(kind, at, folder, whole):
 def kill_everywhere(kind, places=None):
     """Kill a run of a kind after each of its calls, or after those whose text contains one of `places`.
 
-    Returns
-    -------
-    number : int
-        Number of kills.
-    messages : list of str
-        What went wrong.
+    Returns the number of kills, and messages of what went wrong.
     """
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
     try:

@@ -276,14 +276,9 @@ def chain_of(folder):
 
 
 def kill(number, kinds=KINDS, seed=1, show=print):
-    """Make kills of each kind of run.
+    """Make kills of each kind of run; returns counts and messages of what went wrong.
 
-    Returns
-    -------
-    counts : Counter
-        By (kind, "kills"), (kind, "runs"), and (kind, "stuck" | "wrong" | "lost").
-    messages : list of str
-        What went wrong.
+    Counts are by (kind, "kills"), (kind, "runs"), and (kind, "stuck" | "wrong" | "lost").
     """
     choose, counts, messages = random.Random(seed), Counter(), []
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))

@@ -75,10 +75,7 @@ class Queue:
 class Watched(WithBlobs):
     """Writes the points of every call to a file, fails for a few of them, and takes time in every call.
 
-    Attributes
-    ----------
-    event : callable
-        Called before the values are computed.
+    `event` is called before the values are computed.
     """
 
     def __init__(self, log=None, seconds=0.0, event=None, **kwargs):

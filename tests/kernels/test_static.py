@@ -166,14 +166,7 @@ def test_a_failed_run_without_fatigue_is_not_lowered():
 def lowered(factor, fractured=1):
     """Lower a displaced column until it carries `factor` times its weight; some bars of its base have fractured.
 
-    Returns
-    -------
-    done : bool
-    position : Position
-    before : ndarray (6,)
-        Displacements before.
-    load : ndarray (6,)
-    column : Column
+    Returns whether it was done, the position, the displacements (6,) before, the load (6,), and the column.
     """
     column = golden.column(golden.circle(), bars_fail=True)
     iteration = Iteration(TOLERANCE, 50, 6)

@@ -12,30 +12,13 @@ ADDRESSES = ("src", "href", "action", "data", "poster", "srcset")
 
 
 class Page(NamedTuple):
-    """The parts of a page that tests look at.
+    """The parts of a page that tests look at."""
 
-    Attributes
-    ----------
-    text : str
-        All text that is shown.
-    tables : list of list of list of str
-        Cells of the rows of each table.
-    notes : dict of str to str
-        Text of each note by its title.
-    images : list of (bytes, str)
-        PNG and alternative text.
-    addresses : list of str
-        Values of all attributes that a browser would load.
-    tags : set of str
-    style : str
-    path : Path
-    """
-
-    text: str
-    tables: list
-    notes: dict
-    images: list
-    addresses: list
+    text: str  # all text that is shown
+    tables: list  # cells (str) of the rows of each table
+    notes: dict  # text of each note by its title
+    images: list  # (PNG bytes, alternative text)
+    addresses: list  # values of all attributes that a browser would load
     tags: set
     style: str
     path: Path

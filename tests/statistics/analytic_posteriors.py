@@ -33,36 +33,21 @@ LOG_2_PI = float(np.log(2.0 * np.pi))
 
 @dataclass(frozen=True)
 class Posterior:
-    """A posterior with known answers, as the samplers take it (``vectorize=True``).
-
-    Attributes
-    ----------
-    ndim : int
-        Number of parameters.
-    density : callable
-        Logarithm of the unnormalised posterior density (n,) at points (n, ndim) inside the box.
-    log_evidence : float
-        Logarithm of its integral.
-    mean, sd : (ndim,) float
-        Moments of the posterior.
-    lower, upper : float
-        Bounds of the uniform prior in every dimension. Where they are infinite, the prior is standard normal.
-    responsibilities : callable, optional
-        Function of points (n, ndim) that returns the probability that each belongs to each mode (n, k). The mean over
-        draws of the posterior is `shares`, even where modes overlap.
-    shares : (k,) float
-        Posterior probabilities of the modes.
-    """
+    """A posterior with known answers, as the samplers take it (``vectorize=True``)."""
 
     ndim: int
+    # log of the unnormalised posterior density (n,) at points (n, ndim) inside the box
     density: Callable[[np.ndarray], np.ndarray]
-    log_evidence: float
-    mean: np.ndarray
-    sd: np.ndarray
+    log_evidence: float  # log of its integral
+    mean: np.ndarray  # (ndim,)
+    sd: np.ndarray  # (ndim,)
+    # bounds of the uniform prior in every dimension; where infinite, the prior is standard normal
     lower: float = float("-inf")
     upper: float = float("inf")
+    # Probability (n, k) that points (n, ndim) belong to each mode. The mean over draws of the posterior is `shares`,
+    # even where modes overlap.
     responsibilities: Callable[[np.ndarray], np.ndarray] | None = None
-    shares: np.ndarray | None = None
+    shares: np.ndarray | None = None  # (k,), posterior probabilities of the modes
 
     @property
     def bounded(self) -> bool:
@@ -125,24 +110,11 @@ def _direction(random: np.random.RandomState, ndim: int) -> np.ndarray:
 def modes(
     seed: int, count: int, ndim: int, separation: float, mass_ratio: float, volume_ratio: float, prior: str
 ) -> Posterior:
-    """Round Gaussian modes at random positions.
+    """Round Gaussian modes at random positions, for a prior "normal" (standard normal) or "box" (uniform in (-3, 3)).
 
-    Parameters
-    ----------
-    seed : int
-        Of positions and widths, and of which mode has the larger share.
-    count : int
-        Number of modes. Their logarithms of width and of share are equally spaced.
-    ndim : int
-        Number of parameters.
-    separation : float
-        Distance of each mode from the first, widest one, in standard deviations of that one.
-    mass_ratio : float
-        Largest share divided by the smallest.
-    volume_ratio : float
-        Largest volume (width to the power of `ndim`) divided by the smallest.
-    prior : {"normal", "box"}
-        Standard normal, or uniform in (-3, 3).
+    The seed also decides which mode has the larger share. Logarithms of the widths and shares of the `count` modes are
+    equally spaced: `mass_ratio` and `volume_ratio` (width to the power of `ndim`) are the largest divided by the
+    smallest. `separation` is the distance of each mode from the first, widest one, in standard deviations of that one.
     """
     random = np.random.RandomState(seed)
     steps = np.linspace(0.0, 1.0, count)

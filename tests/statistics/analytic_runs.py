@@ -68,23 +68,10 @@ def _posterior(cell: Cell, seed: int) -> targets.Posterior:
 
 
 def run(cell: Cell, seed: int, steps: int = 5, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Run a sampler once and compare with the truth.
+    """Run a sampler once, with a chain of `steps`, and compare with the truth.
 
-    Parameters
-    ----------
-    cell : Cell
-        What to run.
-    seed : int
-        Of the posterior and of the sampler.
-    steps : int
-        Length of the chain.
-    settings : dict, optional
-        Settings of the sampler.
-
-    Returns
-    -------
-    dict
-        Errors of the result and what the run said about itself; JSON can store it.
+    The seed belongs to the posterior and to the sampler. Returns errors of the result and what the run said about
+    itself; JSON can store it.
     """
     posterior, start = _posterior(cell, seed), time.perf_counter()
     sampler = SAMPLERS[cell.sampler](

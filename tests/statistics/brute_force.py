@@ -23,32 +23,18 @@ _CHUNK = 4000  # rows evaluated at once
 
 
 class Reference(NamedTuple):
-    """Known answer of a posterior, with standard errors.
-
-    Attributes
-    ----------
-    log_evidence, log_evidence_error : float
-        Logarithm of the evidence.
-    mean, mean_error, sd, sd_error : (ndim,) float
-        Moments of the parameters.
-    shares, shares_error : (n_modes,) float
-        Masses of the modes.
-    effective_sample_size : float
-        Of the weighted draws.
-    draws : int
-        Their number in the last generations.
-    """
+    """Known answer of a posterior, with standard errors."""
 
     log_evidence: float
     log_evidence_error: float
-    mean: np.ndarray
+    mean: np.ndarray  # (ndim,), as the next three
     mean_error: np.ndarray
     sd: np.ndarray
     sd_error: np.ndarray
-    shares: np.ndarray
+    shares: np.ndarray  # (n_modes,), masses of the modes, as the next
     shares_error: np.ndarray
-    effective_sample_size: float
-    draws: int
+    effective_sample_size: float  # of the weighted draws
+    draws: int  # in the last generations
 
 
 def log_prob_function(case: HardPosterior, seed: int) -> tuple[Callable, Callable]:
@@ -136,22 +122,8 @@ def _ess(log_weights: np.ndarray) -> float:
 def reference(case: HardPosterior, seed: int, draws: int = 100_000) -> Reference:
     """Evidence, moments and mode shares of a case by brute force, one annealing per mode.
 
-    Parameters
-    ----------
-    case : HardPosterior
-    seed : int
-        Seed of the data.
-    draws : int
-        Draws of the last generation of every mode.
-
-    Returns
-    -------
-    Reference
-
-    Raises
-    ------
-    RuntimeError
-        If the annealing or the last generation of a mode is too poor to be a reference.
+    There are `draws` in the last generation of every mode; the seed belongs to the data. Raises RuntimeError if the
+    annealing or the last generation of a mode is too poor to be a reference.
     """
     rng = np.random.default_rng([seed, 11])
     prior = case.posterior(seed).prior

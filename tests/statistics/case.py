@@ -65,55 +65,28 @@ class _ShortenedModel(FunctionModel):
 
 @dataclass(frozen=True)
 class HardPosterior:
-    """A small posterior that is hard in one way.
+    """A small posterior that is hard in one way."""
 
-    Attributes
-    ----------
-    what : str
-        What makes it hard.
-    prior : dict of str to Distribution
-        Priors of the structural parameters.
-    features : callable, optional
-        Function of theta (n, d) that returns the coefficients (n, k) of the shapes; NaN where a simulation fails.
-    target : (k,) array_like
-        Features of the noise-free data; need not be features of any theta.
-    respond : callable, optional
-        Function of theta (n, d) that returns (n, n_channels, n_steps), instead of `features`.
-    truth : (d,) array_like, optional
-        Parameters of the noise-free data where `respond` is given.
-    noise : float
-        Standard deviation of the noise of the data.
-    n_steps, n_channels : int
-        Size of the data.
-    error_model : {"marginal", "white", "autoregressive"}
-        White noise with sigmas integrated out, or with sigmas as parameters, or autoregressive noise.
-    label : callable, optional
-        Function of theta (n, d) that returns the number of the mode (n,), from 0.
-    n_modes : int
-        Number of modes.
-    offset : float
-        Constant in the responses and in the data [m].
-    balanced : bool
-        Whether the noise has no component along the shapes, so that it does not change the shares of the modes.
-    windows : (k, 2) array_like, optional
-        Start and end of each shape, as fractions of the record; by default all shapes cover the whole record. With
-        windows, the model can be shortened.
-    """
-
-    what: str
-    prior: Mapping[str, Distribution]
+    what: str  # makes it hard
+    prior: Mapping[str, Distribution]  # of the structural parameters
+    # coefficients (n, k) of the shapes from theta (n, d); NaN where a simulation fails
     features: Features | None = None
-    target: Any = None
+    target: Any = None  # (k,), features of the noise-free data; need not be features of any theta
+    # response (n, n_channels, n_steps) from theta (n, d), instead of `features`
     respond: Callable[[np.ndarray], np.ndarray] | None = None
-    truth: Any = None
-    noise: float = 0.05
+    truth: Any = None  # (d,), parameters of the noise-free data where `respond` is given
+    noise: float = 0.05  # standard deviation of the noise of the data
     n_steps: int = 200
     n_channels: int = 1
+    # "marginal" (white, sigmas integrated out), "white" (sigmas as parameters) or "autoregressive"
     error_model: str = "marginal"
-    label: Callable[[np.ndarray], np.ndarray] | None = None
+    label: Callable[[np.ndarray], np.ndarray] | None = None  # number (n,) of the mode, from 0, from theta (n, d)
     n_modes: int = 1
-    offset: float = 0.0
+    offset: float = 0.0  # constant in the responses and in the data [m]
+    # whether the noise has no component along the shapes, so that it does not change the mode shares
     balanced: bool = False
+    # Start and end (k, 2) of each shape, as fractions of the record; by default all shapes cover the whole record. With
+    # windows, the model can be shortened.
     windows: Any = None
 
     @property

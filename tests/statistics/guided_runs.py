@@ -21,97 +21,44 @@ ROUNDING = 0.02  # of log Z, and of a mean in standard deviations of the referen
 
 
 class Outcome(NamedTuple):
-    """Result and cost of a run.
+    """Result and cost of a run."""
 
-    Attributes
-    ----------
-    log_evidence, log_evidence_error : float
-        As reported by the sampler.
-    mean, mean_error, sd : (ndim,) float
-        Of the chain.
-    samples : (n, ndim) float
-        The chain.
-    effective_sample_size : float
-        Of the verdict.
-    simulations : float
-        Simulations of the whole record (parts count as fractions).
-    weighted : float
-        Those among them before the first sweep, when the posterior is known as weighted draws.
-    status, reasons : str
-        The verdict.
-    seconds, overhead : float
-        Wall time, and CPU time of this process outside simulations [s].
-    warnings : list of str
-        Messages of the sampler.
-    failed : str
-        Exception that ended the run, empty if there was none.
-    """
-
-    log_evidence: float = np.nan
+    log_evidence: float = np.nan  # as reported by the sampler, with its error
     log_evidence_error: float = np.nan
-    mean: Any = None
+    mean: Any = None  # (ndim,) of the chain, as mean_error and sd
     mean_error: Any = None
     sd: Any = None
-    samples: Any = None
-    effective_sample_size: float = 0.0
-    simulations: float = 0.0
-    weighted: float = 0.0
-    status: str = ""
+    samples: Any = None  # (n, ndim), the chain
+    effective_sample_size: float = 0.0  # of the verdict
+    simulations: float = 0.0  # of the whole record; parts count as fractions
+    weighted: float = 0.0  # simulations before the first sweep, when the posterior is known as weighted draws
+    status: str = ""  # of the verdict, as reasons
     reasons: str = ""
-    seconds: float = 0.0
-    overhead: float = 0.0
-    warnings: tuple[str, ...] = ()
-    failed: str = ""
+    seconds: float = 0.0  # wall time [s]
+    overhead: float = 0.0  # CPU time of this process outside simulations [s]
+    warnings: tuple[str, ...] = ()  # messages of the sampler
+    failed: str = ""  # exception that ended the run, empty if there was none
 
 
 class Errors(NamedTuple):
-    """Errors of a run.
+    """Errors of a run."""
 
-    Attributes
-    ----------
-    log_evidence, log_evidence_z : float
-        Error of log Z, absolute and in standard errors.
-    mean, mean_z : float
-        Largest error of a mean, in standard deviations of the reference and in standard errors.
-    sd : float
-        Largest relative error of a standard deviation.
-    share : float
-        Largest error of the share of a mode.
-    wrong : bool
-        Whether an error exceeds what the run states, whatever its verdict.
-    judgement : str
-        "right", "refused" (the verdict is "not usable"), "WRONG", "no error" (a standard error is infinite or NaN), or
-        the exception that ended the run.
-    """
-
-    log_evidence: float
-    log_evidence_z: float
-    mean: float
-    mean_z: float
-    sd: float
-    share: float
-    wrong: bool
+    log_evidence: float  # absolute error
+    log_evidence_z: float  # error in standard errors
+    mean: float  # largest error, in standard deviations of the reference
+    mean_z: float  # largest error, in standard errors
+    sd: float  # largest relative error
+    share: float  # largest error of the share of a mode
+    wrong: bool  # whether an error exceeds what the run states, whatever its verdict
+    # "right", "refused" (the verdict is "not usable"), "WRONG", "no error" (a standard error is infinite or NaN), or
+    # the exception that ended the run
     judgement: str
 
 
 def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True, **settings: Any) -> Outcome:
-    """Run `SMCSampler` with the posterior's guide and a budget, or the default sampler.
+    """Run `SMCSampler` with the posterior's guide and a budget of simulations; without, if not `guided`.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    seed : int
-        Seed of the sampler.
-    budget : float or None
-        Largest number of simulations.
-    guided : bool
-        False: the default sampler.
-    **settings
-        Other arguments of `SMCSampler`.
-
-    Returns
-    -------
-    Outcome
+    Other arguments of `SMCSampler` are passed on.
     """
     walkers = settings.pop("nwalkers", WALKERS)
     if guided:
@@ -155,17 +102,8 @@ def run(posterior: Any, seed: int, budget: float | None, *, guided: bool = True,
 def compare(outcome: Outcome, reference: Any, labels: Callable[[np.ndarray], np.ndarray] | None = None) -> Errors:
     """Errors of a run, and whether they lie within what the run says.
 
-    Parameters
-    ----------
-    outcome : Outcome
-    reference : object
-        With the attributes log_evidence, mean, sd, shares and, of each, ``..._error``.
-    labels : callable, optional
-        Function of samples (n, ndim) that returns the number of the mode (n,).
-
-    Returns
-    -------
-    Errors
+    The reference has log_evidence, mean, sd, shares and, of each, ``..._error``; `labels` is a function of samples (n,
+    ndim) that returns the number of the mode (n,).
     """
     if outcome.failed:
         return Errors(*[np.nan] * 6, False, outcome.failed)
