@@ -43,7 +43,7 @@ def trace_founders(
     """Founders (n,) of each point after one more resampling, per generation, the oldest generation first.
 
     `founders` is the previous result, empty before the first resampling; `ancestors` (n,) are indices of the points
-    before the resampling. A generation is dropped once it has fewer than `min_share` n founders left, or fewer than
+    before the resampling. A generation is dropped once it has fewer founders than n times `min_share`, or fewer than
     ten. The last generation, the points before this resampling, is always kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]

@@ -171,8 +171,8 @@ def fit_mixture(
     """Fit a mixture to points (n, ndim); the number of components minimises the Bayesian information criterion.
 
     Components are added one at a time, each by splitting an existing component, as long as the criterion improves. Each
-    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then 4, 3
-    and 2.5 degrees of freedom are tried instead of `dof`, which is above 2, for points with heavier tails. If shears
+    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then fewer
+    degrees of freedom than `dof` (above 2) are tried, 4, 3 and 2.5, for points with heavier tails. If shears
     (`samplers.proposals.transforms`), or a transformation that removes `bounds` near the population, improve the
     criterion, the components are fitted to the transformed points.
 
