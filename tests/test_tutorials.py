@@ -125,7 +125,7 @@ def test_bridge_column_on_another_record(shared, tmp_path):
 def test_main_job_has_the_evidence_and_the_posterior_of_the_annealing(tmp_path):
     """`make update` uses a guide and a tenth of the simulations."""
     runs = {}
-    for name, options in {"guide": (), "annealing": ("--no-guide", "--walkers", "500")}.items():
+    for name, options in {"guide": (), "annealing": ("--no-guide", "--walkers", "200")}.items():
         out = tmp_path / name
         output = run_tutorial("02_bridge_column.py", "--preset", "reduced", "--out", str(out), *options)
         runs[name] = json.loads((out / "summary.json").read_text())

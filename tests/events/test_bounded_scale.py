@@ -142,7 +142,7 @@ def measured_shares(n_tests: int, rng: np.random.Generator, error: float = 0.1) 
 
 @pytest.mark.slow
 def test_ranks_of_the_truth_are_uniform():
-    """Simulation-based calibration: medians, spreads and new tests of 150 data sets drawn from the priors.
+    """Simulation-based calibration: medians, spreads and new tests of 80 data sets drawn from the priors.
 
     Talts et al. (2018), arXiv:1804.06788. The hyper-parameters are sampled on a grid. The measured shares have
     normal errors of 0.1, so that posteriors end at the bounds. The control leaves the derivative of the scale out.
@@ -150,7 +150,7 @@ def test_ranks_of_the_truth_are_uniform():
     cell = np.array([1.0 / 40.0, 3.5 / 30.0])
     points = (np.stack(np.meshgrid(np.arange(40), np.arange(30)), axis=-1).reshape(-1, 2) + 0.5) * cell
     ranks = {"right": [], "control": []}
-    for seed in range(150):
+    for seed in range(80):
         rng = np.random.default_rng([7, seed])
         truth, tests = measured_shares(6, rng)
         posterior = HierarchicalPosterior(tests, {"share": SHARE})
@@ -169,7 +169,7 @@ def test_ranks_of_the_truth_are_uniform():
     right, control = (np.array(each).T for each in ranks.values())
     assert min(stats.kstest(row, "uniform").pvalue for row in right) > 1e-3
     inside = (np.abs(right[2] - 0.5) < 0.45).mean()
-    assert abs(inside - 0.9) < 4.0 * np.sqrt(0.09 / 150)
+    assert abs(inside - 0.9) < 4.0 * np.sqrt(0.09 / 80)
     assert min(stats.kstest(row, "uniform").pvalue for row in control) < 1e-3
 
 
