@@ -74,4 +74,4 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environments, the built documentation and the results
-	rm -rf $(VENV) .venv-newer .venv-clients .venv-uqpy .venv-tinyda docs/_build results results-*
+	rm -rf $(VENV) .venv-newer .venv-clients .venv-uqpy docs/_build results results-*

@@ -34,7 +34,6 @@ SAME_NAME = {"comparison", "damage", "events", "guide", "inputs", "isolated_brid
     "scores",
     "sensors",
     "starting",
-    "umbridge",
 }
 
 
@@ -148,8 +147,7 @@ def test_every_adapter_imports_its_client_and_the_posterior_alone():
         adapts = name(path).startswith("fe_likelihoods/adapters/")
         expected = ADAPTED.get(path.stem, set()) if adapts else set()
         assert {top(i) for i in imports(path)} & set().union(*ADAPTED.values()) == expected, name(path)
-        # models are served as well as posteriors
-        more = {"simulation"} if path.stem == "umbridge" else set()
+        more = {"models"} if path.stem == "__init__" else set()  # the server is in the module of its client
         assert not adapts or own(path) <= {"adapters", "likelihood", "priors"} | more, name(path)
 
 

@@ -5,8 +5,8 @@ one function here, which translates the priors and passes the likelihood as a bl
 Clients in other languages and processes call the server of `serve` (UM-Bridge).
 """
 
+from ..models.umbridge import serve
 from .bilby import to_bilby
 from .pymc import to_pymc
-from .umbridge import serve
 
 __all__ = ["serve", "to_bilby", "to_pymc"]

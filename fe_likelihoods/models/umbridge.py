@@ -1,101 +1,66 @@
-"""Model that runs on UM-Bridge servers, in any language, in a container or on another machine."""
+"""UM-Bridge both ways, on the package `umbridge`: a model on a server, and a server of posteriors and models."""
 
 from __future__ import annotations
 
-import json
+import asyncio
+import socket
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
 from ..signals.channels import Channel
-from ..simulation.faults import ChangedModel, TransientReason
-from ..simulation.model import SimulationFailed
-from ..simulation.umbridge_servers import (
-    SIMULATION_FAILED,
-    TRANSIENT_FAILURE,
-    ServerError,
-    ServerTimeout,
-    UMBridgeServers,
-    Unavailable,
-)
+from ..simulation.faults import ChangedModel, TransientReason, UnusableModel, reason_of
+from ..simulation.model import SimulationFailed, simulate_batch, split_seconds
 from .user_model import ExternalModel
-from .validation import positive_float
+from .validation import check_integer, check_non_negative, positive_float
 
-__all__ = ["UMBridgeModel"]
+__all__ = ["UMBridgeModel", "UMBridgeServer", "serve"]
 
-_OTHER_MODEL = {"InvalidInput", "ModelNotFound", "UnsupportedFeature"}  # errors of a server with another model
+
+def _package() -> Any:
+    """The package, whose module `um` imports aiohttp.web and requests; ValueError if it is not installed."""
+    try:
+        import umbridge
+    except ImportError as error:
+        raise ValueError("UM-Bridge needs the package umbridge: pip install 'fe-likelihoods[umbridge]'") from error
+    return umbridge
 
 
 class UMBridgeModel(ExternalModel):
-    """Model of an UM-Bridge server.
-
-    The parameters are sent in the order of `parameter_names`, divided into vectors of the sizes that the server asks
-    for. The response has one vector per channel, or `output` computes it from the vectors that the server returns.
-
-    If the server answers with an error, the simulation has failed, and the error text is the reason. A server that
-    cannot be reached, or that dies during a simulation, is a fault of the infrastructure: the simulation is repeated
-    `retries` times. If all attempts fail, no cache stores the failure (docs/own_model.rst).
-
-    For several servers, use a pool with one thread per server, such as
-    ``FELikelihood(..., pool=ThreadPoolExecutor(3))`` for three; each simulation goes to the least busy server. A load
-    balancer has one address; use as many threads as it has servers.
+    """Model of an UM-Bridge server (docs/own_model.rst); it needs the package umbridge.
 
     Parameters
     ----------
-    urls : str or sequence of str
-        Address of the server, as in ``"http://localhost:4242"``, or addresses of several servers of the same model.
-    name : str
-        Name of the model on the server, often ``"forward"``.
-    parameter_names : sequence of str
-        Names of the structural parameters, in the order of theta.
-    channels : sequence of Channel
-        Channels of the response, in the order of its rows.
-    dt : float
-        Time step of the response [s].
-    n_steps : int, optional
-        Number of response samples; by default the length of the server's vectors.
+    url : str
+        Address of the server or load balancer. A pool of threads in `FELikelihood` runs several simulations at once.
+    name, version : str
+        Name of the model on the server, often ``"forward"``, and a text to change whenever that model changes. Both are
+        in the fingerprint, as are the configuration and the sizes; the address is not.
+    parameter_names, channels, dt, n_steps, depends_on
+        As for `FunctionModel`. The parameters fill the input vectors in their order; the server states `n_steps`.
     config : mapping, optional
-        Configuration that is sent with every request; its values must be representable in JSON.
+        Configuration that is sent with every request, of values that JSON can represent.
     output : callable, optional
-        Function that takes the server's list of vectors (one-dimensional arrays) and returns the response (n_channels,
-        n_steps) [SI]. It is required if the server does not return one vector [SI] per channel.
-    version : str
-        Text that enters the fingerprint. The code on a server has no digest here: change the text whenever the served
-        model changes, and give different models with the same name different texts.
-    depends_on : sequence, optional
-        Other files and values that the response depends on; see `FunctionModel`.
+        Function of the list of output vectors that returns the response (n_channels, n_steps) [SI]. It is required if
+        the server does not return one vector [SI] per channel.
     time_limit : float, optional
-        Longest time until the answer [s], which includes the time that a simulation waits at the server for others. A
-        longer simulation counts as failed; the server is not told and continues to run it.
-    retries : int
-        Number of further attempts after a fault of the infrastructure.
-    retry_wait : float
-        Time between the first two attempts [s]; it is doubled each time, up to 60 s. The defaults leave half a minute
-        in which a server can be restarted.
+        Longest wait for an answer [s]. Without it, a machine that vanishes may be waited for without end.
+    retries, retry_wait : int, float
+        Further attempts if the server cannot be reached or dies; time until the first [s], doubled each time to 60 s.
 
     Raises
     ------
-    ConnectionError
-        If a server does not answer.
-    ValueError
-        If a server has no such model, its sizes do not fit the parameters and channels, or another argument is wrong.
-
-    Notes
-    -----
-    The addresses are not part of the fingerprint: a model is the same at another port. The name, the configuration, the
-    sizes and `version` are.
-
-    Examples
-    --------
-    >>> model = UMBridgeModel(
-    ...     "http://localhost:4242", "forward", ("stiffness",), (Channel("tip", "displacement", "mm"),), 0.01
-    ... )
+    ConnectionError, ValueError
+        If the server cannot be reached; if it has no such model, or arguments are wrong or do not fit the model.
     """
 
     def __init__(
         self,
-        urls: str | Sequence[str],
+        url: str,
         name: str,
         parameter_names: Sequence[str],
         channels: Sequence[Channel],
@@ -110,113 +75,176 @@ class UMBridgeModel(ExternalModel):
         retries: int = 5,
         retry_wait: float = 1.0,
     ) -> None:
-        kind = type(self).__name__
-        if output is not None and not callable(output):
-            raise ValueError(f"{kind}: output must be a function of the server's vectors; got {output!r}")
-        if output is not None and n_steps is None:
-            raise ValueError(f"{kind}: give n_steps, the number of samples that output returns per channel")
+        if output is not None and (n_steps is None or not callable(output)):
+            raise ValueError(f"UMBridgeModel: output must be a function, with n_steps; got {output!r}, {n_steps!r}")
         super().__init__(parameter_names, channels, dt, 1 if n_steps is None else n_steps, depends_on)
-        self.time_limit = None if time_limit is None else positive_float(time_limit, f"{kind}: time_limit", "seconds")
-        self.name, self.config, self.version, self.output = name, _copy_of(config, kind), str(version), output
-        self.servers = UMBridgeServers([urls] if isinstance(urls, str) else list(urls), retries, retry_wait)
-        self.input_sizes, self.output_sizes = self._common_sizes()
-        if sum(self.input_sizes) != len(self.parameter_names):
+        self.time_limit = None if time_limit is None else positive_float(time_limit, "time_limit", "seconds")
+        check_integer("number of retries", retries, 0, 1000)
+        check_non_negative("retry_wait", retry_wait)
+        self.url, self.name, self.output, self.retries, self.retry_wait = url, name, output, retries, retry_wait
+        self.config = dict(sorted((config or {}).items()))
+        self.input_sizes, self.output_sizes = sizes = self._sizes()
+        self.n_steps = self.n_steps if n_steps is not None else max(self.output_sizes, default=1)
+        expected = [self.n_steps] * len(self.channels) if output is None else self.output_sizes
+        if sum(self.input_sizes) != len(self.parameter_names) or self.output_sizes != expected:
             raise ValueError(
-                f"{kind}: model {name!r} at {self.servers.urls[0]} takes {sum(self.input_sizes)} numbers, in vectors "
-                f"of sizes {self.input_sizes}; got {len(self.parameter_names)} parameter_names: "
-                f"{', '.join(self.parameter_names)}"
+                f"UMBridgeModel: {name!r} takes vectors of sizes {sizes[0]} and returns {sizes[1]}; got the parameters "
+                f"{self.parameter_names} and channels of sizes {expected}: change the names, or give n_steps and output"
             )
-        if output is None:
-            expected = self.output_sizes[0] if n_steps is None and self.output_sizes else self.n_steps
-            if self.output_sizes != [expected] * len(self.channels) or not expected:
-                steps = "of the same length" if n_steps is None else f"of n_steps={n_steps} numbers"
-                raise ValueError(
-                    f"{kind}: expected one vector {steps} for each of the channels "
-                    f"{', '.join(channel.name for channel in self.channels)}; model {name!r} at "
-                    f"{self.servers.urls[0]} returns vectors of sizes {self.output_sizes}: give n_steps= and output=, "
-                    "a function of these vectors that returns (n_channels, n_steps)"
-                )
-            self.n_steps = expected
-        sizes = self.input_sizes, self.output_sizes
-        self.fingerprint = self._digest(self.name, self.config, *sizes, self.version)
+        self.fingerprint = self._digest(self.name, self.config, *sizes, str(version))
 
     def code_parts(self) -> dict[str, Any]:
         """User code, for the label of stored simulations."""
         return {"output": self.output}
 
-    def _common_sizes(self) -> tuple[list[int], list[int]]:
-        """Sizes of the inputs and of the outputs, which are the same on all servers."""
-        kind, known = type(self).__name__, None
-        for url in self.servers.urls:
-            try:
-                sizes = self.servers.sizes(url, self.name, self.config)
-            except Unavailable as error:
-                raise ConnectionError(
-                    f"{kind}: expected a server of UM-Bridge; {error}. Start it, or correct the address"
-                ) from error
-            except ServerError as error:
-                raise ValueError(
-                    f"{kind}: expected a model named {self.name!r} that can be evaluated at {url}; {error}"
-                ) from error
-            if known is not None and sizes != known:
-                raise ValueError(
-                    f"{kind}: expected the same model {self.name!r} on all servers; its input and output sizes are "
-                    f"{known} at {self.servers.urls[0]} and {sizes} at {url}"
-                )
-            known = sizes
-        return known
+    def _sizes(self) -> tuple[list[int], list[int]]:
+        """Sizes of the input and output vectors that the server states."""
+        package = _package()
+        try:
+            model = package.HTTPModel(self.url, self.name)
+            sizes = model.get_input_sizes(self.config), model.get_output_sizes(self.config)
+            return [int(size) for size in sizes[0]], [int(size) for size in sizes[1]]
+        except Exception as error:  # the package raises Exception, KeyError and others
+            kind = ConnectionError if type(error).__name__ == "ConnectionError" else UnusableModel
+            text = f"UMBridgeModel: expected an UM-Bridge server with a model {self.name!r} at {self.url}; got "
+            raise kind(f"{text}{type(error).__name__}: {error}. Start it, or correct the address") from error
 
     def _respond(self, theta: np.ndarray) -> Any:
         if not np.isfinite(theta).all():
             raise SimulationFailed("the parameters are not finite")
-        blocks = np.split(theta, np.cumsum(self.input_sizes[:-1]))
-        request = {"name": self.name, "input": [block.tolist() for block in blocks], "config": self.config}
+        blocks = [block.tolist() for block in np.split(theta, np.cumsum(self.input_sizes[:-1]))]
+        answer = self._ask({"name": self.name, "input": blocks, "config": self.config})
+        content, place = {}, 0
         try:
-            answer = self.servers.evaluate(request, self.time_limit)
-        except ServerTimeout as error:
-            raise SimulationFailed(TransientReason(str(error), time_limit=self.time_limit)) from error
-        except Unavailable as error:
-            raise SimulationFailed(TransientReason(str(error))) from error
-        except ServerError as error:
-            if error.kind in _OTHER_MODEL:
-                self._require_same_model(error)
-            own = {SIMULATION_FAILED: str, TRANSIENT_FAILURE: TransientReason}.get(error.kind)
-            raise SimulationFailed(own(error.message) if own else str(error)) from error
-        vectors = self._vectors(answer)
-        return vectors if self.output is None else self.output(vectors)
+            content = answer.json()
+        except ValueError as error:
+            place = error.pos
+        if "error" in content:
+            kind, text = content["error"]["type"], content["error"]["message"]
+            other = kind in ("InvalidInput", "ModelNotFound", "UnsupportedFeature")
+            if other and self._sizes() != (self.input_sizes, self.output_sizes):
+                raise ChangedModel(
+                    f"UMBridgeModel: the server has another model now, start the first one again: {text}"
+                )
+            text = text if kind in ("SimulationFailed", "TransientReason") else f"{kind}: {text}"
+            raise SimulationFailed(TransientReason(text) if kind == "TransientReason" else text)
+        if "output" not in content:
+            # the package answers 500 where a model raises an exception, and an output with nan, which is not JSON
+            kind = str if answer.status_code == 500 or answer.text.startswith("{") else TransientReason
+            raise SimulationFailed(kind(f"not UM-Bridge, HTTP {answer.status_code}: {answer.text[place:][:200]}"))
+        vectors = [[x for x in vector if type(x) in (int, float) and abs(x) < np.inf] for vector in content["output"]]
+        if [len(vector) for vector in vectors] != self.output_sizes or vectors != content["output"]:
+            raise SimulationFailed(f"expected numbers, {self.output_sizes} of them; got {str(content['output'])[:200]}")
+        return vectors if self.output is None else self.output([np.array(vector, dtype=float) for vector in vectors])
 
-    def _vectors(self, answer: Any) -> list[np.ndarray]:
-        """Vectors of an answer; SimulationFailed if they are not vectors of numbers with the stated sizes."""
+    def _ask(self, request: dict[str, Any]) -> Any:
+        """HTTP answer. The package's own request has no time limit, and hides the HTTP status."""
+        requests = _package().um.requests
+        for attempt in range(self.retries + 1):
+            try:
+                answer = requests.post(f"{self.url}/Evaluate", json=request, timeout=(10.0, self.time_limit))
+                if answer.status_code not in (429, 502, 503, 504):  # a load balancer without a free server
+                    return answer
+                answer.raise_for_status()
+            except requests.RequestException as error:
+                limit = self.time_limit if isinstance(error, requests.ReadTimeout) else 0.0
+                if limit or attempt == self.retries:
+                    raise SimulationFailed(TransientReason(f"{error} (attempt {attempt + 1})", limit)) from error
+                time.sleep(min(self.retry_wait * 2.0**attempt, 60.0))
+
+
+def serve(served: Any, *, host: str = "127.0.0.1", port: int = 4242, block: bool = True) -> UMBridgeServer | None:
+    """Make posteriors and models available to clients of UM-Bridge (docs/clients.rst); it needs the package umbridge.
+
+    Parameters
+    ----------
+    served : Posterior, Model, or mapping of str to these
+        A mapping gives the names; a single posterior is named ``"posterior"``, a single model ``"forward"``.
+    host, port : str, int
+        Where connections are accepted, without passwords; ``"0.0.0.0"`` is all networks, and port 0 a free port.
+    block : bool
+        Whether to return only after Ctrl-C.
+
+    Returns
+    -------
+    UMBridgeServer or None
+        Without `block`, the server, in threads of this process. Do not evaluate `served` elsewhere until its `close`.
+    """
+    if not isinstance(served, Mapping):
+        served = {"posterior" if hasattr(served, "log_prob") else "forward": served}
+    application = _application([_served(name, thing) for name, thing in served.items()])
+    listening = socket.create_server((host, port))
+    if not block:
+        return UMBridgeServer(application, listening)
+    _package().um.web.run_app(application, sock=listening, access_log=None)
+
+
+class UMBridgeServer(ExitStack):
+    """A running server; `url` is its address. `close` ends it after the points that are being evaluated."""
+
+    def __init__(self, application: Any, listening: socket.socket) -> None:
+        def end() -> None:
+            raise web.GracefulExit
+
+        super().__init__()
+        web = _package().um.web
+        self.url, loop = "http://{}:{}".format(*listening.getsockname()), asyncio.new_event_loop()
+        options = {"sock": listening, "loop": loop, "handle_signals": False, "print": None, "access_log": None}
+        thread = threading.Thread(target=web.run_app, args=(application,), kwargs=options, daemon=True)
+        thread.start()
+        self.callback(thread.join)
+        self.callback(lambda: loop.is_closed() or loop.call_soon_threadsafe(end))  # the first to be called
+
+
+def _application(models: list[Any]) -> Any:
+    """The application that `umbridge.serve_models` would run on all networks; here exceptions have reasons."""
+    web = _package().um.web
+
+    @web.middleware
+    async def with_reasons(request: Any, handler: Any) -> Any:
         try:
-            vectors = [np.asarray(vector, dtype=float) for vector in answer]
-        except (TypeError, ValueError) as error:
-            raise SimulationFailed(f"the output of the server is not a list of numeric vectors: {error}") from error
-        if [vector.shape for vector in vectors] != [(size,) for size in self.output_sizes]:
-            shapes = [vector.shape for vector in vectors]
-            raise SimulationFailed(f"the output has vectors of shapes {shapes}, expected sizes {self.output_sizes}")
-        return vectors
+            return await handler(request)
+        except Exception as error:
+            kind = "TransientReason" if isinstance(reason_of(error), TransientReason) else type(error).__name__
+            answer = {"error": {"type": kind, "message": split_seconds(str(error))[0]}}
+            return web.json_response(answer, status=getattr(error, "status", 500))
 
-    def _require_same_model(self, error: ServerError) -> None:
-        """Raise ChangedModel if the error came from servers that were started again with another model."""
-        try:
-            same = self._common_sizes() == (self.input_sizes, self.output_sizes)
-        except ConnectionError as fault:
-            raise SimulationFailed(TransientReason(str(fault))) from error
-        except ValueError:
-            same = False
-        if not same:
-            raise ChangedModel(
-                f"{type(self).__name__}: a server no longer has the model {self.name!r} with inputs of sizes "
-                f"{self.input_sizes} and outputs of sizes {self.output_sizes} ({error}): start that model again, or "
-                "make a new UMBridgeModel and a new likelihood"
-            ) from error
-
-
-def _copy_of(config: Mapping[str, Any] | None, kind: str) -> dict[str, Any]:
-    """Copy of a configuration as JSON gives it; ValueError if JSON cannot represent it."""
+    taken, run = [], web.run_app
+    web.run_app = lambda application, **_: taken.append(application)
     try:
-        return json.loads(json.dumps(dict(config or {}), sort_keys=True, allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{kind}: config must be a mapping of texts to values that JSON can represent; got {config!r} ({error})"
-        ) from error
+        _package().serve_models(models)
+    finally:
+        web.run_app = run
+    taken[0].middlewares.append(with_reasons)
+    return taken[0]
+
+
+def _served(name: str, thing: Any) -> Any:
+    """Posterior or model as an object of the package, which asks for the sizes before each evaluation."""
+    densities = [density for density in ("log_prob", "log_likelihood", "log_prior") if hasattr(thing, density)]
+    if not densities and not all(hasattr(thing, name) for name in ("simulate", "parameter_names", "channels")):
+        raise ValueError(f"serve: expected a posterior or a model as {name!r}; got {type(thing).__name__}")
+    inputs = [thing.ndim if densities else len(thing.parameter_names)]
+    outputs = [1] if densities else [thing.n_steps] * len(thing.channels)
+
+    def input_sizes(config: dict[str, Any]) -> list[int]:
+        if config and (list(config) != ["density"] or config["density"] not in densities):
+            raise ValueError(f"expected a config with at most a density, one of {densities}; got {config}")
+        return inputs
+
+    def evaluate(parameters: list[list[float]], config: dict[str, Any]) -> list[list[float]]:
+        point = np.asarray(parameters)
+        if point.dtype.kind not in "fiu" or not np.isfinite(point).all():
+            raise ValueError(f"expected finite numbers; got {str(parameters)[:200]}")
+        if densities:
+            (value,) = getattr(thing, config.get("density", densities[0]))(point.astype(float))
+            return [[max(float(value), -1e100)]]  # JSON has no infinite numbers
+        (response,), (reason,) = simulate_batch(thing, point.astype(float))
+        if reason:
+            raise SimulationFailed(reason)
+        return response.tolist()
+
+    model = _package().Model(name)
+    model.supports_evaluate, model.__call__ = lambda: True, evaluate
+    model.get_input_sizes, model.get_output_sizes = input_sizes, lambda config: outputs
+    return model
