@@ -54,7 +54,8 @@ class CostEstimate(NamedTuple):
         Evaluations made for the estimate, evaluations that returned -inf, and evaluations that needed no simulation (0
         for a posterior whose ``report()`` has no number of simulations).
     evaluations : Expected
-        Evaluations of the posterior. Each step at beta = 1 needs one more per walker.
+        Evaluations of the posterior, without sweeps over fast parameters, which need no simulation. Each step at
+        beta = 1 needs one more per walker.
     wall_time : Expected
         Wall time [s] with all workers busy. Without ``asynchronous=True``, a run also waits for the longest evaluation
         of every batch.

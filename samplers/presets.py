@@ -14,6 +14,8 @@ The scale of their random walk is not given; 2.38 / sqrt(ndim) is used.
 `CHING_CHEN_2007` is for `TMCMCSampler`: coefficient of variation 1, multinomial leaders, one Metropolis step per point,
 covariance 0.04 times the weighted covariance (Ching & Chen 2007, doi:10.1061/(ASCE)0733-9399(2007)133:7(816)). It can
 collapse on sharp posteriors; the default of `TMCMCSampler` does not.
+
+None of these settings makes sweeps over fast parameters, which are not in the papers.
 """
 
 from collections.abc import Mapping
@@ -31,6 +33,7 @@ _COMMON = {
     "resampling": "multinomial",
     "min_moves": 10,
     "max_moves": 10,
+    "fast_sweeps": 0,
 }
 RAMANCHA_2022_CONSTANT: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "constant"})
 RAMANCHA_2022_LITERAL: Mapping[str, Any] = MappingProxyType({**_COMMON, "ess_rule": "declining", "ess_floor": 50.0})
@@ -41,5 +44,6 @@ CHING_CHEN_2007: Mapping[str, Any] = MappingProxyType(
         "resampling": "multinomial",
         "chains": "leaders",
         "burn_in": 0,
+        "fast_sweeps": 0,
     }
 )

@@ -63,7 +63,7 @@ class Stage(NamedTuple):
     acceptance : float
         Share of accepted proposals in this stage.
     moves : int
-        Sweeps of the whole ensemble made at this beta; 0 for recycling.
+        Sweeps of the whole ensemble made at this beta, without sweeps over fast parameters; 0 for recycling.
     distinct_ancestors : int
         Number of distinct points that survived the resampling.
     log_evidence_increment : float
@@ -72,7 +72,7 @@ class Stage(NamedTuple):
         Standard error of the summed increments so far.
     evaluations : int
         Points for which ``log_prob_fn`` was called in this stage (the first stage includes the draws of the prior).
-        Points that differ in fast parameters only count, so this can exceed the simulations. Entered by the sampler.
+        Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
     seconds : float
         Wall time of the stage [s]. Entered by the sampler.
     """

@@ -40,7 +40,10 @@ class RunResults:
 
     @property
     def evaluations(self) -> int:
-        """Points for which `log_prob_fn` was called, by this object and by an interrupted run that it continues."""
+        """Points for which `log_prob_fn` was called, by this object and by an interrupted run that it continues.
+
+        Sweeps over fast parameters are included.
+        """
         return self._record.count
 
     def report(self) -> dict[str, float]:

@@ -19,7 +19,7 @@ from .resampling import RESAMPLING
 __all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "refuse_unused"]
 
 # settings of annealing by moves that every sampler has
-MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "check_draws", "max_failure_share")
+MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
 
 
 def as_whole_number(name: str, value: Any) -> int:
@@ -57,6 +57,9 @@ class Settings:
         resampled point, one step per copy of it, and sweeps follow if the points are still correlated.
     burn_in : int
         With "leaders", steps of a chain before its points count; 0 for the published algorithm, without sweeps.
+    fast_sweeps : int
+        Sweeps over the fast parameters after every move, if `log_prob_fn` has an attribute ``fast_parameters``
+        (`samplers.moves.fast_parameters`); 0 for none.
     recycle : bool, optional
         Anneal by adaptive importance sampling over all evaluated points (`samplers.tempering.recycling`), and by moves
         only if the result cannot be trusted. None leaves the choice to the sampler.
@@ -83,13 +86,14 @@ class Settings:
     max_correlation: float = 0.15
     chains: str = "equal"
     burn_in: int = 0
+    fast_sweeps: int = 2
     recycle: bool | None = None
     check_draws: int | None = None
     max_failure_share: float = 0.5
     asynchronous: bool = False
 
     def __post_init__(self):
-        for name in ("min_moves", "max_moves", "burn_in", "check_draws"):
+        for name in ("min_moves", "max_moves", "burn_in", "fast_sweeps", "check_draws"):
             if name != "check_draws" or self.check_draws is not None:
                 object.__setattr__(self, name, as_whole_number(name, vars(self)[name]))
         for name, allowed in (("asynchronous", "True or False"), ("recycle", "True, False or None")):
@@ -113,6 +117,7 @@ class Settings:
             ("max_correlation", 0.0 < self.max_correlation <= 1.0, "above 0 and at most 1"),
             ("chains", self.chains in ("equal", "leaders"), '"equal" or "leaders"'),
             ("burn_in", self.burn_in >= 0, "non-negative"),
+            ("fast_sweeps", self.fast_sweeps >= 0, "a whole number, 0 for none"),
             ("check_draws", check_draws is None or check_draws >= 0, "non-negative"),
             ("max_failure_share", 0.0 <= self.max_failure_share <= 1.0, "between 0 and 1"),
         ):

@@ -37,7 +37,8 @@ from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood
 from .judgement.failures import judged_failures
 from .judgement.verdict import CONVERGED, describe_early_stop, independent_points, judge
-from .moves.population_moves import GuideMove, RandomWalkMove
+from .moves.fast_parameters import with_fast_sweeps
+from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move
 from .output import Output
 from .record import EvaluatedBatch, RunStart
 from .replay import compare, describe_run, differences, open_record, points_to_compare
@@ -66,12 +67,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ----------
     nwalkers, ndim, log_prob_fn, pool, moves, args, kwargs, backend, vectorize, blobs_dtype, parameter_names
         As in `emcee.EnsembleSampler`, in the same order. `moves` are the mutation kernels, which are copied; a random
-        walk by default. A point for which `log_prob_fn` raises an exception or returns NaN counts as -inf and is
-        recorded (`failures`). Points outside the support of the prior are not evaluated. Blobs are stored exactly:
-        without `blobs_dtype`, in a type that holds the blobs of the first evaluations, and later blobs that this type
-        cannot hold are refused. With an emcee `HDFBackend`, a record of all evaluations is kept beside the file, and a
-        killed run continues without repeating an evaluation (`run_mcmc`). While another program holds the file open,
-        the chain is kept in memory.
+        walk by default. If `log_prob_fn` has ``fast_parameters``, each move is followed by `fast_sweeps` sweeps over
+        them (not with a `pool` and ``vectorize=False``, since workers do not cache simulations). A point for which
+        `log_prob_fn` raises an exception or returns NaN counts as -inf and is recorded (`failures`). Points outside the
+        support of the prior are not evaluated. Blobs are stored exactly: without `blobs_dtype`, in a type that holds
+        the blobs of the first evaluations, and later blobs that this type cannot hold are refused. With an emcee
+        `HDFBackend`, a record of all evaluations is kept beside the file, and a killed run continues without repeating
+        an evaluation (`run_mcmc`). While another program holds the file open, the chain is kept in memory.
     log_prior_fn : callable, optional
         Log-density of the normalised prior. It takes the same kind of argument as `log_prob_fn` (a point; a batch with
         `vectorize`; a dict with `parameter_names`) but not `args` and `kwargs`. By default ``log_prob_fn.log_prior``.
@@ -174,7 +176,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._result, self._verdict = self._output.result, self._output.verdict
         self._is_compared = not self._reopened and self.backend.iteration == 0
         check_moves(get_moves(self)[0], given.chains)
-        self._first_moves = copy.deepcopy(get_moves(self)[0]), get_moves(self)[1]  # each annealing begins with copies
+        self._fast = self._optional.fast_parameters if pool is None or vectorize else ()
+        followed = with_fast_sweeps(get_moves(self)[0], self._fast, ndim, self.settings.fast_sweeps)
+        # each annealing begins with copies of these
+        self._first_moves = copy.deepcopy(followed), get_moves(self)[1]
+        set_moves(self, followed, get_moves(self)[1])
         refuse_unused(self.settings, guide is not None)
         advise_on_pool(pool)
         if given.ess_floor >= nwalkers:
@@ -620,7 +626,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         for concern in (*self._result.concerns, *self._result.refusals):
             warn(f"the result may miss a part of the posterior: {concern}")
         if self._result.start is not None and self._result.start.used:
-            set_moves(self, [GuideMove(self._guide)], np.ones(1))
+            moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
+            calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
+            set_moves(self, moves, np.ones(1))
         self._judge(0, population.coords)
         self._reopened = False
         last = None if self._result.early_stop is not None else self._output.last_state()

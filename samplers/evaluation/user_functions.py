@@ -45,10 +45,6 @@ class OptionalAttributes(NamedTuple):
     def slow_parameters(self, ndim: int) -> list[int]:
         """Indices of the parameters that a simulation depends on; all parameters if none is slow."""
         fast = set(self.fast_parameters)
-        if not fast <= set(range(ndim)):
-            raise ValueError(
-                f"fast_parameters must be indices of parameters, 0 to {ndim - 1}; got {tuple(self.fast_parameters)}"
-            )
         return [j for j in range(ndim) if j not in fast] or list(range(ndim))
 
     @property

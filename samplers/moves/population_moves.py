@@ -81,7 +81,7 @@ def calibrate_move(
 ) -> None:
     """Fit a move to points (n, ndim) with normalised weights (n,), if it can be fitted; emcee's own moves cannot.
 
-    A `MixtureMove` takes a given `mixture` instead.
+    A `MixtureMove`, with fast sweeps or without, takes a given `mixture` instead.
     """
     if mixture is not None and getattr(move, "takes_mixture", False):
         move.calibrate(coords, weights, inside, mixture)

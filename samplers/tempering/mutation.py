@@ -15,6 +15,7 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
 from ..estimates.weights import LOWEST
+from ..moves.fast_parameters import WithFastSweeps
 from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
 from ..reports import Sweep
@@ -92,13 +93,13 @@ class MoveSchedule(NamedTuple):
         about 1.
         """
         for move in self.moves:
-            if isinstance(move, MixtureMove):
+            if isinstance(move, MixtureMove | WithFastSweeps):
                 move.cover_basins(coords, log_target)
 
     def expect_independence(self) -> None:
         """Tell mixture moves that the points are already independent draws of the target."""
         for move in self.moves:
-            if isinstance(move, MixtureMove):
+            if isinstance(move, MixtureMove | WithFastSweeps):
                 move.expect_independence()
 
 

@@ -304,10 +304,12 @@ def test_arviz_from_emcee(Sampler):
 
 def test_our_moves_are_emcees():
     """A plain EnsembleSampler does not calibrate moves; they fit themselves to the first ensemble."""
+    from samplers.moves.fast_parameters import WithFastSweeps
     from samplers.moves.population_moves import MixtureMove, RandomWalkMove
 
     posterior = Gaussian()
-    for move in (RandomWalkMove(), MixtureMove()):
+    followed = [WithFastSweeps(move, (2,)) for move in (MixtureMove(), emcee.moves.StretchMove())]
+    for move in (RandomWalkMove(), MixtureMove(), *followed):
         sampler = emcee.EnsembleSampler(N, 3, posterior, moves=move)
         sampler.run_mcmc(posterior.mean + posterior.sd * start(posterior), 20, tune=True)
         assert sampler.acceptance_fraction.mean() > 0.1

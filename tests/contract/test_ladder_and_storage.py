@@ -314,6 +314,8 @@ def test_no_evidence_before_a_run():
         {"min_moves": 5, "max_moves": 4},
         {"max_correlation": 0.0},
         {"check_draws": -1},
+        {"fast_sweeps": -1},
+        {"fast_sweeps": 1.5},
     ],
     ids=str,
 )

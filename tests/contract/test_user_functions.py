@@ -178,40 +178,6 @@ def test_a_log_likelihood_as_log_prob_is_refused(Sampler):
     run(Sampler, posterior.__call__, log_prior_fn=posterior.log_prior, vectorize=True)
 
 
-# ---------------------------------------------------------------- attributes of the function
-
-
-@pytest.mark.parametrize("fast", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])
-def test_fast_parameters_are_indices(fast):
-    posterior = Gaussian()
-    posterior.fast_parameters = fast
-    with pytest.raises(ValueError, match="fast_parameters must be indices of parameters"):
-        SMCSampler(50, 3, posterior)
-
-
-@every
-def test_points_that_differ_in_fast_parameters_are_one_simulation(Sampler):
-    evaluated = []
-
-    class Noted(Gaussian):
-        fast_parameters = (1, 2)
-
-        def __call__(self, x):
-            evaluated.append(x.copy())
-            return super().__call__(x)
-
-    sampler = Sampler(100, 3, Noted(), vectorize=True, seed=1)
-    sampler.run_mcmc(None, 5)
-    points = np.concatenate(evaluated)
-    assert sampler.simulations == len(np.unique(points[:, 0])) < len(points) == sampler.evaluations
-
-
-@pytest.mark.parametrize("Sampler", [*SAMPLERS, TemperedSampler])
-def test_a_wrong_ndim_is_refused_with_the_number_of_parameters(Sampler):
-    with pytest.raises(ValueError, match=r"ndim is 2, but log_prob_fn has 3 parameters \(x0, x1, x2\): pass ndim=3"):
-        Sampler(50, 2, Gaussian(3), vectorize=True)
-
-
 # ---------------------------------------------------------------- functions that change their argument
 
 

@@ -10,6 +10,7 @@ from emcee.model import Model
 from scipy import stats
 
 from samplers import SMCSampler
+from samplers.moves.fast_parameters import FastWalk
 from samplers.moves.population_moves import MixtureMove, RandomWalkMove, _first_half
 from tests.statistics.test_tails import SCALE, StudentProduct
 
@@ -31,7 +32,7 @@ def proposals_of(move, coords, sweeps):
     return np.array(proposed)
 
 
-@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove])
+@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove, lambda: FastWalk([1])])
 def test_a_walker_has_no_part_in_its_own_proposal(make, rng):
     """Walkers that are far away change the proposals to the other half, and not those to their own half."""
     coords = rng.standard_normal((N, 3))
@@ -63,7 +64,7 @@ def test_both_halves_are_tuned(make, rng):
     assert np.allclose(later, first * np.exp(-10 * move.target))
 
 
-@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove])
+@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove, lambda: FastWalk([1])])
 def test_another_number_of_walkers_is_fitted_anew(make, rng):
     """Proposals have the place and the width of the new walkers."""
     move = make()
@@ -99,7 +100,7 @@ def test_copies_are_in_one_half_and_places_are_divided(rng):
         assert not halves[0] & halves[1] and len(halves[1]) - len(halves[0]) in (0, 1)
 
 
-@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove])
+@pytest.mark.parametrize("make", [MixtureMove, RandomWalkMove, lambda: FastWalk([1])])
 def test_walkers_that_span_no_volume_are_refused(make, rng):
     line = rng.standard_normal((N, 1)) * [1.0, 1e6, 1e-6]
     few = np.repeat(rng.standard_normal((6, 3)), 10, axis=0)

@@ -5,6 +5,7 @@ import pytest
 
 from samplers.estimates.importance import EvidenceCheck
 from samplers.judgement import rounds as judged
+from samplers.moves.fast_parameters import WithFastSweeps
 from samplers.moves.population_moves import MixtureMove
 from samplers.reports import AnnealingResult, Restart, Stage, Sweep
 from samplers.settings import Settings
@@ -100,7 +101,8 @@ def test_sweeps_after_recycling_use_its_last_proposal(monkeypatch):
     monkeypatch.setattr("samplers.tempering.anneal.recycle", watched)
     posterior, random, move = Gaussian(3, sd=0.02), np.random.RandomState(1), MixtureMove()
     start = Population(0.0, posterior.sample_prior(250, random), None, 250.0)
-    list(anneal(start, CountedDensity(posterior), random, MoveSchedule([move], np.ones(1)), Settings(recycle=True)))
+    moves = WithFastSweeps(move, [2])
+    list(anneal(start, CountedDensity(posterior), random, MoveSchedule([moves], np.ones(1)), Settings(recycle=True)))
     assert found[0].reliable and move.mixture is found[0].proposals[-1][1]
 
 

@@ -146,6 +146,14 @@ def test_points_are_observed_once_before_they_are_evaluated():
     assert sampler.guide.seen == sampler.evaluations == posterior.calls
 
 
+def test_points_that_differ_in_fast_parameters_are_one_simulation():
+    posterior = Gaussian()
+    posterior.fast_parameters = (2,)
+    sampler = run(posterior, laplace(posterior), steps=2)
+    draws = sum(r.draws for r in sampler.rounds)
+    assert sampler.simulations <= draws + 2 * N < sampler.evaluations
+
+
 def test_guided_runs_are_pickled():
     posterior = Gaussian()
     sampler = run(posterior, laplace(posterior, scale=2.0, guide=LearningGuide))

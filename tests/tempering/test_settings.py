@@ -33,18 +33,19 @@ CHANGES = {
     "max_correlation": (1e-6, {}),
     "chains": ("leaders", {}),
     "burn_in": (3, {"chains": "leaders"}),
+    "fast_sweeps": (4, {}),
     "recycle": (None, {}),  # the other value than that of the path
     "check_draws": (0, {}),
     "max_failure_share": (0.0, {}),
     "asynchronous": (True, {}),
 }
 ACTS = {
-    "recycling": {"recycle", "check_draws", "asynchronous"},
+    "recycling": {"fast_sweeps", "recycle", "check_draws", "asynchronous"},
     "moves": {"ess_ratio", "ess_rule", "ess_floor", "resampling", "min_moves", "max_moves", "max_correlation"}
-    | {"recycle", "check_draws"},
+    | {"fast_sweeps", "recycle", "check_draws"},
     "equal chains": {"coefficient_of_variation", "resampling", "min_moves", "max_moves", "max_correlation", "chains"}
-    | {"burn_in", "check_draws"},
-    "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "check_draws"}
+    | {"burn_in", "fast_sweeps", "check_draws"},
+    "chains from leaders": {"coefficient_of_variation", "resampling", "burn_in", "fast_sweeps", "check_draws"}
     | {"min_moves", "max_moves", "max_correlation"},
 }
 
@@ -66,7 +67,9 @@ def test_docstring_of_the_settings_names_every_setting():
 
 
 class Target(Gaussian):
-    """A sharp Gaussian; optionally, some of its points fail."""
+    """A sharp Gaussian with a fast parameter; optionally, some of its points fail."""
+
+    fast_parameters = (2,)
 
     def __init__(self, fails=False, **target):
         super().__init__(**target)
@@ -161,6 +164,7 @@ def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
         {"burn_in": 1.5},
         {"min_moves": 2.0},
         {"max_moves": 5.5},
+        {"fast_sweeps": True},
         {"recycle": "no"},
         {"recycle": 1},
     ],

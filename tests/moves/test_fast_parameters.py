@@ -1,0 +1,379 @@
+"""Sweeps over fast parameters: correct posterior, other parameters unchanged, no additional simulations."""
+
+import pickle
+from multiprocessing.pool import ThreadPool
+
+import emcee
+import numpy as np
+import pytest
+from emcee.model import Model
+from scipy import stats
+
+from fe_likelihoods import (
+    FELikelihood,
+    HalfNormal,
+    LinearOscillator,
+    Measurements,
+    Posterior,
+    Record,
+    TruncatedNormal,
+)
+from samplers import MixtureMove, RandomWalkMove, SMCSampler, TemperedSampler, TMCMCSampler
+from samplers.emcee_internals import get_moves
+from samplers.moves.fast_parameters import FastWalk, WithFastSweeps
+from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
+from tests.contract.targets import Gaussian, WithBlobs
+from tests.statistics.test_posteriors import deviations, evidence_deviation, runs, within
+
+
+class NormalInverseGamma:
+    """Mean and standard deviation of a sample under the conjugate prior, with known posterior and evidence.
+
+    The prior of the variance is inverse gamma (2, 1). The prior of the mean is normal with mean zero and that variance.
+    """
+
+    ndim = 2
+    fast_parameters = (1,)
+
+    def __init__(self, n=12):
+        y = stats.norm.ppf((np.arange(n) + 0.5) / n, 0.8, 0.4)
+        self.n, self.centre, self.square = n, y.mean(), np.sum((y - y.mean()) ** 2)
+        self.shape = 2.0 + 0.5 * n
+        self.scale = 1.0 + 0.5 * self.square + 0.5 * n / (1.0 + n) * self.centre**2
+        self.mean = n * self.centre / (1.0 + n)
+        variance = stats.invgamma(self.shape, scale=self.scale)
+        self.variance, self.median = variance.mean(), np.sqrt(variance.median())
+        # evidence by Bayes' rule, evaluated at one point
+        at = np.array([0.7, 0.5])
+        posterior = variance.logpdf(0.25) + np.log(1.0) + stats.norm.logpdf(0.7, self.mean, 0.5 / np.sqrt(1.0 + n))
+        self.log_evidence = self.log_likelihood(at) + self.log_prior(at) - np.log(2 * 0.5) - posterior
+
+    def log_prior(self, x):
+        mean, sd = x[..., 0], x[..., 1]
+        with np.errstate(all="ignore"):
+            variance = sd * sd
+            log_prior = stats.invgamma.logpdf(variance, 2.0) + np.log(2.0 * sd) + stats.norm.logpdf(mean, 0.0, sd)
+        return np.where(sd > 0.0, log_prior, -np.inf)[()]
+
+    def log_likelihood(self, x):
+        mean, sd = x[..., 0], x[..., 1]
+        square = self.square + self.n * (mean - self.centre) ** 2
+        return -self.n * np.log(np.sqrt(2 * np.pi) * sd) - 0.5 * square / sd**2
+
+    def __call__(self, x):
+        return self.log_prior(x) + self.log_likelihood(x)
+
+    def sample_prior(self, n, rng):
+        sd = np.sqrt(1.0 / rng.gamma(2.0, size=n))
+        return np.column_stack([sd * rng.standard_normal(n), sd])
+
+
+class Noisy(Gaussian):
+    fast_parameters = (0, 2)
+
+
+class NoisyWithBlobs(WithBlobs):
+    fast_parameters = (2,)
+
+
+MODES = {
+    "recycling": {},
+    "moves": {"recycle": False},
+    "walk": {"moves": RandomWalkMove(adapt=True), "min_moves": 6, "max_moves": 15},
+    "stretch": {"moves": emcee.moves.StretchMove(), "min_moves": 8, "max_moves": 20},
+    "tmcmc": {"Sampler": TMCMCSampler},
+    "leaders": {"Sampler": TMCMCSampler, "chains": "leaders", "burn_in": 3, "moves": RandomWalkMove(adapt=True)},
+}
+
+
+# ---------------------------------------------------------------- the right posterior
+
+
+@pytest.mark.parametrize(
+    "mode", [pytest.param(m, marks=() if m in ("recycling", "moves", "tmcmc") else pytest.mark.slow) for m in MODES]
+)
+def test_conjugate_sample(mode, seed):
+    posterior = NormalInverseGamma()
+    samplers = runs(posterior, seed, **MODES[mode])
+    assert all(isinstance(move, WithFastSweeps) for s in samplers for move in get_moves(s)[0])
+    assert within(deviations(samplers, posterior.mean, lambda x: x[:, 0]), samplers)
+    assert within(deviations(samplers, posterior.variance, lambda x: x[:, 1] ** 2), samplers)
+    assert within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
+    assert within(evidence_deviation(samplers, posterior.log_evidence), samplers)
+
+
+class WrongMove(WithFastSweeps):
+    """Fast sweeps with a drift that the acceptance ratio does not contain."""
+
+    def __init__(self, move, indices):
+        super().__init__(move, indices, sweeps=5)
+        walk, draw = self.walk, self.walk.get_proposal
+
+        def drift(coords, random):
+            proposed, factors = draw(coords, random)
+            proposed[:, walk.indices] += walk.root.diagonal()
+            return proposed, factors
+
+        walk.get_proposal = drift
+
+    def __deepcopy__(self, memo):  # a copy would have a closure of the original
+        return self
+
+
+def test_wrong_fast_sweeps_are_detected(seed):
+    """Negative control: the criterion of the test above fails for a wrong move."""
+    posterior = NormalInverseGamma()
+    samplers = []
+    for k in range(8):
+        sampler = SMCSampler(200, 2, posterior, vectorize=True, seed=[seed, k], recycle=False, fast_sweeps=0)
+        sampler._first_moves = [WrongMove(MixtureMove(), (1,))], np.ones(1)  # in place of correct moves
+        sampler.run_mcmc(None, 4)
+        samplers.append(sampler)
+    assert not within(deviations(samplers, 0.5, lambda x: x[:, 1] < posterior.median), samplers)
+
+
+class Still(emcee.moves.Move):
+    """An expensive move that never moves."""
+
+    def propose(self, model, state):
+        return state, np.zeros(len(state.coords), dtype=bool)
+
+
+def target(x):
+    """Log density of two coordinates, the spread of the second depending on the first; blobs identify the points."""
+    return stats.norm.logpdf(x[:, 0]) + stats.norm.logpdf(x[:, 1], x[:, 0], np.exp(0.5 * x[:, 0])), x.copy()
+
+
+@pytest.fixture
+def ensemble(rng):
+    """Exact draws of `target` as a state, and the model that moves need."""
+    first = rng.normal(size=20_000)
+    first[:2] = -0.0, 5e-324
+    x = np.column_stack([first, rng.normal(first, np.exp(0.5 * first))])
+    log_prob, blobs = target(x)
+    state = emcee.State(x, log_prob=log_prob, blobs=blobs, copy=True)
+    return state, Model(None, target, map, np.random.RandomState(rng.integers(2**31)))
+
+
+def test_fast_sweeps_alone_keep_the_target_and_the_other_coordinates(ensemble):
+    """Exact draws remain exact, the slow coordinate keeps every bit, and values and blobs stay with their points."""
+    state, model = ensemble
+    start = state.coords.copy()
+    move = WithFastSweeps(Still(), [1], sweeps=10)
+    move.calibrate(start[:500] * np.array([1.2, 0.7]), np.full(500, 1 / 500))  # the fit may be wrong
+    state, accepted = move.propose(model, state)
+    assert not accepted.any()  # the flags are those of the expensive move
+    assert state.coords[:, 0].tobytes() == start[:, 0].tobytes()
+    assert np.mean(state.coords[:, 1] != start[:, 1]) > 0.9
+    np.testing.assert_array_equal(state.blobs, state.coords)
+    np.testing.assert_array_equal(state.log_prob, target(state.coords)[0])
+    z = (state.coords[:, 1] - start[:, 0]) * np.exp(-0.5 * start[:, 0])
+    assert stats.kstest(z, "norm").pvalue > 1e-4
+    assert stats.ks_2samp(state.coords[:10_000, 1], start[10_000:, 1]).pvalue > 1e-4
+
+
+def test_the_walk_has_the_conditional_covariance(rng):
+    covariance = np.array([[1.0, 0.9, 0.2], [0.9, 1.0, 0.5], [0.2, 0.5, 2.0]]) * np.outer([1, 1e6, 1], [1, 1e6, 1])
+    points = rng.multivariate_normal(np.zeros(3), covariance, size=100_000)
+    for fast, slow in (([1], [0, 2]), ([0, 2], [1])):
+        walk = FastWalk(fast)
+        walk.calibrate(points, np.full(len(points), 1.0 / len(points)))
+        cross = covariance[np.ix_(fast, slow)]
+        expected = covariance[np.ix_(fast, fast)] - cross @ np.linalg.solve(covariance[np.ix_(slow, slow)], cross.T)
+        assert walk.root @ walk.root.T == pytest.approx(expected, rel=0.05)
+
+
+def test_only_tuning_adapts_the_scale(ensemble):
+    state, model = ensemble
+    move = WithFastSweeps(RandomWalkMove(), [1])
+    fixed = emcee.EnsembleSampler(64, 2, lambda x: target(x[None])[0][0], moves=move)
+    fixed.run_mcmc(state.coords[:64], 5)
+    assert move.walk.log_scale_factor == 0.0
+    move.calibrate(10.0 * state.coords, np.full(len(state.coords), 1 / len(state.coords)))  # much too wide
+    for _ in range(20):
+        state, accepted = move.propose(model, state)
+        move.tune(state, accepted)
+    assert -3.0 < move.walk.log_scale_factor < -1.5  # about -log 10
+    assert move.fast_acceptance == pytest.approx(0.35, abs=0.1)
+
+
+@pytest.mark.filterwarnings("ignore:stuck")
+def test_fast_parameters_move_when_the_expensive_move_does_not(seed):
+    """If the expensive move is almost never accepted, the fast parameters still change."""
+    moved = []
+    for fast_sweeps in (0, 2):
+        sampler = SMCSampler(
+            200, 3, Noisy(), vectorize=True, seed=seed, moves=RandomWalkMove(scale=8.0), fast_sweeps=fast_sweeps
+        )
+        sampler.run_mcmc(None, 20)
+        chain = sampler.get_chain()
+        moved.append(np.mean(chain[1:] != chain[:-1], axis=(0, 1)))
+        assert moved[-1][1] == pytest.approx(sampler.acceptance_fraction.mean(), abs=0.02)
+    assert np.all(moved[0] < 0.1)
+    assert np.all(moved[1][[0, 2]] > 0.4)
+    assert moved[1][1] < 0.1
+
+
+# ---------------------------------------------------------------- what it costs
+
+
+class Recorded(Posterior):
+    """A posterior that keeps every point that it evaluated."""
+
+    def __call__(self, x):
+        self.evaluated = [*getattr(self, "evaluated", []), np.array(x)]
+        return super().__call__(x)
+
+
+def oscillator(kind=Posterior, memory=100_000):
+    rng = np.random.default_rng(3)
+    model = LinearOscillator(Record("noise", 0.02, rng.normal(size=200)), period=0.6, damping_ratio=0.05)
+    values = model.simulate([1.15, 0.8]) + np.array([[0.2], [0.004]]) * rng.normal(size=(2, model.n_steps))
+    prior = {
+        "stiffness": TruncatedNormal(1.0, 0.3),
+        "damping": TruncatedNormal(1.0, 0.6),
+        "sigma_acceleration": HalfNormal(0.5),
+        "sigma_displacement": HalfNormal(0.01),
+    }
+    return kind(FELikelihood(model, Measurements(model.channels, model.dt, values), memory_rows=memory), prior)
+
+
+@pytest.mark.parametrize("mode", ["recycling", *(pytest.param(m, marks=pytest.mark.slow) for m in ("moves", "tmcmc"))])
+def test_only_new_structural_parameters_are_simulated(mode, seed):
+    posterior = oscillator(Recorded)
+    kwargs = dict(MODES[mode])
+    sampler = kwargs.pop("Sampler", SMCSampler)(60, 4, posterior, vectorize=True, seed=seed, **kwargs)
+    sampler.run_mcmc(None, 10)
+    evaluated = np.concatenate(posterior.evaluated)
+    report = posterior.report()
+    assert report["simulations"] == len(np.unique(evaluated[:, :2], axis=0))
+    assert sampler.evaluations == len(evaluated) == report["simulations"] + report["cache_hits"]
+    # negative control: the samplers evaluate more points than they simulate
+    sweeps = 10 + sum(stage.moves for stage in sampler.ladder)
+    assert report["cache_hits"] > 60 * sweeps  # two fast sweeps per sweep; a few points lie outside the support
+    without_cache = oscillator(memory=0)
+    again = type(sampler)(60, 4, without_cache, vectorize=True, seed=seed, **kwargs)
+    again.run_mcmc(None, 10)
+    np.testing.assert_array_equal(again.get_chain(), sampler.get_chain())
+    # equal rows of one batch are simulated once, with and without the cache
+    assert without_cache.report()["simulations"] > 1.5 * report["simulations"]
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
+def test_stages_count_expensive_sweeps(Sampler):
+    posterior = Noisy()
+    kwargs = {"recycle": False} if Sampler is SMCSampler else {"chains": "equal"}
+    sampler = Sampler(40, 3, posterior, vectorize=True, seed=1, fast_sweeps=3, **kwargs)
+    sampler.run_mcmc(None, 0)
+    assert all(stage.evaluations == 4 * 40 * stage.moves for stage in sampler.ladder[1:])
+    assert all(2 <= stage.moves <= 7 for stage in sampler.ladder)
+    assert sampler.evaluations == posterior.calls
+
+
+# ---------------------------------------------------------------- when it is off
+
+
+@pytest.mark.parametrize("preset", [CHING_CHEN_2007, RAMANCHA_2022_LITERAL, RAMANCHA_2022_CONSTANT])
+def test_presets_make_no_fast_sweeps(preset, seed):
+    Sampler = TMCMCSampler if preset is CHING_CHEN_2007 else SMCSampler
+    chains, calls = [], []
+    for posterior in (Gaussian(), Noisy()):
+        sampler = Sampler(60, 3, posterior, vectorize=True, seed=seed, **preset)
+        sampler.run_mcmc(None, 3)
+        chains.append(sampler.get_chain())
+        calls.append(posterior.calls)
+    np.testing.assert_array_equal(*chains)
+    assert calls[0] == calls[1]
+
+
+def kinds(posterior, Sampler=SMCSampler, **kwargs):
+    sampler = Sampler(50, 3, posterior, log_prior_fn=Gaussian().log_prior, **kwargs)
+    return {type(move) for move in get_moves(sampler)[0]}
+
+
+def test_only_if_some_parameters_are_fast():
+    assert kinds(Noisy()) == kinds(Noisy(), TMCMCSampler) == kinds(Noisy(), TemperedSampler) == {WithFastSweeps}
+    assert kinds(Noisy(), moves=[(emcee.moves.DEMove(), 0.8), (RandomWalkMove(), 0.2)]) == {WithFastSweeps}
+    assert kinds(Noisy(), fast_sweeps=0) == kinds(Gaussian()) == kinds(Noisy().__call__) == {MixtureMove}
+    everything = Noisy()
+    everything.fast_parameters = (0, 1, 2)
+    nothing = Noisy()
+    nothing.fast_parameters = ()
+    assert kinds(everything) == kinds(nothing) == {MixtureMove}
+
+
+def test_not_with_a_pool_of_workers_without_a_cache():
+    with ThreadPool(1) as pool:
+        assert kinds(Noisy(), pool=pool) == {MixtureMove}
+        assert kinds(Noisy(), pool=pool, vectorize=True) == {WithFastSweeps}
+
+
+@pytest.mark.parametrize("fast", [(3,), (-1,), (0, 7), (0.5,), ("sigma",)])
+def test_invalid_indices(fast):
+    posterior = Noisy()
+    posterior.fast_parameters = fast
+    with pytest.raises(ValueError, match="fast_parameters must be indices of parameters"):
+        SMCSampler(50, 3, posterior)
+
+
+@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler, TemperedSampler])
+def test_a_wrong_ndim_is_refused_with_the_number_of_parameters(Sampler):
+    posterior = Gaussian(3)
+    with pytest.raises(ValueError, match=r"ndim is 2, but log_prob_fn has 3 parameters \(x0, x1, x2\): pass ndim=3"):
+        Sampler(50, 2, posterior, vectorize=True)
+
+
+def test_invalid_fast_sweeps():
+    with pytest.raises(ValueError, match="sweeps must be at least 1"):
+        WithFastSweeps(RandomWalkMove(), [0], sweeps=0)
+    with pytest.raises(ValueError, match="fast_parameters"):
+        WithFastSweeps(RandomWalkMove(), [])
+    move = WithFastSweeps(RandomWalkMove(), [4])
+    with pytest.raises(ValueError, match="from 0 to 2"):
+        emcee.EnsembleSampler(50, 3, Noisy(), moves=move).run_mcmc(
+            Noisy().sample_prior(50, np.random.default_rng(1)), 1
+        )
+    assert WithFastSweeps(RandomWalkMove(), [2, 0, np.int64(2)]).indices == (0, 2)
+
+
+# ---------------------------------------------------------------- blobs, pickles, files
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_blobs_stay_with_their_points(vectorize):
+    posterior = NoisyWithBlobs()
+    sampler = SMCSampler(40, 3, posterior, vectorize=vectorize, seed=1)
+    sampler.run_mcmc(None, 4)
+    chain, blobs = sampler.get_chain(), sampler.get_blobs()
+    assert np.allclose(blobs[..., 0], np.sum(chain**2, axis=-1), rtol=1e-13)
+    assert np.array_equal(blobs[..., 1], chain[..., 0])
+    assert np.allclose(sampler.get_log_prob(flat=True), Gaussian()(sampler.get_chain(flat=True)), rtol=1e-13)
+
+
+def test_pickled_samplers_continue_identically():
+    sampler = SMCSampler(40, 3, Noisy(), vectorize=True, seed=1)
+    sampler.run_mcmc(None, 3)
+    copy = pickle.loads(pickle.dumps(sampler))
+    first, second = sampler.run_mcmc(None, 5), copy.run_mcmc(None, 5)
+    np.testing.assert_array_equal(first.coords, second.coords)
+    np.testing.assert_array_equal(first.log_prob, second.log_prob)
+
+
+def test_a_reopened_file_continues(tmp_path):
+    """The moves of a new sampler fit themselves to the ensemble; two new samplers do so identically."""
+
+    def reopen(name):
+        sampler = SMCSampler(40, 3, Noisy(), vectorize=True, seed=1, backend=emcee.backends.HDFBackend(tmp_path / name))
+        assert get_moves(sampler)[0][0].indices == (0, 2)
+        return sampler
+
+    chains = []
+    for name in ("a.h5", "b.h5"):
+        reopen(name).run_mcmc(None, 3)
+        sampler = reopen(name)
+        stages = sampler.ladder
+        sampler.run_mcmc(None, 4)
+        assert sampler.ladder == stages
+        chains.append(sampler.get_chain())
+    assert chains[0].shape == (7, 40, 3)
+    np.testing.assert_array_equal(*chains)
