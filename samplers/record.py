@@ -127,10 +127,12 @@ class Record:
         self._arrays: dict[str, list[list[np.ndarray] | _Place]] = {}
         self._large: Any = None  # temporary file of the large arrays of a record in memory
         self._whole = 0  # bytes of the file that were read
+        self._seen = 0  # size of the file when it was read or closed
 
     def __getstate__(self):
         arrays = {key: [self._stored(each) for each in known] for key, known in self._arrays.items()}
-        return {**self.__dict__, "_file": None, "_large": None, "_arrays": arrays}
+        seen = self._seen if self._file is None else self._whole
+        return {**self.__dict__, "_file": None, "_seen": seen, "_large": None, "_arrays": arrays}
 
     # ------------------------------------------------------------------ evaluations
 
@@ -315,7 +317,17 @@ class Record:
         """Close the file."""
         if self._file is not None:
             self._file.close()
-            self._file = None
+            self._file, self._seen = None, self._whole
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether another sampler has written to the file since it was read or closed."""
+        return (
+            self.path is not None
+            and self._file is None
+            and self.path.exists()
+            and self.path.stat().st_size != self._seen
+        )
 
     def renew(self) -> Path | None:
         """Begin with an empty record; returns the new name of its file, if it has one."""
@@ -378,7 +390,7 @@ class Record:
                 )
                 break
             place = end
-        self._whole = place if len(data) >= len(MAGIC) else 0
+        self._whole, self._seen = place if len(data) >= len(MAGIC) else 0, len(data)
 
     def _read_block(self, kind: bytes, content: bytes, start: int) -> bool:
         """Enter a block of the file; False if its content is of another form."""

@@ -90,7 +90,10 @@ class RunResults:
 
     @property
     def log_evidence(self) -> float:
-        """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, whichever has the smaller error."""
+        """Log-evidence: `log_evidence_ladder` or `log_evidence_check`, whichever has the smaller error.
+
+        A check that can be trusted and is significantly higher is taken in any case.
+        """
         return self._result.evidence[0]
 
     @property

@@ -325,6 +325,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         for name, value in (("log_prob", log_prob0), ("random_state", rstate0), ("blobs", blobs0)):
             if value is not None:
                 setattr(state, name, value)
+        if self._record.is_stale:
+            raise ValueError(
+                f"another sampler has written to {self._place} since this sampler was made or last ran, so this one "
+                "does not know the chain: make the sampler again, which goes on from the file"
+            )
         self._evaluator.pool = self.pool
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}

@@ -15,6 +15,7 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 
 from ..budget import BudgetExhausted
 from ..estimates.weights import LOWEST
+from ..judgement.checks import ROUNDING
 from ..moves.fast_parameters import WithFastSweeps
 from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
@@ -188,7 +189,10 @@ class StartCorrelation:
     def _centred(coords: np.ndarray, records: np.ndarray) -> np.ndarray:
         log_likelihood = np.maximum(records["log_prob"] - records["log_prior"], LOWEST)  # whose squares are finite
         columns = np.column_stack([coords, log_likelihood])
-        return columns - columns.mean(axis=0)
+        rounding = np.zeros(columns.shape[1])  # a constant log-likelihood differs by the rounding errors of log_prob
+        known = np.isfinite(records["log_prob"])
+        rounding[-1] = ROUNDING * np.abs(records["log_prob"][known]).max(initial=1.0)
+        return np.where(np.ptp(columns, axis=0) > rounding, columns - columns.mean(axis=0), 0.0)
 
     def update(self, coords: np.ndarray, records: np.ndarray) -> None:
         """Enter the population after a sweep."""

@@ -73,13 +73,15 @@ def test_without_a_check(recycle):
     assert sampler.log_evidence_error == sampler.ladder[-1].log_evidence_error
 
 
-def test_two_estimates_that_disagree_widen_the_error():
+def test_two_estimates_that_disagree_widen_the_error_unless_the_higher_one_is_trusted():
     sampler = annealed()
     check = sampler.log_evidence_check
-    check = check._replace(log_evidence=check.log_evidence + 10.0, error=0.01, pareto_shape=0.1)
+    check = check._replace(log_evidence=check.log_evidence - 10.0, error=0.01, pareto_shape=0.1)
     log_evidence, error = AnnealingResult(sampler.ladder, check).evidence
     assert log_evidence == check.log_evidence
     assert error == pytest.approx(5.0, abs=1.0)
+    higher = check._replace(log_evidence=check.log_evidence + 20.0, error=0.3)
+    assert AnnealingResult(sampler.ladder, higher).evidence == (higher.log_evidence, 0.3)
     unreliable = AnnealingResult(sampler.ladder, check._replace(pareto_shape=0.9))
     assert unreliable.evidence[0] == sampler.log_evidence_ladder
 

@@ -385,6 +385,21 @@ def test_two_processes_and_two_samplers_on_one_file(tmp_path):
     assert make(path, "smc").iteration == 2
 
 
+def test_a_sampler_that_does_not_know_the_chain_of_another_one_leaves_it_alone(tmp_path):
+    """Made before the other one ran, or before the other one went on: it is refused, and nothing is changed."""
+    path = tmp_path / "run.h5"
+    first, second = make(path, "smc"), make(path, "smc")
+    first.run_mcmc(None, 2)
+    chain = first.get_chain()
+    with pytest.raises(ValueError, match="another sampler has written to .* make the sampler again"):
+        second.run_mcmc(None, 1)
+    third = make(path, "smc")
+    third.run_mcmc(None, 1)
+    with pytest.raises(ValueError, match="another sampler has written to"):
+        first.run_mcmc(None, 1)
+    assert third.iteration == make(path, "smc").iteration == 3 and np.array_equal(third.get_chain()[:2], chain)
+
+
 def limit_files(size):
     """Limit the size of files of this process [bytes]; None: no limit."""
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]

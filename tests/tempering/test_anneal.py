@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from samplers import SMCSampler
 from samplers.estimates.importance import EvidenceCheck
 from samplers.judgement import rounds as judged
 from samplers.moves.fast_parameters import WithFastSweeps
@@ -14,7 +15,7 @@ from samplers.tempering.mutation import MoveSchedule
 from samplers.tempering.pending_points import PendingPoints
 from samplers.tempering.population import Population
 from samplers.tempering.recycling import recycle
-from tests.contract.targets import Gaussian
+from tests.contract.targets import Box, Gaussian
 
 N = 100
 
@@ -145,3 +146,18 @@ def test_a_restart_makes_earlier_stages_void(monkeypatch):
     before, after = reports[:place], [report for report in reports[place:] if isinstance(report, Stage)]
     assert before and all(stage.moves == 0 for stage in before)
     assert after[0].beta < 1.0 and after[-1].beta == 1.0 and all(stage.moves > 0 for stage in after)
+
+
+@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
+def test_the_constant_of_a_likelihood_with_one_value_has_no_effect():
+    """Rounding errors of a constant log-likelihood are no correlation with the start, which would end the moves."""
+    found = []
+    for value in (0.0, 0.1, -123.4):
+        posterior = Box([0, 0], [1, 1], lambda x, value=value: np.where(np.all(x < 0.4, axis=-1), value, -np.inf))
+        sampler = SMCSampler(100, 2, posterior, vectorize=True, seed=1, recycle=False)
+        sampler.run_mcmc(None, 1)
+        found.append((sampler.get_chain(), [stage.moves for stage in sampler.ladder], sampler.log_evidence - value))
+    chain, moves, log_evidence = found[0]
+    for each in found[1:]:
+        assert np.array_equal(each[0], chain) and each[1] == moves
+        assert each[2] == pytest.approx(log_evidence, abs=1e-12)
