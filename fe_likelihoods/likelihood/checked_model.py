@@ -127,11 +127,14 @@ class CheckedModel:
         self._rows_since += len(thetas)
         here = run.pool is None
         due = self._is_due and last and (here or _SHARE_OF_TIME * seconds >= self._last_seconds)
-        if due:
-            self._require_same(run, simulated_here=here)
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
-        for row in succeeded[:1] + succeeded[-1:] if not self.unchecked or not self._points else []:
-            self._points[1:] = [(thetas[row].copy(), misfit[row].copy())]
+        points = [(thetas[row].copy(), misfit[row].copy()) for row in succeeded[:1] + succeeded[-1:]]
+        if not here and not self._points:
+            self._points = points  # threads share the model, which may have changed itself: these can be repeated
+        if due and (here or self._points):
+            self._require_same(run, simulated_here=here)
+        if points and (not self.unchecked or not self._points):
+            self._points = [(self._points or points)[0], points[-1]]
         return due
 
     def _require_what_was_sent(self, model: Model) -> None:

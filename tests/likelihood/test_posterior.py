@@ -4,6 +4,7 @@ import logging
 import math
 import multiprocessing
 import pickle
+import time
 import warnings
 from multiprocessing.pool import ThreadPool
 
@@ -285,6 +286,25 @@ def test_an_object_that_is_no_model_is_refused_with_the_missing_members(oscillat
         FELikelihood(Incomplete(), measurements)
     with pytest.raises(ValueError, match="function is not a model, because it has no parameter_names, channels, dt"):
         FELikelihood(lambda theta: theta, measurements)
+
+
+class SlowPolynomial(Polynomial):
+    """Takes so long that the model is compared after the first batch."""
+
+    def simulate(self, theta):
+        time.sleep(0.3)
+        return super().simulate(theta)
+
+
+def test_threads_share_a_model_that_counts_its_runs():
+    """Its list of runs grows in this process: no change of the model, since a repeated simulation agrees."""
+    expected = polynomial_posterior(Polynomial())
+    x = np.array([[0.3, 0.1, 0.5, 1.0], [0.4, 0.1, 0.5, 1.0]])
+    posterior = polynomial_posterior(SlowPolynomial())
+    with ThreadPool(2) as pool:
+        posterior.likelihood.simulator.pool = pool
+        assert np.array_equal(posterior(x), expected(x))
+    assert posterior.report()["simulations"] == 2
 
 
 @pytest.mark.parametrize("threads", [0, 2])
