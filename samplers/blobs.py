@@ -45,8 +45,10 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
     if dtype.kind == "O" and shape == ():
         return _objects(_rows(blobs))
     if blobs.shape[1:] != shape:
+        shapes = [np.shape(blob) for blob in blobs]
+        found = next((each for each in shapes if each != shape), blobs.shape[1:])
         raise ValueError(
-            f"the blobs of each point must have the shape {shape} of the first evaluations; got {blobs.shape[1:]}. "
+            f"the blobs of each point must have the shape {shape} of the first evaluations; got {found}. "
             "Return arrays of one length; or, without a file, pass blobs_dtype=object and return a dictionary"
         )
     try:
@@ -55,7 +57,7 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
         lost = _lost(blobs, found, declared)
         value = blobs[lost].ravel()[:1].tolist()
     except (TypeError, ValueError, OverflowError):
-        lost, value = np.ones(1, dtype=bool), blobs[:1].tolist()
+        lost, value = np.ones(1, dtype=bool), [_first_that_does_not_fit(blobs, dtype)]
     if lost.any():
         numbers = {blobs.dtype.kind, dtype.kind} <= set(NUMBERS)
         wider = np.result_type(blobs.dtype, dtype) if numbers else "object, or for text in a file blobs_dtype='S50'"
@@ -64,6 +66,17 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
             f"pass blobs_dtype={wider}. A run with a file then goes on with its evaluations"
         )
     return found
+
+
+def _first_that_does_not_fit(blobs: np.ndarray, dtype: np.dtype) -> Any:
+    """The first of the values that cannot become the type; the first one if each can alone."""
+    values = blobs.ravel().tolist()
+    for value in values:
+        try:
+            np.array(value).astype(dtype)
+        except (TypeError, ValueError, OverflowError):
+            return value
+    return values[0]
 
 
 def _inferred(blobs: list) -> np.ndarray:
