@@ -37,7 +37,7 @@ test-newer: .venv-newer/.ready ## tests that use arviz, with arviz 1 and NEWER_P
 # `PYTEST_ADDOPTS=--randomly-seed=n make test-slow` repeats an order: the first lines of the output name the seed
 test-slow: $(READY) ## run the slow tests on all cores, in random order
 	$(BIN)/python -m tests.compile_kernels
-	$(BIN)/python -m pytest -m slow -n auto --dist worksteal --timeout 3600
+	$(BIN)/python -m pytest -m slow -n auto --dist worksteal --timeout 3600 --randomly-dont-reset-seed
 
 clients:         ## run every client on one posterior and compare with quadrature (makes two environments, 3 GB)
 	PYTHON=$(PYTHON) .ci/clients

@@ -61,6 +61,12 @@ def shared_pool():
 
 
 @pytest.fixture(autouse=True)
+def random_numbers_of_numpy():
+    """A test that seeds nothing, as examples of emcee, has the same random numbers in any order of the tests."""
+    np.random.seed(1)  # noqa: NPY002  the generator that emcee uses
+
+
+@pytest.fixture(autouse=True)
 def figures_are_closed():
     """Close the figures of a test: matplotlib warns of more than 20, in whichever test comes next."""
     yield

@@ -12,7 +12,6 @@ from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import (
     Absent,
-    DiesLoading,
     DiesOnce,
     Gated,
     Large,
@@ -72,7 +71,7 @@ def test_items_that_kill_their_process_end_as_with_map(tmp_path, shared_pool):
         assert pool.submit(again, np.array([bad.KILLED + 0.5, 0.1])).result()[1] == ""
 
 
-def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(tmp_path, shared_pool):
+def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(shared_pool):
     with shared_pool(2) as pool:
         absent = pool.submit_all(sent_simulation(Absent()), SHORT)
         fine = pool.submit_all(sent_simulation(Treacherous()), SHORT)
@@ -80,8 +79,6 @@ def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(tmp_pat
             with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
                 future.result()
         assert [future.result()[1] for future in fine] == [""] * 4
-        dies = DiesLoading(tmp_path)
-        assert [pool.submit(dies, item).result() for item in (5, 6)] == [5, 6]
         unpicklable = pool.submit_all(abs, [threading.Lock(), -1])
         with pytest.raises(TypeError, match="cannot pickle"):
             unpicklable[0].result()
