@@ -39,7 +39,7 @@ def joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declared: bool = False) -> np.ndarray:
-    """Blobs (n, ...) as an array (n, *shape) of a type, `declared` or not; ValueError if it cannot hold a value."""
+    """Blobs (n, ...) as an array ``(n, *shape)`` of a type, `declared` or not; ValueError if it cannot hold a value."""
     if blobs.dtype == dtype and blobs.shape[1:] == shape:
         return blobs
     if dtype.kind == "O" and shape == ():
