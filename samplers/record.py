@@ -95,7 +95,7 @@ class RunStart(NamedTuple):
     """Start of an annealing."""
 
     header: dict  # settings and identity of the run, as JSON returns them
-    coords: np.ndarray  # (nwalkers, ndim), draws of the prior, or of the start density
+    coords: np.ndarray  # (nwalkers, ndim), draws of the prior
     random_state: tuple  # as `numpy.random.RandomState.get_state` returns it
 
 

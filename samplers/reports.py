@@ -199,12 +199,6 @@ class AnnealingResult(NamedTuple):
         return float(sum(stage.log_evidence_increment for stage in self.require_finished()))
 
     @property
-    def has_better_check(self) -> bool:
-        """Whether the check of the evidence is reliable and has a smaller error than the stages."""
-        check = self.check
-        return check is not None and check.reliable and check.error < self.ladder[-1].log_evidence_error
-
-    @property
     def evidence(self) -> tuple[float, float]:
         """Log-evidence and its standard error, by tempering or by the check, whichever has the smaller error.
 

@@ -30,8 +30,6 @@ __all__ = [
     "PooledRounds",
     "Round",
     "draw_inside",
-    "LARGEST_ERROR",
-    "efficiencies",
     "evidence_from_weights",
     "expected_efficiency",
     "fewest_points",
@@ -152,17 +150,11 @@ def expected_efficiency(ndim: int, dof: float, components: int, points: float) -
     return _efficiency_without_noise(ndim, dof) / (1.0 + components * ndim * (ndim + 3) / (2.0 * points))
 
 
-def efficiencies(check: EvidenceCheck, mixture: Mixture, points: float) -> tuple[float, float]:
-    """Effective share of fresh draws of a mixture fitted to `points` effective points, and the expected share."""
-    components, ndim = mixture.means.shape
-    expected = expected_efficiency(ndim, mixture.dof, components, points)
-    return check.effective_sample_size / max(check.evaluations, 1), expected
-
-
 def fits_poorly(check: EvidenceCheck, mixture: Mixture, points: float) -> bool:
     """Whether the effective share of fresh draws is below 85 % of the expected share for Gaussian modes."""
-    found, expected = efficiencies(check, mixture, points)
-    return found < POOR_FIT * expected
+    components, ndim = mixture.means.shape
+    expected = expected_efficiency(ndim, mixture.dof, components, points)
+    return check.effective_sample_size / max(check.evaluations, 1) < POOR_FIT * expected
 
 
 @lru_cache

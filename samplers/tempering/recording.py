@@ -55,7 +55,11 @@ class Recording:
         if stop is not None and not stop.complete:
             return  # its points are judged by their weights
         founders = np.arange(len(coords)) if result.founders is None else result.founders
-        several, error = len(find_clusters(coords[None], founders)) > 1, result.ladder[-1].log_evidence_error
-        for concern in check_evidence(result.log_evidence_ladder, error, result.check, several):
+        error = result.ladder[-1].log_evidence_error
+
+        def has_several_modes() -> bool:
+            return len(find_clusters(coords[None], founders)) > 1
+
+        for concern in check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes):
             warn(concern.message)
             self.result = self.result._replace(findings=(*self.result.findings, concern))

@@ -33,17 +33,18 @@ def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
     ],
 )
 def test_two_evidences_that_differ_are_reported_without_condemning_the_posterior(check, doubted):
-    found = check_evidence(-10.0, 0.1, check, several_modes=True)
+    found = check_evidence(-10.0, 0.1, check, lambda: True)
     assert [doubt.grave for doubt in found] == [False] * doubted
     for doubt in found:
         own = doubt.message.find("log_prior is a function of your own")
-        assert "more walkers" in doubt.message[:own].lower() or "more walkers" in doubt.message.lower()
+        assert own < 0 or doubt.message.index("more walkers") < own
+        assert "more walkers" in doubt.message
         assert (own < 0) == ("stages have lost" in doubt.message)
 
 
 @pytest.mark.parametrize("value", [-8.5, float("-inf")])
 def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
-    (doubt,) = check_evidence(-10.0, 0.1, _check(value, error=0.4, effective=12.0, shape=0.9), False)
+    (doubt,) = check_evidence(-10.0, 0.1, _check(value, error=0.4, effective=12.0, shape=0.9), lambda: False)
     assert "heavy tails" in doubt.message
     assert doubt.message.index("more walkers or more moves") < doubt.message.index("log_prior")
     assert doubt.grave
@@ -61,7 +62,7 @@ def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
     ],
 )
 def test_a_large_error_of_the_evidence_is_reported(error, check, several_modes, doubted):
-    found = check_evidence(-10.0, error, check, several_modes)
+    found = check_evidence(-10.0, error, check, lambda: several_modes)
     assert [(doubt.grave, "standard error of the log-evidence" in doubt.message) for doubt in found] == [
         (False, True)
     ] * doubted
