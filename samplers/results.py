@@ -144,13 +144,31 @@ class RunResults:
         walkers that some moves introduce, such as emcee's stretch move, is not accounted for. A single run cannot
         detect a mode that it lost, or moves that did not move: after a `SamplingWarning` the errors are too small.
         """
-        shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
-        groups = 1.0 / np.sum(shares**2)
+        return self._error_of_mean(self._chain_of("mean_error", discard, thin))
+
+    def sd_error(self, discard: int = 0, thin: int = 1) -> np.ndarray:
+        """Monte Carlo standard errors (ndim,) of the standard deviations over ``get_chain(discard, thin)``.
+
+        Those of `mean_error`, for the mean of the squared deviations: the error of a variance is 2 sd times the error
+        of the standard deviation. Heavy tails that the chain has not met are not accounted for.
+        """
+        chain = self._chain_of("sd_error", discard, thin)
+        apart = chain - chain.mean(axis=(0, 1))
+        sd = np.sqrt(np.square(apart).mean(axis=(0, 1)))
+        return 0.5 * self._error_of_mean(np.square(apart)) / np.where(sd > 0.0, sd, 1.0)
+
+    def _chain_of(self, name: str, discard: int, thin: int) -> np.ndarray:
+        """The chain (nsteps, nwalkers, ndim); ValueError by the method called `name` if it has no step."""
         chain = self.get_chain(discard=discard, thin=thin)
         if not len(chain):
-            raise ValueError(f"mean_error: expected discard below the number of stored steps; got discard={discard}")
-        errors = standard_error_of_mean(chain, self.founders)
-        return errors if len(shares) == 1 else errors * student_factor(groups - 1.0)
+            raise ValueError(f"{name}: expected discard below the number of stored steps; got discard={discard}")
+        return chain
+
+    def _error_of_mean(self, values: np.ndarray) -> np.ndarray:
+        """Standard errors (k,) of the mean of values (nsteps, nwalkers, k), with Student's t for few founders."""
+        shares = np.unique(self.founders, return_counts=True)[1] / self.nwalkers
+        errors = standard_error_of_mean(values, self.founders)
+        return errors if len(shares) == 1 else errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
 
     def _repr_html_(self) -> str:
         """In notebooks: summary of the run, or how to start it."""

@@ -46,5 +46,5 @@ def test_a_sampler_shows_its_summary(posterior):
     assert f"Log-evidence {sampler.log_evidence:.2f}" in text() and str(sampler.verdict) in text()
     chain, (first, _, last) = sampler.get_chain(flat=True), text().splitlines()[-3:]
     assert last.startswith("sigma_top <1> [mm]")
-    assert float(last.split()[-4]) == pytest.approx(1000.0 * chain[:, 2].mean(), rel=1e-3)
-    assert float(first.split()[-2]) == pytest.approx(chain[:, 0].std(), rel=1e-3)
+    assert float(last.split()[-5]) == pytest.approx(1000.0 * chain[:, 2].mean(), rel=1e-3)
+    assert float(first.split()[-3]) == pytest.approx(chain[:, 0].std(), rel=1e-3)

@@ -101,11 +101,15 @@ class SignedSample(NamedTuple):
         return Expectation(value, np.sqrt(variance))
 
     def standard_deviation(self) -> Expectation:
-        """Standard deviations (ndim,) of the parameters."""
+        """Standard deviations (ndim,) of the parameters.
+
+        Both numbers are NaN where a variance, which has weights of both signs, is not larger than its own error: the
+        draws do not determine it, as with a tail of the posterior that the known density does not have.
+        """
         mean = self.weights @ self.coords
         variance, error = self.expectation(lambda coords: np.square(coords - mean))
-        value = np.sqrt(np.maximum(variance, 0.0))
-        return Expectation(value, 0.5 * error / np.where(value > 0.0, value, np.inf))
+        value = np.sqrt(np.where(variance > error, variance, np.nan))
+        return Expectation(value, 0.5 * error / value)
 
     def quantile(self, probability: float) -> Expectation:
         """Quantiles (ndim,) of the parameters at a probability between 0 and 1."""

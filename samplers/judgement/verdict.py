@@ -254,6 +254,7 @@ def judge(
         )
         if result.start.shortfall:
             found.append(Concern(result.start.shortfall, False))
+        found += _of_signed_sample(result)
     elif result.start is not None:
         found.append(Concern(f"the draws of the guide were not used ({result.start.reason})", False))
     if result.start is not None or (stop is not None and stop.from_guide):
@@ -334,6 +335,21 @@ def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Concern]:
         return [Concern(text, False)]
     wanted = f"an effective sample size of {fewest_points(ndim):.0f} and a shape below {LARGEST_SHAPE:g} are needed"
     return [Concern(f"{text} ({wanted})", True)]
+
+
+def _of_signed_sample(result: AnnealingResult) -> list[Concern]:
+    """A concern if the signed sample does not determine the standard deviation of some parameters."""
+    if result.signed is None:
+        return []
+    unknown = np.flatnonzero(np.isnan(result.signed.standard_deviation().value))
+    if len(unknown) == 0:
+        return []
+    message = (
+        f"the standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
+        "the signed sample is below its own error, as with a tail of the posterior in which the guide makes few draws. "
+        "Use more walkers, a prior without this tail, or no guide"
+    )
+    return [Concern(message, False)]
 
 
 def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | None:

@@ -85,8 +85,8 @@ class Summary(NamedTuple):
         Mean and standard deviation.
     cv : ndarray, shape (ndim,)
         Coefficient of variation ``sd / |mean|`` [-]; inf where the mean is zero and the standard deviation is not.
-    mean_error : ndarray, shape (ndim,)
-        Monte Carlo standard error of `mean`; NaN if it is not known.
+    mean_error, sd_error : ndarray, shape (ndim,)
+        Monte Carlo standard errors of `mean` and `sd`; NaN if they are not known.
     """
 
     names: tuple[str, ...]
@@ -94,11 +94,13 @@ class Summary(NamedTuple):
     sd: np.ndarray
     cv: np.ndarray
     mean_error: np.ndarray
+    sd_error: np.ndarray
 
     def __str__(self) -> str:
-        rows = [("parameter", "mean", "MC error", "sd", "CV")]
-        for name, *values in zip(self.names, self.mean, self.mean_error, self.sd, self.cv, strict=True):
-            cells = (f"{x:{form}}" for x, form in zip(values, (".5g", ".2g", ".4g", ".3g"), strict=True))
+        rows = [("parameter", "mean", "MC error", "sd", "MC error", "CV")]
+        columns = self.names, self.mean, self.mean_error, self.sd, self.sd_error, self.cv
+        for name, *values in zip(*columns, strict=True):
+            cells = (f"{x:{form}}" for x, form in zip(values, (".5g", ".2g", ".4g", ".2g", ".3g"), strict=True))
             rows.append((name, *("-" if cell == "nan" else cell for cell in cells)))
         return "\n".join(aligned(rows))
 
@@ -116,8 +118,9 @@ def summary(
     names: Sequence[str] | None = None,
     weights: np.ndarray | None = None,
     mean_error: np.ndarray | None = None,
+    sd_error: np.ndarray | None = None,
 ) -> Summary:
-    """Posterior mean, its Monte Carlo error, standard deviation and coefficient of variation.
+    """Posterior mean, standard deviation, their Monte Carlo errors, and coefficient of variation.
 
     Parameters
     ----------
@@ -127,9 +130,9 @@ def summary(
         One name per parameter; theta_0, theta_1, ... by default.
     weights : array_like, shape (n,), optional
         Non-negative weights of the samples, normalised or not.
-    mean_error : array_like, shape (ndim,), optional
-        Standard error of the mean, from ``sampler.mean_error()``, since copies made by resampling are correlated; NaN
-        where it is unknown.
+    mean_error, sd_error : array_like, shape (ndim,), optional
+        Standard errors of mean and standard deviation, from ``sampler.mean_error()`` and ``sampler.sd_error()``, since
+        copies made by resampling are correlated; NaN where they are unknown.
 
     Returns
     -------
@@ -140,9 +143,12 @@ def summary(
         raise ValueError(
             f"samples must be an array (n, ndim) with n >= 2, as get_chain(flat=True) returns; got {samples.shape}"
         )
-    error = np.full(samples.shape[1], np.nan) if mean_error is None else np.asarray(mean_error, dtype=float)
-    if error.shape != samples.shape[1:] or np.any(error < 0.0):
-        raise ValueError(f"mean_error must be {samples.shape[1]} numbers, each non-negative or NaN; got {mean_error}")
+    errors = []
+    for name, given in (("mean_error", mean_error), ("sd_error", sd_error)):
+        error = np.full(samples.shape[1], np.nan) if given is None else np.asarray(given, dtype=float)
+        if error.shape != samples.shape[1:] or np.any(error < 0.0):
+            raise ValueError(f"{name} must be {samples.shape[1]} numbers, each non-negative or NaN; got {given}")
+        errors.append(error)
     weights = np.ones(len(samples)) if weights is None else np.asarray(weights, dtype=float)
     if weights.shape != (len(samples),) or not np.all(weights >= 0.0) or not 0.0 < weights.sum() < np.inf:
         raise ValueError(
@@ -152,7 +158,7 @@ def summary(
     mean = weights @ samples
     sd = np.sqrt(weights @ (samples - mean) ** 2)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
-    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, error)
+    return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, *errors)
 
 
 def finished_ladder(sampler: Any) -> tuple[Stage, ...]:
@@ -203,7 +209,7 @@ def ladder_table(sampler: Any) -> str:
             f"(effective sample size {check.effective_sample_size:.0f}, Pareto shape {check.pareto_shape:.2f})"
         )
     if (sample := sampler.signed_sample) is not None:
-        error = np.max(sample.expectation().error / sample.standard_deviation().value)
+        error = np.nanmax(sample.expectation().error / sample.standard_deviation().value, initial=0.0)
         rows.append(
             f"largest error of a mean by sampler.signed_sample: {error:.2g} posterior standard deviations, from "
             f"{np.count_nonzero(sample.rounds)} weighted draws and {sampler.simulations:.0f} simulations"
@@ -298,7 +304,8 @@ def describe_sampler(sampler: Any) -> str:
         if sampler.iteration > 0:
             described = described_parameters_of(log_posterior_of(sampler), sampler.ndim)
             labels, factors = [each.label for each in described], np.array([each.factor for each in described])
-            moments = summary(sampler.get_chain(flat=True) / factors, labels, None, sampler.mean_error() / factors)
+            errors = sampler.mean_error() / factors, sampler.sd_error() / factors
+            moments = summary(sampler.get_chain(flat=True) / factors, labels, None, *errors)
     title = f"{type(sampler).__name__} of {sampler.nwalkers} walkers and {sampler.ndim} parameters"
     text = "".join(f"<div>{escape(line)}</div>" for line in lines)
     return f"<div><strong>{escape(title)}</strong>{text}<pre>{escape(str(moments))}</pre></div>"

@@ -536,22 +536,28 @@ def test_summary_with_weights():
     result = summary(values, ["a", "b"], weights=[1, 1, 0])
     assert np.array_equal(result.mean, [1, 1]) and np.array_equal(result.sd, [1, 0])
     assert np.array_equal(result.cv, [1, 0])
-    assert str(result).splitlines()[1].split() == ["a", "1", "-", "1", "1"]
+    assert str(result).splitlines()[1].split() == ["a", "1", "-", "1", "-", "1"]
     for weights in ([1, 1], [0, 0, 0], [1, -1, 1]):
         with pytest.raises(ValueError, match="weights"):
             summary(values, weights=weights)
 
 
-def test_summary_with_the_error_of_the_mean():
+def test_summary_with_errors_of_mean_and_standard_deviation():
     sampler = annealed()
-    result = summary(sampler.get_chain(flat=True), mean_error=sampler.mean_error())
+    result = summary(sampler.get_chain(flat=True), None, None, sampler.mean_error(), sampler.sd_error())
     assert np.array_equal(result.mean_error, sampler.mean_error())
+    assert np.array_equal(result.sd_error, sampler.sd_error())
     rows = str(result).splitlines()
-    assert "MC error" in rows[0] and f"{result.mean_error[2]:.2g}" in rows[3].split()
-    with pytest.raises(ValueError, match="discard below the number of stored steps; got discard=99"):
-        sampler.mean_error(discard=99)
-    with pytest.raises(ValueError, match="mean_error must be 3"):
-        summary(sampler.get_chain(flat=True), mean_error=[0.1, 0.1])
+    assert rows[0].count("MC error") == 2
+    assert [rows[3].split()[column] for column in (2, 4)] == [
+        f"{e[2]:.2g}" for e in (result.mean_error, result.sd_error)
+    ]
+    for error in (sampler.mean_error, sampler.sd_error):
+        with pytest.raises(ValueError, match=f"{error.__name__}: .* the number of stored steps; got discard=99"):
+            error(discard=99)
+    for name in ("mean_error", "sd_error"):
+        with pytest.raises(ValueError, match=f"{name} must be 3"):
+            summary(sampler.get_chain(flat=True), **{name: [0.1, 0.1]})
 
 
 def test_samplers_side_by_side():

@@ -83,11 +83,11 @@ def scores(posterior, samplers, stated):
 
 @cache
 def scores_of_forty_runs(mode, target, nwalkers, seed):
-    """Of 40 short runs: the scores of their means, their log-evidences, and the stated errors of these."""
+    """Of 40 short runs: the scores of their means, their log-evidences, and the stated errors of these; the runs."""
     posterior = target()
     samplers = runs(posterior, seed, count=40, nwalkers=nwalkers, nsteps=2, **MODES[mode])
     of_means = scores(posterior, samplers, np.array([s.mean_error() for s in samplers]))
-    return of_means, *np.array([[s.log_evidence, s.log_evidence_error] for s in samplers]).T
+    return of_means, *np.array([[s.log_evidence, s.log_evidence_error] for s in samplers]).T, samplers
 
 
 @pytest.mark.slow
@@ -111,9 +111,21 @@ def test_mean_error_covers(mode, target, nwalkers, low, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
+def test_error_of_standard_deviations_covers(mode, seed):
+    """Two stated errors cover the true standard deviation in nearly 95 % of the same runs, and are not too wide."""
+    samplers = scores_of_forty_runs(mode, Gaussian, 150, seed)[-1]
+    errors = np.array([s.get_chain(flat=True).std(axis=0) for s in samplers]) - Gaussian().sd
+    stated = np.array([s.sd_error() for s in samplers])
+    assert np.all(np.sum(np.abs(errors) < 2 * stated, axis=0) >= stats.binom(40, 0.93).ppf(1e-3))
+    ratio = np.sqrt(np.mean((errors / stated) ** 2, axis=0))
+    assert np.all((0.6 < ratio) & (ratio < 1.6))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["default", "moves", "literal", "tmcmc"])
 def test_evidence_error_covers(mode, seed):
     """Two standard errors cover the truth in nearly 95 % of the same runs, and are not idly wide."""
-    _, log_evidence, stated = scores_of_forty_runs(mode, Gaussian, 150, seed)
+    _, log_evidence, stated, _ = scores_of_forty_runs(mode, Gaussian, 150, seed)
     error = log_evidence - Gaussian().log_evidence
     covered = int(np.sum(np.abs(error) < 2 * stated))
     assert covered >= stats.binom(40, 0.93).ppf(1e-3)
@@ -132,6 +144,17 @@ def test_control_walkers_counted_as_independent_give_too_small_an_error(seed):
     founders = [s.mean_error() for s in samplers]
     assert np.max(scores(posterior, samplers, np.array(alone))[1]) > 1.6
     assert np.all(scores(posterior, samplers, np.array(founders))[1] < 1.6)
+
+
+def test_the_error_of_the_standard_deviation_of_independent_draws():
+    """For a normal distribution it is sd / sqrt(2 n), and a parameter that never varies has none."""
+    sampler = SMCSampler(2000, 3, Gaussian(), vectorize=True, seed=1, recycle=False)
+    sampler.run_mcmc(None, 1)
+    draws = np.random.default_rng(2).standard_normal((2000, 3)) * [1.0, 5.0, 0.0]
+    sampler.backend.chain[0] = draws
+    sampler._result = sampler._result._replace(founders=np.arange(2000))
+    assert np.allclose(sampler.sd_error()[:2], np.array([1.0, 5.0]) / np.sqrt(4000.0), rtol=0.1)
+    assert sampler.sd_error()[2] == 0.0
 
 
 def test_a_chain_continued_by_another_sampler_keeps_its_founders():

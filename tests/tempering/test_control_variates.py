@@ -8,6 +8,7 @@ from samplers import SMCSampler
 from samplers.estimates.control_variates import signed_sample, unreached_share
 from samplers.estimates.importance import KnownDensity, Round, pool_rounds
 from samplers.judgement import rounds as judged
+from samplers.judgement.verdict import judge
 from tests.contract.targets import Box, Gaussian
 from tests.tempering.guides import FixedGuide
 
@@ -108,6 +109,30 @@ def test_wrong_arguments(rng):
     assert repr(sample).startswith("<SignedSample of 2030 points, 3 parameters, log-evidence 3.9")
     with pytest.raises(ValueError, match="finite numbers; .* are not"):
         sample.expectation(lambda coords: np.where(coords[:, 0] > 0.0, np.inf, 1.0))
+
+
+def test_a_variance_below_its_error_is_not_a_standard_deviation_of_zero(rng):
+    """Weights of both signs can make a variance negative: no number is stated then, and the verdict says so."""
+    sample = signed_sample(rounds_of(rng, 30, 1))
+    far = sample.coords.copy()
+    far[int(np.argmin(sample.weights)), 1] = 1e3  # a draw in a tail that the known density does not have
+    found = sample._replace(coords=far).standard_deviation()
+    assert np.isnan(found.value).tolist() == [False, True, False]
+    assert np.isnan(found.error).tolist() == [False, True, False]
+    posterior = Gaussian(3)
+    sampler = SMCSampler(
+        50,
+        3,
+        posterior,
+        vectorize=True,
+        seed=2,
+        guide=KnowingGuide(posterior, posterior.mean, [np.diag((1.3 * posterior.sd) ** 2)]),
+    )
+    sampler.run_mcmc(None, 1)
+    before = judge(sampler._result, 50, 3, 100)
+    assert not any("is not determined" in reason for reason in before.reasons)
+    after = judge(sampler._result._replace(signed=sample._replace(coords=far)), 50, 3, 100)
+    assert any("the standard deviation of parameter 2 is not determined" in reason for reason in after.reasons)
 
 
 class KnowingGuide(FixedGuide):
