@@ -32,13 +32,16 @@ class Moments(NamedTuple):
 
 
 def moments_of(run: FinishedRun) -> Moments:
-    """Moments of the chain, or of the signed sample of a run with a guide if it has smaller errors of all means."""
+    """Moments of the chain, or of the signed sample of a run with a guide if that is the more accurate sample.
+
+    It has smaller errors of all means, and determines all standard deviations.
+    """
     signed = getattr(run.sampler, "signed_sample", None)
     if signed is not None:
-        mean, error = signed.expectation()
-        if np.all(error < run.mean_error):
+        (mean, error), sd = signed.expectation(), signed.standard_deviation().value
+        if np.all(error < run.mean_error) and np.all(sd > 0.0):
             quantiles = (signed.quantile(probability).value for probability in (0.05, 0.5, 0.95))
-            return Moments(mean, error, signed.standard_deviation().value, *quantiles)
+            return Moments(mean, error, sd, *quantiles)
     return Moments.of_samples(run.samples, run.mean_error)
 
 

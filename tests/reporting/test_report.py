@@ -237,6 +237,11 @@ def test_moments_are_those_of_the_more_accurate_sample(rng):
     moments = moments_of(finished)
     assert moments.sd == pytest.approx(np.ones(2), abs=0.03) and moments.high == pytest.approx(1.645, abs=0.06)
     assert np.all(moments.mean_error < 0.01)
+    undetermined = np.where(np.arange(20_000) == 0, -1e3, 1.0) / 20_000  # of a point in a tail
+    weights = undetermined / undetermined.sum()
+    finished.sampler.signed_sample = signed._replace(coords=np.vstack([[1e3, 0.0], points[1:]]), weights=weights)
+    np.testing.assert_array_equal(moments_of(finished).sd, chain.std(axis=0))
+    finished.sampler.signed_sample = signed
     errors[1] = 1e-3
     np.testing.assert_array_equal(moments_of(finished).sd, chain.std(axis=0))
     finished.sampler = object()  # emcee's own
