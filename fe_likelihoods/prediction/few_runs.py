@@ -146,6 +146,11 @@ def propagate_few(
             f"all {len(values)} simulated values of a number are equal, so nothing is known of its scatter: a rare "
             f"event with a probability below about {3.0 / len(values):.0%} may not be among them",
         )
+    if np.isnan(variance).any():
+        remarks += (
+            f"the signed sample does not determine the standard deviation of {np.isnan(variance).sum()} numbers, whose "
+            "variance by it is negative: use more simulations, or propagate with the chain",
+        )
     if unexplained > ROUGH:
         remarks += (
             f"the emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "

@@ -346,8 +346,8 @@ def _of_signed_sample(result: AnnealingResult) -> list[Concern]:
         return []
     message = (
         f"the standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
-        "the signed sample is below its own error, as with a tail of the posterior in which the guide makes few draws. "
-        "Use more walkers, a prior without this tail, or no guide"
+        "the signed sample is negative, as with a tail of the posterior in which the guide makes few draws. Use more "
+        "walkers, a prior without this tail, or no guide"
     )
     return [Concern(message, False)]
 

@@ -111,7 +111,7 @@ def test_wrong_arguments(rng):
         sample.expectation(lambda coords: np.where(coords[:, 0] > 0.0, np.inf, 1.0))
 
 
-def test_a_variance_below_its_error_is_not_a_standard_deviation_of_zero(rng):
+def test_a_negative_variance_is_not_a_standard_deviation_of_zero(rng):
     """Weights of both signs can make a variance negative: no number is stated then, and the verdict says so."""
     sample = signed_sample(rounds_of(rng, 30, 1))
     far = sample.coords.copy()
