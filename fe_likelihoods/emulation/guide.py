@@ -87,8 +87,6 @@ _OPEN_ENDS = (
     "not tell apart, or use the combination of them that the data determine as the parameter"
 )
 _LATE = 0.1  # growth of the emulated log-evidence after draws were made, from which ridges are followed again
-_FEW_ENDED = 0.5  # share of the starts below which their ends say little
-_TOO_FEW = 3  # such starts below which a result is refused: two miss one of two equal modes in half of all cases
 _NOT_AT_THE_TOP = "the search for modes ended before the top of a mode"
 
 
@@ -102,7 +100,7 @@ class ResponseGuide:
     posterior : Posterior
         Its noise must use statistics that are quadratic in the residuals.
     starts : int
-        Starts of the search for modes: the median of the prior, and draws of it.
+        Starts of the search for modes that shall lead to one: the median of the prior, and draws of it.
 
     Attributes
     ----------
@@ -120,7 +118,7 @@ class ResponseGuide:
     # a response does not depend on how long its simulation takes
     learns_from_parts = True
 
-    def __init__(self, posterior: Any, starts: int = 8) -> None:
+    def __init__(self, posterior: Any, starts: int = 6) -> None:
         starts = check_starts(starts)
         fewest = min(part.simulator.memory_cache.rows for part, _ in posterior.likelihood.parts())
         if fewest < _FEWEST_CACHED:
@@ -140,7 +138,6 @@ class ResponseGuide:
         self._wide: Mixture | None = None
         self._beyond = np.empty((0, self._target.n_structural))  # points beyond the ends of a curved posterior
         self._curves = 0  # times that such points were tried
-        self._ridge = False  # whether the data leave a combination of parameters to the prior
         self._extensions = 0  # of the emulator along directions that the data leave to the prior
 
     def check(self, log_prob_fn: Callable) -> None:
@@ -167,7 +164,7 @@ class ResponseGuide:
         return (
             *self._concerns,
             *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN),
-            *self._of_few_ends(self._too_few, np.inf),
+            *self._of_few_ends(),
             *self._of_heavy_weights(),
         )
 
@@ -184,22 +181,18 @@ class ResponseGuide:
     @property
     def refusals(self) -> tuple[str, ...]:
         """Why parts of the posterior are probably missing."""
-        return (*self._of_unseen_modes(_MOST_UNSEEN, np.inf), *self._of_few_ends(1, self._too_few))
+        return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
 
-    @property
-    def _too_few(self) -> int:
-        """Ends below which a result is refused; on a growing record, most starts are given up on its first part."""
-        return 1 if hasattr(self._target.model, "first") else _TOO_FEW
-
-    def _of_few_ends(self, least: int, below: float) -> tuple[str, ...]:
-        """A sentence on a ridge to which less than half of the starts led, at least `least` and fewer than `below`."""
+    def _of_few_ends(self) -> tuple[str, ...]:
+        """A sentence if one mode was found, by fewer starts than wanted: another one may not have been found."""
         n = 0 if self.search is None else ended(self.search)
-        if not self._ridge or not least <= n < min(below, _FEW_ENDED * len(self.search.ends)):
+        if not 0 < n < self._starts or len(self.search.modes) > 1:
             return ()
         return (
-            f"only {n} of {len(self.search.ends)} starts led to a mode, the others were given up far below it, and the "
-            "data leave a direction to the prior, or the posterior is curved: parts of it may be missing. Where the "
-            "model is a function, let it take n_steps, so that the search begins with the first part of the record",
+            f"only {n} of {len(self.search.ends)} starts led to the one mode that was found, the others were given up "
+            f"far below it: {1.0 - 0.05 ** (1.0 / n):.0%} of such starts may lead to modes that were not found. Use "
+            "more starts; where the model is a function, let it take n_steps, so that the search begins with the first "
+            "part of the record",
         )
 
     def _of_unseen_modes(self, least: float, most: float) -> tuple[str, ...]:
@@ -384,7 +377,6 @@ class ResponseGuide:
         yield from self._follow_curves(session)
         self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
         reached = self._free_directions()[1]
-        self._ridge = len(reached) > 0
         if np.any(reached < _REACHED):
             self._add_concern(_SHORT_OF_THE_RIDGE)
 

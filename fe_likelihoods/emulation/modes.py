@@ -38,12 +38,9 @@ _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times t
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
 _APART_OF_ALL = 2.0  # the same, times the number of starts
 _FEW = 6  # parameters whose differences cost about as much as two steps
-UNSEEN = 0.05  # share of starts alone in a mode above which further starts follow
-_FREE = 0.2  # variance of a standard normal coordinate from which a direction is left to the prior
-_ENDED = 0.75  # ascents that reached a mode, as a share of the first starts, below which further starts follow as well
-_ENOUGH = 5  # the same where the data leave a direction to the prior: of two equal modes, five miss one in 6 % of cases
-_MOST_FOR_ENDS = 1.5  # times the number of the first starts, up to which they follow for this reason
+UNSEEN = 0.05  # `unseen_share` above which further starts follow
 _MOST_STARTS = 4  # times the number of the first ones
+_DRAWN = 8  # the same for those of which the highest begin: a simulation each is cheaper than ascents given up
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
 _SHARES = 0.03, 0.1, 0.3, 0.6  # of the Arias intensity, at which the parts of the record end
 
@@ -144,11 +141,6 @@ def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -
     return Mode(parameters, at, covariance, top, log_evidence, starts, finite and end.converged)
 
 
-def _leaves_a_direction(search: ModeSearch) -> bool:
-    """Whether the data leave a direction to the prior at the highest mode, as on a ridge."""
-    return bool(search.modes) and np.linalg.eigvalsh(search.modes[0].covariance)[-1] > _FREE
-
-
 class _Part(NamedTuple):
     """A part of the record, with the ends found on it by the numbers of their starts."""
 
@@ -169,60 +161,98 @@ def search_modes(
 ) -> Generator[float, None, ModeSearch]:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
-    Further starts follow the first ones while `unseen_share` is large (modes that one start alone led to say that
-    others may have been missed). Half as many starts follow while the ascents that have reached a mode are fewer than
-    three quarters of the first starts: ascents that are given up may have been on their way to another mode. Where the
-    data leave a direction to the prior, most are given up because they advance slowly along it: on the whole record
-    further starts follow while fewer than five have reached a mode, and on a growing record none.
+    `first` starts begin (default: all). Further ones follow until as many have reached a mode (ascents that are given
+    up may have been on their way to another one), and while `unseen_share` is large (modes that one start alone led to
+    say that others may have been missed). They begin in the order of their likelihoods, for which each of them is
+    simulated once on the first part of the record: high ones are given up less often.
 
-    `first` starts begin (default: all), and half of it follow at a time. `remember` stores responses for a resumed run,
-    ``fits(n)`` says whether n more simulations of the whole record fit into the budget, and `remaining` how many are
-    left of it. With `overlap`, ascents begin together, and go on as soon as their own simulations have ended
-    (`Batches`). Yields the cost of each batch, in simulations of the whole record.
+    `remember` stores responses for a resumed run, ``fits(n)`` says whether n more simulations of the whole record fit
+    into the budget, and `remaining` how many are left of it. With `overlap`, ascents begin together, and go on as soon
+    as their own simulations have ended (`Batches`). Yields the cost of each batch, in simulations of the whole record.
     """
     first = len(starts) if first is None else first
+    most = min(_MOST_STARTS * first, len(starts))
     shortened = [*target.shortened(_SHARES), target]
     parts = [_Part(part, part.n_steps / target.n_steps, {}, Jacobians()) for part in shortened]
     standing_for: list[int] = []  # start that has taken the place of each; -1 for none
-    spent, search = 0.0, ModeSearch((), (), 0.0, True)
+    spent = 0.0
+
+    def counted(steps: Generator[float, None, Any]) -> Generator[float, None, Any]:
+        """The steps of another generator, whose costs are added."""
+        nonlocal spent
+        while True:
+            try:
+                cost = next(steps)
+            except StopIteration as end:
+                return end.value
+            spent += cost
+            yield cost
 
     def affordable() -> list[np.ndarray]:  # the search is worth nothing without draws after it
         return [np.array(remaining() > 2.0 * spent)]
 
-    begins = (0, *range(first, len(starts), _further(first)))
-    for begin, following in zip(begins, (*begins[1:], len(starts)), strict=True):
-        if not _leaves_a_direction(search):
-            few = 0 < ended(search) < _ENDED * first and begin < _MOST_FOR_ENDS * first
-        else:
-            few = len(parts) == 1 and 0 < ended(search) < min(_ENOUGH, _ENDED * begin)
-        enough = unseen_share(search) <= UNSEEN and not few
-        if begin and (enough or not remember("starts", affordable)[0]):
-            break
+    begin, following = 0, first
+    while True:
         fresh = range(begin, following)
         standing_for.extend(fresh)
-        ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
-        finished = True
-        while True:
-            try:
-                cost = next(ascents)
-            except StopIteration as end:
-                finished = end.value
-                break
-            spent += cost
-            yield cost
+        finished = yield from counted(
+            _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
+        )
         search = _modes_of(parts[-1], standing_for, spent, finished)
-        if not finished:
-            break
-    return search
+        missing = max(first - ended(search), _further(first) if unseen_share(search) > UNSEEN else 0)
+        if not finished or missing == 0 or following == most or not remember("starts", affordable)[0]:
+            return search
+        if begin == 0:
+            heights = yield from counted(_heights(parts[0], starts, remember, fits, overlap))
+            starts = np.concatenate([starts[:following], starts[_in_order(starts, heights, following)]])
+            most = min(most, len(starts))
+            if following == most:  # every simulation has failed
+                return search
+        begin, following = following, min(following + missing, most)
+
+
+def _heights(
+    part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool], overlap: bool
+) -> Generator[float, None, np.ndarray]:
+    """Log-likelihoods (n,) of starts (n, n_structural) on the first part of the record; -inf where one failed."""
+
+    def simulate(start: np.ndarray) -> Generator[np.ndarray, Any, float]:
+        runs = yield start[None]
+        return -np.inf if runs.failed[0] else part.target.fit_noise(runs.statistics[0]).log_density
+
+    heights = np.full(len(starts), -np.inf)
+    batches = Batches(part.target, remember, lambda points: fits(part.share * points), overlap)
+    for points in batches.complete({k: simulate(start) for k, start in enumerate(starts)}, heights.__setitem__):
+        yield part.share * points
+    return heights
+
+
+def _in_order(starts: np.ndarray, heights: np.ndarray, begun: int) -> np.ndarray:
+    """Numbers of the starts (n, d) after the first ones that have `begun`, in the order in which they shall begin.
+
+    Starts that have failed do not. The first ones are those without a higher start in a critical distance, in the unit
+    cube of the prior's probabilities; then the others follow, the highest first. With this distance, each mode is
+    reached, from a finite number of starts (multi-level single linkage: Rinnooy Kan & Timmer 1987, Math. Program. 39,
+    57-78, eq. 8, with sigma = 4).
+    """
+    from scipy.special import gamma, ndtr
+
+    n, d = starts.shape
+    unit = ndtr(starts)
+    critical = (gamma(1.0 + 0.5 * d) * 4.0 * np.log(n) / n) ** (1.0 / d) / np.sqrt(np.pi)
+    near = np.linalg.norm(unit[:, None] - unit, axis=2) < critical
+    covered = (near & (heights[None] > heights[:, None])).any(axis=1)
+    order = begun + np.lexsort((-heights[begun:], covered[begun:]))
+    return order[heights[order] > -np.inf]
 
 
 def unseen_share(search: ModeSearch) -> float:
     """Share of further starts that are expected to lead to modes not seen yet: the share of starts alone in a mode.
 
-    I. J. Good (1953), Biometrika 40, 237-264, eq. 9, with modes as species; starts that are given up count.
+    I. J. Good (1953), Biometrika 40, 237-264, eq. 9, with modes as species, among the starts that have reached one.
     """
     alone = sum(search.ends.count(number) == 1 for number in range(len(search.modes)))
-    return alone / len(search.ends) if len(search.ends) > 1 else 0.0
+    return alone / max(ended(search), 1)
 
 
 def ended(search: ModeSearch) -> int:
@@ -327,9 +357,9 @@ def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     """
     from scipy.special import ndtri
 
-    d, some = target.n_structural, _further(n)
+    d = target.n_structural
     blocks = [np.zeros((1, d))]
-    for size in (n - 1, *[some] * ((_MOST_STARTS - 1) * n // some)) if n > 1 else ():
+    for size in (n - 1, (_DRAWN - 1) * n) if n > 1 else ():
         columns = [random.permutation(size) + random.uniform(size=size) for _ in range(d)]
         blocks.append(ndtri(np.column_stack(columns) / size))
     return np.concatenate(blocks)
@@ -342,7 +372,7 @@ def check_starts(starts: Any) -> int:
     return int(starts)
 
 
-def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
+def find_modes(posterior: Any, starts: int = 6, seed: Any = None, max_simulations: float | None = None) -> ModeSearch:
     """Find the modes of a posterior from the responses of its model.
 
     Parameters
@@ -350,7 +380,8 @@ def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulation
     posterior : Posterior
         Any noise whose statistics are quadratic in the residuals, as all noises of this package are.
     starts : int
-        Number of starts: the median of the prior, and a Latin hypercube of its quantiles.
+        Number of starts that shall lead to a mode: the median of the prior, and a Latin hypercube of its quantiles. At
+        most four times as many begin.
     seed : int, optional
         Seed of the draws.
     max_simulations : float, optional
@@ -367,8 +398,8 @@ def find_modes(posterior: Any, starts: int = 8, seed: Any = None, max_simulation
 
     Notes
     -----
-    A mode that no start leads to is not found. The more starts, the better; two equally wide modes are both found from
-    eight starts in 99 of 100 cases.
+    A mode that no start leads to is not found. The more starts, the better: of two modes to which equally many starts
+    lead, six starts find both in 97 of 100 cases.
 
     Examples
     --------

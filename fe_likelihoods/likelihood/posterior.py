@@ -244,7 +244,7 @@ class Posterior:
         """
         return self.likelihood.draw_noise(x, rng)
 
-    def guide(self, starts: int = 8) -> "ResponseGuide":
+    def guide(self, starts: int = 6) -> "ResponseGuide":
         """A guide for samplers: finds the modes from the responses and emulates the responses around them.
 
         It reduces the simulations from thousands to hundreds: ``SMCSampler(..., guide=posterior.guide())``. The result
@@ -253,8 +253,8 @@ class Posterior:
         Parameters
         ----------
         starts : int
-            Starts of the search for modes: the median of the prior, and a Latin hypercube of its quantiles. A mode to
-            which no start leads can be missed.
+            Starts of the search for modes that shall lead to a mode: the median of the prior, and a Latin hypercube of
+            its quantiles. At most four times as many begin. A mode to which no start leads can be missed.
 
         Returns
         -------

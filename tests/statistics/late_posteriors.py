@@ -1,7 +1,7 @@
 """Small posteriors that are decided late in the record, with models that can be shortened.
 
 A search for modes on growing parts of the record sees nothing of the parameters that act late, or is led to a wrong
-place, until it uses the whole record. Two cases are beyond the default search: eight starts miss the narrow mode of
+place, until it uses the whole record. Two cases are beyond the default search: few starts miss the narrow mode of
 late_basin in some runs, and in all_misled, nearly all runs end at the wrong place. Such runs can be called converged.
 """
 
