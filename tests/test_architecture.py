@@ -24,7 +24,6 @@ ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
 WORKERS = {"faults", "interrupts", "folder", "shared_files", "by_value", "user_code", "worker", "local_pool"} | {
     "sandbox",
-    "program_supervisor",
     "programs",
 }
 # a thing and its figure, section of the command, report or other package

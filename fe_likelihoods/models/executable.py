@@ -45,9 +45,8 @@ class ExecutableModel(UserModel):
     parameter, with all its digits; ``$$`` is a dollar sign (`string.Template`). The program is started in the folder of
     the run, without a shell and without standard input.
 
-    After the program has ended or was stopped, all processes that it started are killed: on Linux also processes in
-    another session with another environment, on other systems the process group. Containers and queued jobs that a
-    service starts for the program are not found, nor are the processes of a program that kills its supervisor.
+    After the program has ended or was stopped, all processes in its process group are killed. A program that is stopped
+    is killed with all processes that it waits for, on Linux. Daemons, containers and queued jobs are not found.
 
     Parameters
     ----------

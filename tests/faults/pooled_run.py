@@ -58,7 +58,7 @@ def _isolated() -> FunctionModel:
 
 
 def _program() -> ExecutableModel:
-    code = "import subprocess, sys; subprocess.run(['sleep', '3600'], start_new_session=True, env={})"
+    code = "import subprocess, sys; subprocess.run(['sleep', '3600'], env={})"
     command = [sys.executable, "-c", code, "$offset", "$slope"]
     return ExecutableModel(command, {}, "out.txt", NAMES, CHANNELS, DT, N_STEPS, time_limit=3600.0)
 

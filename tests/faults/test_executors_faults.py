@@ -336,7 +336,7 @@ PARENTS = [
 @needs_proc
 @pytest.mark.parametrize("pool", PARENTS)
 def test_nothing_outlives_a_parent_that_is_killed(pool, tmp_path, tmp_path_factory):
-    # three more for the program, its supervisor and its child
+    # three more for the program, its watcher and its child
     expected = {"isolated": 1, "nested": 2 * WORKERS, "program": 4 * WORKERS}.get(pool, WORKERS)
     at_once = 1 if pool == "isolated" else WORKERS
     command = [sys.executable, "-m", "tests.faults.pooled_run", pool, str(tmp_path)]

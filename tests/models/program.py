@@ -13,12 +13,11 @@ offset, slope, n, dt, what = open(sys.argv[1]).read().split()
 rows = [(k * float(dt), float(offset) + float(slope) * (k * float(dt))) for k in range(int(n))]
 if what == "hang":
     time.sleep(3600)
-if what in ("family", "leftovers"):  # a child, one in its own session, and a daemon without environment
+if what in ("family", "leftovers"):  # a child, one that may be in its own session, and one whose parent has ended
     sleep = ["sleep", "3600"]
-    children = [subprocess.Popen(sleep), subprocess.Popen(sleep, start_new_session=True)]
+    children = [subprocess.Popen(sleep), subprocess.Popen(sleep, start_new_session=what == "family")]
     read, write = os.pipe()
     if os.fork() == 0:
-        os.setsid()
         if pid := os.fork():
             os.write(write, str(pid).encode())
             os._exit(0)

@@ -1,7 +1,6 @@
 """Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
 import functools
-import multiprocessing
 import os
 import pickle
 import re
@@ -12,8 +11,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ExecutableModel, SimulationFailed
-from fe_likelihoods.simulation import programs
-from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.label import ModelLabel
 from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch, split_seconds
@@ -152,33 +149,12 @@ def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: background processes cannot be found")
 def test_processes_left_by_a_program_are_killed(tmp_path):
-    """Also a daemon in its own session, without an environment, whose parent has ended."""
+    """Also a process without an environment, whose parent has ended."""
     model = model_of("leftovers", env={"FAMILY": str(tmp_path / "pids"), "PATH": os.environ["PATH"]})
     np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
     pids = family(tmp_path / "pids")
     assert len(pids) == 4
-    assert gone(pids, 0.0)  # before the run is over
-
-
-def test_a_supervisor_that_is_killed_is_a_transient_fault():
-    model = model_of()
-    model.simulate(THETA)  # its supervisor is kept
-    kill = "import os, signal; os.kill(os.getppid(), signal.SIGKILL)"
-    killer = model_of(command=[sys.executable, "-S", "-c", kill, "in.txt"])
-    (reason,) = simulate_batch(killer, THETA[None]).reasons
-    assert isinstance(reason, TransientReason)
-    assert reason.startswith("the supervisor of the program died")
-    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
-
-
-def test_a_forked_process_has_a_supervisor_of_its_own():
-    """As in a pool of multiprocessing that forks while threads of the parent run programs."""
-    model = model_of()
-    model.simulate(THETA)
-    with multiprocessing.get_context("fork").Pool(1) as pool:
-        assert programs._idle
-        np.testing.assert_array_equal(pool.apply_async(model.simulate, (THETA,)).get(20.0), line(THETA))
-    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+    assert gone(pids)
 
 
 # environment --------------------------------------------------------------------------------------------------------
@@ -191,7 +167,7 @@ def test_a_program_has_the_stated_environment(monkeypatch):
     def names(**options):
         seen = []
         model_of(command=show, output=functools.partial(_names, seen), version="1", **options).simulate(THETA)
-        return {name for name in seen if not name.startswith(("FE_LIKELIHOODS_RUN_", "LC_CTYPE"))}
+        return {name for name in seen if name != "LC_CTYPE"}
 
     assert names() >= {"SEEN", "PATH"}
     assert names(env={"LICENCE": "1"}) == {"LICENCE"}
