@@ -1,15 +1,16 @@
 """Executor for other pools: concurrent.futures, multiprocessing, MPI, and any object with ``map``."""
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
 from multiprocessing.pool import Pool, ThreadPool
 from typing import Any
 
-from samplers.interrupts import Ended
+from samplers.interrupts import Ended, SentFunction
 
+from .by_value import Pickled, Recent
 from .local_pool import Outcome
-from .sent_functions import FunctionReference, Missing, PrivateFiles
 
 __all__ = ["PoolExecutor", "resolve"]
 
@@ -47,7 +48,6 @@ class PoolExecutor:
 
     def __init__(self, pool: Any) -> None:
         self.pool = pool
-        self._files = PrivateFiles()
 
     @property
     def other_processes(self) -> bool:
@@ -67,14 +67,7 @@ class PoolExecutor:
 
     def map(self, function: Callable[[Any], Outcome], items: Iterable[Any]) -> list[Outcome]:
         """Outcomes of a function for every item, in order; ValueError if a worker cannot load the function."""
-        items = list(items)
-        reference = self._reference(function)
-        outcomes = list(self.pool.map(reference, items))
-        missing = [index for index, outcome in enumerate(outcomes) if isinstance(outcome, Missing)]
-        if missing:
-            carried = self.pool.map(reference.carried(), [items[index] for index in missing])
-            for index, outcome in zip(missing, carried, strict=True):
-                outcomes[index] = outcome
+        outcomes = list(self.pool.map(self._by_value(function), list(items)))
         for outcome in outcomes:
             if isinstance(outcome, Ended):
                 raise outcome.error
@@ -94,11 +87,11 @@ class PoolExecutor:
                 f"{type(self.pool).__name__} has map, and neither submit nor apply_async: its items cannot be "
                 "submitted one by one; use map"
             )
-        reference = self._reference(function)
-        tasks: list[Future] = []
+        sent, tasks = self._by_value(function), []
         try:
             for item in items:
-                tasks.append(self._send(_Task(), item, reference))
+                tasks.append(_Task())
+                self._start(tasks[-1], sent, item)
         except BaseException:
             self.give_up(tasks)
             raise
@@ -110,38 +103,56 @@ class PoolExecutor:
             if not future.cancel() and running:
                 Future.cancel(future)
 
-    def _reference(self, function: Callable) -> FunctionReference:
+    def _by_value(self, function: Callable) -> SentFunction:
         """The function as it is sent to workers, pickled now if they are known to be other processes."""
-        reference = FunctionReference(function, self._files)
+        by_value = _ByValue(function)
         if self.other_processes:
-            reference.pickle()
-        return reference
+            by_value.pickled  # noqa: B018
+        return SentFunction(by_value)
 
-    def _send(self, task: _Task, item: Any, reference: FunctionReference, carried: bool = False) -> _Task:
-        """Send an item to the pool, and again together with the function if the worker does not have it."""
-
-        def received(result: Any) -> None:
-            if isinstance(result, Missing) and not carried:
-                try:
-                    self._send(task, item, reference, True)
-                except Exception as error:
-                    resolve(task, error=error)
-            else:
-                resolve(task, result)
-
+    def _start(self, task: _Task, sent: SentFunction, item: Any) -> None:
         def ended(inner: Future) -> None:
             if inner.cancelled():
                 Future.cancel(task)
             elif (error := inner.exception()) is not None:
                 resolve(task, error=error)
             else:
-                received(inner.result())
+                resolve(task, inner.result())
 
-        function = reference.carried() if carried else reference
         if hasattr(self.pool, "submit"):
-            task.inner = self.pool.submit(function, item)
+            task.inner = self.pool.submit(sent, item)
             task.inner.add_done_callback(ended)
         else:
             failed = partial(resolve, task, None)
-            task.inner = self.pool.apply_async(function, (item,), callback=received, error_callback=failed)
-        return task
+            task.inner = self.pool.apply_async(sent, (item,), callback=partial(resolve, task), error_callback=failed)
+
+
+class _ByValue:
+    """A function that is sent to other processes by value, in its state when it is first pickled."""
+
+    def __init__(self, function: Callable) -> None:
+        self._function = function
+
+    @cached_property
+    def pickled(self) -> Pickled:
+        return Pickled.of(self._function)
+
+    def __call__(self, item: Any) -> Any:
+        return self._function(item)
+
+    def __reduce__(self) -> tuple:
+        return partial, (_call, self.pickled)
+
+
+loaded_functions = Recent()  # `Arrived` by key, in a worker process
+_loading = threading.Lock()
+
+
+def _call(pickled: Pickled, item: Any) -> Any:
+    """Result of a sent function, which each process loads once."""
+    with _loading:
+        function = loaded_functions.use(pickled.key)
+        if function is None:
+            function = pickled.load()
+            loaded_functions.keep(pickled.key, function, len(pickled.payload))
+    return function(item)

@@ -25,7 +25,6 @@ from tests.faults.treacherous import Treacherous, posterior_of
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "docs" / "clusters"
-LARGEST_GROUP = 10  # short simulations that are one task of dask, and are repeated if its worker ends
 WALKERS = 250  # of slow_model.py
 LOG_EVIDENCE = 2427.63  # +- 0.01, of problem.py with 2000 walkers in one process
 PRINTED = re.compile(r"log-evidence ([\d.]+) \+- ([\d.]+)")
@@ -83,7 +82,7 @@ def check_result(place, interruptions):
 
     No evaluation has failed, so that none was given up because of the ends of its workers. Every simulation that ended
     is in the record and in the cache.
-    Each of the interruptions, the ends of worker processes, has repeated one group of simulations at most.
+    Each of the interruptions, the ends of worker processes, has repeated two simulations at most.
     """
     text = (place / "output.txt").read_text()
     estimate, error = map(float, PRINTED.search(text).groups())
@@ -95,7 +94,7 @@ def check_result(place, interruptions):
     starts, ends = Counter(lines(place, "starts.txt")), Counter(lines(place, "ends.txt"))
     assert set(starts) == set(ends)  # what was interrupted was simulated again
     repeated = starts.total() - len(starts)
-    assert repeated <= LARGEST_GROUP * interruptions, (repeated, interruptions)
+    assert repeated <= 2 * interruptions, (repeated, interruptions)
     with contextlib.closing(sqlite3.connect(place / "simulations.db")) as cache:
         rows = cache.execute("select count(*) from simulations").fetchone()[0]
     # the measurements are a simulation of the function that is not one of the likelihood

@@ -166,9 +166,9 @@ class Cluster:
             self.workers = dict.fromkeys(self.worker_spec)
             self.ended.set()
 
-    def map(self, function, groups, pure):
+    def map(self, function, items, pure):
         self.workers = {}
-        self.futures = [Waiting(function(group)) for group in groups]
+        self.futures = [Waiting(function(item)) for item in items]
         threading.Thread(target=self._end, daemon=True).start()
         return self.futures
 
@@ -265,7 +265,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         assert np.isneginf(values[3])
         assert np.isfinite(values[4:]).all()
         assert posterior.report()["failure_reasons"] == {"the worker process died in every attempt of dask": 1}
-        # short runs are sent in groups once their duration is known; the item that kills its worker is still identified
+        # beside many short runs
         many = np.column_stack([theta(bad.FINE, 40), np.full(40, 0.5)])
         expected = posterior_of(Treacherous(), top=20.0)(many)
         np.testing.assert_array_equal(posterior(many), expected)

@@ -5,7 +5,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -18,7 +17,7 @@ from fe_likelihoods import problems
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation import dask_executor, sent_functions
+from fe_likelihoods.simulation import pool_executor
 from fe_likelihoods.simulation.by_value import Pickled
 from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
@@ -30,24 +29,17 @@ SPAWN = multiprocessing.get_context("spawn")
 
 
 class Recorder:
-    """A pool that pickles like processes, and counts the bytes."""
-
-    def __init__(self, forget=False):
-        self.bytes, self.forget = [], forget
+    """A pool that pickles like processes."""
 
     def map(self, function, items):
         for item in items:
-            if self.forget:
-                sent_functions.loaded_functions.clear()
-            task = pickle.dumps((function, item))
-            self.bytes.append(len(task))
-            function, item = pickle.loads(task)
+            function, item = pickle.loads(pickle.dumps((function, item)))
             yield function(item)
 
 
 @pytest.fixture(autouse=True)
 def nothing_known():
-    sent_functions.loaded_functions.clear()
+    pool_executor.loaded_functions.clear()
 
 
 @pytest.fixture
@@ -122,51 +114,6 @@ def test_kind_of_executor():
     assert type(as_executor(Recorder())) is PoolExecutor
 
 
-def test_dask_sends_short_runs_in_groups_and_long_ones_one_by_one(monkeypatch):
-    """A client that runs the tasks itself and records their sizes."""
-
-    class Ended:
-        status = "finished"
-
-        def __init__(self, answer):
-            self.answer = answer
-
-        def add_done_callback(self, callback):
-            callback(self)
-
-    class Client:
-        def __init__(self):
-            self.tasks = []
-
-        def nthreads(self):
-            return {"one": 1, "other": 1}
-
-        def map(self, function, groups, pure):
-            assert not pure
-            self.tasks.append([len(group) for group in groups])
-            return [Ended(function(group)) for group in groups]
-
-        def gather(self, futures):
-            return [future.answer for future in futures]
-
-    def slow(item):
-        time.sleep(0.35)
-        return item, ""
-
-    monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
-    client = Client()
-    executor = as_executor(client)
-    items = list(range(64))
-    for _ in range(2):
-        assert executor.map(lambda item: (item, ""), items) == [(item, "") for item in items]
-    assert executor.map(slow, items[:3]) == [(item, "") for item in items[:3]]
-    assert executor.map(slow, items[:12]) == [(item, "") for item in items[:12]]
-    assert client.tasks[0] == [1] * 64  # the duration of an item is not known yet
-    assert client.tasks[1][0] == 16 and client.tasks[1][-1] == 1 and sum(client.tasks[1]) == 64
-    assert len(client.tasks[1]) < 20
-    assert client.tasks[3] == [2, 2, 2, 1, 1, 1, 1, 1, 1]  # 0.35 s each, so two per second
-
-
 @pytest.mark.parametrize(
     "pool",
     [0, -1, True, 2.5, "four", object(), float("nan"), [2]],
@@ -184,47 +131,24 @@ def test_model_is_sent_once_to_each_process(shared_pool):
             assert set(batch.response[:, 0, 0]) == {1.0}
 
 
-def _absent_file(path):
-    raise FileNotFoundError(path)
-
-
-def test_a_sent_function_is_private_and_its_digest_is_checked(tmp_path):
-    """Anybody who could change the file would run code in the workers."""
-    executor = as_executor(Recorder())
-    model, thetas = Treacherous(), np.array([[0.1, 0.2]])
-    simulate_batch(model, thetas, executor)
-    (file,) = executor._files._files.values()
-    assert os.fstat(file.fileno()).st_mode & 0o777 == 0o600
+def test_a_pickled_function_that_was_changed_is_refused(tmp_path):
+    """Whoever could change it would run code in the workers."""
     evil = tmp_path / "evil"
     pickled = b"cos\nmkdir\n(V" + str(evil).encode() + b"\ntR."  # makes a folder
-    os.ftruncate(file.fileno(), 0)
-    os.pwrite(file.fileno(), pickled, 0)
-    sent_functions.loaded_functions.clear()
-    assert simulate_batch(model, thetas, executor).reasons == [""]  # the function was sent with the items
+    with pytest.raises(ValueError, match="the pickled function has been changed after it was sent"):
+        Pickled(pickled, b"a digest").load()
     assert not evil.exists()
     pickle.loads(pickled)
     assert evil.exists()
-    with pytest.raises(ValueError, match="the pickled function has been changed after it was sent"):
-        Pickled(pickled, b"a digest").load()
 
 
-@pytest.mark.parametrize("forget", [False, True], ids=["file", "no file"])
-def test_bytes_sent_with_each_item(forget, monkeypatch):
+def test_a_worker_of_another_pool_loads_the_model_once():
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
-    recorder = Recorder()
-    executor = as_executor(recorder)
-    treacherous.LOADED.clear()
-    if forget:  # as on another machine without the folder: the model is sent with the items
-        monkeypatch.setattr(sent_functions.Path, "read_bytes", _absent_file)
+    executor = as_executor(Recorder())
     for loaded in (1, 0):
         treacherous.LOADED.clear()  # a value of the module, so that its change would send the function again
-        batch = simulate_batch(model, thetas, executor)
-        assert batch.reasons == [""] * 20
+        assert simulate_batch(model, thetas, executor).reasons == [""] * 20
         assert len(treacherous.LOADED) == loaded
-    large = [size for size in recorder.bytes if size > 2**20]
-    assert len(large) == (20 if forget else 0)
-    assert max(size for size in recorder.bytes if size <= 2**20) < 500
-    assert recorder.bytes[-20:] == [recorder.bytes[-1]] * 20
 
 
 def test_a_worker_keeps_a_bounded_number_of_functions():
@@ -233,17 +157,7 @@ def test_a_worker_keeps_a_bounded_number_of_functions():
         model = Treacherous()
         model.ballast = ballast
         simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(sent_functions.loaded_functions) == 8
-
-
-def test_files_are_closed_with_the_executor():
-    executor = as_executor(Recorder())
-    simulate_batch(Treacherous(), np.array([[0.1, 0.2]]), executor)
-    (file,) = executor._files._files.values()
-    path = executor._files.path(Pickled(b"", *executor._files._files))
-    assert Path(path).stat().st_size > 0
-    del executor, file
-    assert not Path(path).exists()
+    assert len(pool_executor.loaded_functions) == 8
 
 
 @pytest.mark.parametrize(
