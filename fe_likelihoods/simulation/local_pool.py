@@ -1,8 +1,8 @@
 """Pool of local processes that survives the death of its workers.
 
 When a worker dies, the standard library's pools hang or break, and cannot say which item killed it. Here every worker
-has a pipe and a thread in this process, which sends it one item at a time. So the item that a dead worker was running
-is known. Only this item is run again, and it is given up after the third death.
+has a pipe, and a thread in this process sends it one item at a time. So the item that a dead worker was running is
+known. Only this item is run again, and it is given up after the third death.
 """
 
 import os
@@ -14,7 +14,7 @@ from concurrent.futures import wait as wait_for
 from typing import Any
 
 from .by_value import Pickled
-from .worker import Worker, WorkerDied
+from .worker import IdleWorkers, Worker, WorkerDied
 
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
@@ -38,20 +38,13 @@ def results_of(futures: Sequence[Future], executor: Any) -> list[Any]:
 
 
 class _Job(Future):
-    """An item with its function; the future of its result."""
+    """An item with its function; the future of its result. `worker` is the process that has it."""
 
     def __init__(self, function: Pickled, item: Any) -> None:
         super().__init__()
         self.function, self.item = function, item
-        self.deaths = 0
+        self.worker: Worker | None = None
         self.given_up = False
-
-    def start(self) -> bool:
-        """Whether the job is to be run, for the first time or again; ends the job if it was given up."""
-        if self.given_up:
-            self.set_exception(CancelledError())
-            return False
-        return self.running() or self.set_running_or_notify_cancel()
 
 
 def _is_positive_whole(value: Any) -> bool:
@@ -99,11 +92,10 @@ class LocalPool:
     def _set_up(self) -> None:
         self._owner, self._changed = os.getpid(), threading.Condition(threading.RLock())
         self._waiting: deque[_Job] = deque()
-        self._busy: dict[Worker, _Job | None] = {}  # each worker's job, None while it loads a function
-        self._free: list[Worker] = []
+        self._running: set[_Job] = set()
         self._threads: set[threading.Thread] = set()
-        self._idle = 0  # threads that wait for an item
-        self._closed = 0  # how often
+        self._n_idle = 0  # threads that wait for an item
+        self._workers = IdleWorkers(environment=self._environment)
 
     def __enter__(self) -> "LocalPool":
         return self
@@ -123,17 +115,9 @@ class LocalPool:
         """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
         with self._changed:
-            self._closed += 1
-            self._changed.notify_all()
-            loading = [worker for worker, job in self._busy.items() if job is None]
-            left = [*self._waiting, *filter(None, self._busy.values())]
-        for worker in loading:
-            worker.kill()
+            left = [*self._waiting, *self._running]
         self.give_up(left)
-        with self._changed:
-            self._changed.wait_for(lambda: not self._threads - {threading.current_thread()})
-            while self._free:
-                self._free.pop().kill()
+        self._workers.close()
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Results of a function for every item, in order; these items run before items that were submitted.
@@ -165,16 +149,14 @@ class LocalPool:
     def give_up(self, futures: Sequence[Future], running: bool = True) -> None:
         """Cancel items; with `running`, also kill the processes that run them. Items with results keep them."""
         self._notice_fork()
-        for job in futures:
-            if not job.cancel() and running:
-                job.given_up = True
-        with self._changed:
-            killed = [worker for worker, job in self._busy.items() if job is not None and job.given_up]
-            me = threading.current_thread() in self._threads
-        for worker in killed:
-            worker.kill()
-        if not me:
-            wait_for([job for job in futures if job.given_up])
+        started = [job for job in futures if not job.cancel() and running and not job.done()]
+        for job in started:
+            with self._changed:
+                job.given_up, worker = True, job.worker
+            if worker is not None:
+                worker.kill()
+        if threading.current_thread() not in self._threads:
+            wait_for(started)
 
     def _notice_fork(self) -> None:
         """In a forked process: forget the parent's workers and threads."""
@@ -191,7 +173,7 @@ class LocalPool:
             else:
                 self._waiting.extend(jobs)
             self._changed.notify_all()
-            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._idle)):
+            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._n_idle)):
                 thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
                 self._threads.add(thread)
                 thread.start()
@@ -200,121 +182,80 @@ class LocalPool:
     # in a thread per worker -----------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Run items one after the other in this thread's process, until none is waiting."""
-        worker, job = self._first_job(None)
-        while job is not None:
+        """Run items one after the other, until none is waiting."""
+        while (job := self._next()) is not None:
             try:
-                worker = self._loaded(worker, job.function)
-                job = self._next_job(worker, job.function)
-                worker = worker if job is None else self._run(worker, job)
-            except BaseException as error:
-                worker = None
-                self._drop(job.function, error)
-            worker, job = self._first_job(worker)
+                result, error = self._result(job), None
+            except BaseException as raised:
+                result, error = None, raised
+            with self._changed:
+                self._running.discard(job)
+            if error is None:
+                job.set_result(result)
+            else:
+                job.set_exception(error)
 
-    def _first_job(self, worker: Worker | None) -> tuple[Worker | None, _Job | None]:
-        """The first waiting item; None if the thread ends. The process is free while there is no item."""
-        closed = self._closed
+    def _next(self) -> _Job | None:
+        """The next item; None if the thread ends."""
         with self._changed:
             while True:
-                while self._waiting and (self._waiting[0].cancelled() or self._waiting[0].given_up):
-                    self._waiting.popleft().start()
-                if self._waiting:
-                    return worker, self._waiting[0]
-                if worker is not None:
-                    del self._busy[worker]
-                    self._free.append(worker)
-                    worker = None
-                self._idle += 1
-                has_items = self._changed.wait_for(lambda: self._waiting or self._closed != closed, _LINGER)
-                self._idle -= 1
-                if not has_items or not self._waiting:
+                self._n_idle += 1
+                self._changed.wait_for(lambda: self._waiting, _LINGER)
+                self._n_idle -= 1
+                if not self._waiting:
                     self._threads.discard(threading.current_thread())
-                    self._changed.notify_all()
-                    return None, None
+                    return None
+                job = self._waiting.popleft()
+                if job.set_running_or_notify_cancel():
+                    self._running.add(job)
+                    return job
 
-    def _loaded(self, worker: Worker | None, function: Pickled) -> Worker | None:
-        """A process that has loaded a function; None if the pool was closed meanwhile."""
-        closed = self._closed
+    def _result(self, job: _Job) -> Any:
+        """Result of an item, from another process if its process dies."""
+        reason = ""
         for _ in range(MAX_ATTEMPTS):
-            worker = worker or self._take(function) or Worker(self._environment)
+            worker = self._loaded(job)
+            try:
+                worker.send(job.item)
+                answer = worker.receive()
+            except WorkerDied as error:
+                reason = error.reason
+                self._free(job, None)
+                continue
+            except BaseException:  # the item cannot be pickled, or the answer cannot be unpickled
+                worker.kill()
+                raise
+            self._free(job, worker)
+            if answer.error is not None:
+                raise answer.error
+            return answer.value
+        return None, reason
+
+    def _loaded(self, job: _Job) -> Worker:
+        """A process that has loaded the function of an item."""
+        reason = ""
+        for _ in range(MAX_ATTEMPTS):
+            worker = self._workers.take(job.function.key)
             with self._changed:
-                self._busy[worker] = None
-                if closed != self._closed:
+                job.worker = worker
+                if job.given_up:
                     worker.kill()
             try:
-                worker.load(function)
+                worker.load(job.function)
                 return worker
-            except BaseException as error:
-                self._end(worker)
-                worker = None
-                if closed != self._closed:
-                    return None
-                if not isinstance(error, WorkerDied):
-                    raise
+            except WorkerDied as error:
                 reason = error.reason
+                self._free(job, None)
+            except BaseException:
+                self._free(job, worker)
+                raise
         raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
 
-    def _take(self, function: Pickled) -> Worker | None:
-        """A free process, preferably one that has loaded the function."""
+    def _free(self, job: _Job, worker: Worker | None) -> None:
+        """The process of an item is idle, or has died; `CancelledError` if the item was given up."""
         with self._changed:
-            self._free.sort(key=lambda worker: function.key in worker.keys)
-            while self._free:
-                worker = self._free.pop()
-                if worker.alive:
-                    return worker
-        return None
-
-    def _next_job(self, worker: Worker | None, function: Pickled) -> _Job | None:
-        """Take the next waiting item of a function, for a process."""
-        with self._changed:
-            for place, job in enumerate(self._waiting if worker is not None else ()):
-                if job.function.key == function.key and not job.cancelled() and not job.given_up:
-                    del self._waiting[place]
-                    if job.start():
-                        self._busy[worker] = job
-                        return job
-                    break
-        return None
-
-    def _run(self, worker: Worker, job: _Job) -> Worker | None:
-        """Run an item; returns the process if it can go on."""
-        try:
-            worker.send(job.item)
-            answer = worker.receive()
-        except WorkerDied as error:
-            self._end(worker)
-            job.deaths += 1
-            if job.deaths == MAX_ATTEMPTS:
-                job.set_result((None, error.reason))
-            elif job.given_up:
-                job.set_exception(CancelledError())
-            else:
-                with self._changed:
-                    self._waiting.appendleft(job)
-            return None
-        except BaseException as error:  # the item cannot be pickled, or the answer cannot be unpickled
-            self._end(worker)
-            job.set_exception(error)
-            return None
-        with self._changed:
-            self._busy[worker] = None
-        if answer.error is None:
-            job.set_result(answer.value)
-        else:
-            job.set_exception(answer.error)
-        return worker
-
-    def _end(self, worker: Worker) -> None:
-        with self._changed:
-            self._busy.pop(worker, None)
-        worker.kill()
-
-    def _drop(self, function: Pickled, error: BaseException) -> None:
-        """Remove the waiting items of a function that cannot be used."""
-        with self._changed:
-            dropped = [job for job in self._waiting if job.function.key == function.key]
-            self._waiting = deque(job for job in self._waiting if job.function.key != function.key)
-        for job in dropped:
-            if job.start():
-                job.set_exception(error)
+            job.worker = None
+        if worker is not None:
+            self._workers.give_back(worker)
+        if job.given_up:
+            raise CancelledError

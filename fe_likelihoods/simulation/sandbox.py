@@ -2,15 +2,13 @@
 
 import math
 import os
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 from .by_value import Pickled
 from .faults import ChangedModel, RunFailed, TransientReason
-from .worker import Answer, Worker
+from .worker import Answer, IdleWorkers, Worker
 
 __all__ = ["Sandbox"]
 
@@ -38,15 +36,15 @@ class Sandbox:
     ) -> None:
         self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
         self.max_output, self.runs_per_process = max_output, runs_per_process
-        self._free: list[Worker] = []
+        self._workers = IdleWorkers(memory_limit=memory_limit, has_output=True)
         Pickled.of(function)  # an error is raised here instead of in the first call
 
-    def __getstate__(self) -> dict:
-        return vars(self) | {"_free": []}
+    def __reduce__(self) -> tuple:
+        return Sandbox, (self.function, self.time_limit, self.memory_limit, self.max_output, self.runs_per_process)
 
     def __call__(self, item: Any) -> Any:
         """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
-        worker = self._take(Pickled.of(self.function))
+        worker = self._loaded(Pickled.of(self.function))
         start = time.monotonic()
         try:
             worker.send(item)
@@ -63,24 +61,18 @@ class Sandbox:
         else:
             os.ftruncate(worker.output.fileno(), 0)
             os.lseek(worker.output.fileno(), 0, os.SEEK_SET)
-            self._free.append(worker)
+            self._workers.give_back(worker)
         if answer.error is not None:
             raise answer.error
         return answer.value
 
     def close(self) -> None:
         """End the idle processes."""
-        while self._free:
-            self._free.pop().kill()
+        self._workers.close()
 
-    def _take(self, function: Pickled) -> Worker:
+    def _loaded(self, function: Pickled) -> Worker:
         """A process that has loaded the function."""
-        worker = None
-        with suppress(IndexError):
-            while worker is None or not worker.alive:
-                worker = self._free.pop()
-        if worker is None or not worker.alive:
-            worker = Worker(memory_limit=self.memory_limit, output=tempfile.TemporaryFile())
+        worker = self._workers.take(function.key)
         try:
             worker.load(function, _START_LIMIT)
         except BaseException as error:

@@ -15,6 +15,7 @@ import select
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import weakref
@@ -34,7 +35,7 @@ from .faults import RunFailed, TransientReason, is_transient
 from .folder import discard, working_folder
 from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
-__all__ = ["Answer", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
+__all__ = ["Answer", "IdleWorkers", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -71,14 +72,17 @@ class Worker:
 
     It is killed by `kill`, when this object is garbage-collected, or when this process ends. `environment` adds
     variables; `memory_limit` [bytes] of the address space (0: none) makes allocations fail beyond it; `output` receives
-    both streams (default: the streams of this process). `keys` are the keys of loaded functions (`Pickled`), `calls`
-    counts items sent, `waits` says whether its simulation waits for another one
+    both streams if it `has_output` (default: the streams of this process). `keys` are the keys of loaded functions
+    (`Pickled`), `calls` counts items sent, `waits` says whether its simulation waits for another one
     (`fe_likelihoods.simulation.shared_files`), as far as received, and `kept` where the folder of a failed simulation
     was kept, to be added to the reason; "" before `kill`.
     """
 
-    def __init__(self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, output: Any = None) -> None:
-        self.output, self.kept, self.waits = output, "", False
+    def __init__(
+        self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, has_output: bool = False
+    ) -> None:
+        self.output = tempfile.TemporaryFile() if has_output else None
+        self.kept, self.waits = "", False
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -89,8 +93,8 @@ class Worker:
                 env={**os.environ, **(environment or {})},
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
+                stdout=self.output,
+                stderr=self.output,
                 start_new_session=True,
                 cwd=working_folder() or None,
             )
@@ -163,6 +167,31 @@ class Worker:
         self._end()
         self.kept = discard(self._process.pid, reason)
         return self._process.wait()
+
+
+class IdleWorkers:
+    """Processes that are kept for later calls; new ones have the `options` of a `Worker`."""
+
+    def __init__(self, **options: Any) -> None:
+        self._options, self._workers, self._lock = options, [], threading.Lock()
+
+    def take(self, key: bytes) -> Worker:
+        """A process, preferably one that has loaded the function with a key."""
+        with self._lock:
+            self._workers.sort(key=lambda worker: key in worker.keys)
+            while self._workers:
+                if (worker := self._workers.pop()).alive:
+                    return worker
+        return Worker(**self._options)
+
+    def give_back(self, worker: Worker) -> None:
+        """Keep a process that has answered."""
+        self._workers.append(worker)
+
+    def close(self) -> None:
+        """End the processes."""
+        while self._workers:
+            self._workers.pop().kill()
 
 
 class Answer(NamedTuple):

@@ -15,7 +15,6 @@ from tests.faults.treacherous import (
     DiesOnce,
     Gated,
     Large,
-    LoadsOnce,
     Treacherous,
     gone,
     line,
@@ -90,14 +89,6 @@ def test_the_function_is_sent_once_to_each_process(shared_pool):
     with shared_pool(2) as pool:
         futures = [pool.submit(function, theta) for theta in SHORT * 5]
         assert {future.result()[0][0, 0] for future in futures} == {1.0}
-
-
-def test_a_free_process_does_not_wait_for_one_that_loads(tmp_path, shared_pool):
-    function = LoadsOnce(tmp_path)
-    with shared_pool(2) as pool:
-        assert [future.result(SECONDS) for future in pool.submit_all(function, [1, 2])] == [1, 2]
-        assert pool.submit(function, 3).result(SECONDS) == 3
-        (tmp_path / "go").touch()
 
 
 def test_map_goes_before_items_that_wait(function, tmp_path, shared_pool):
