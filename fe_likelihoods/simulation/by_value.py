@@ -32,7 +32,7 @@ from samplers.interrupts import become_worker
 from .faults import ChangedModel
 from .user_code import SCRIPTS, is_of_user, sources_digest
 
-__all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "without_addresses"]
+__all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "process_name", "without_addresses"]
 
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.cache(len))
@@ -40,6 +40,7 @@ _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
+_names: dict[int, bytes] = {}
 _present: dict[str, types.ModuleType] = {}  # modules of the function that ran last in this process
 
 
@@ -49,8 +50,7 @@ def _forget_lock() -> None:
     _lock = threading.RLock()
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_lock)
+os.register_at_fork(after_in_child=_forget_lock)
 
 
 def without_addresses(message: str) -> str:
@@ -94,8 +94,8 @@ class Pickled(NamedTuple):
     def of(cls, function: Any) -> "Pickled":
         """Pickle a function with everything that it uses at present; ValueError if that is impossible."""
         try:
-            payload = sources_digest() + _this_process(os.getpid()) + dumps(function)
-            return cls(payload, _digest(payload))
+            payload = sources_digest() + process_name() + dumps(function)
+            return cls(payload, blake2b(payload, digest_size=16).digest())
         except Exception as error:
             name = getattr(function, "__qualname__", type(function).__qualname__)
             raise ValueError(
@@ -103,19 +103,13 @@ class Pickled(NamedTuple):
                 "Objects that it uses must not contain open files, locks and connections"
             ) from error
 
-    def is_whole(self) -> bool:
-        """Whether the payload matches the digest."""
-        return _digest(self.payload) == self.key
-
     def load(self) -> "Arrived":
         """The function, in a worker.
 
-        ValueError if the payload does not match its digest (then nothing is unpickled) or cannot be unpickled;
-        ChangedModel if this process has another version of this library, or a file that the model depends on differs.
+        ValueError if it cannot be unpickled; ChangedModel if this process has another version of this library, or a
+        file that the model depends on differs.
         """
         global _arriving
-        if not self.is_whole():
-            raise ValueError("the pickled function has been changed after it was sent: its digest differs")
         if self.payload[:16] != sources_digest():
             raise ChangedModel(
                 "the worker process has another version of fe_likelihoods than the process that sends simulations: "
@@ -123,7 +117,7 @@ class Pickled(NamedTuple):
             )
         with _lock:
             # a pool may run the function in the sending process, whose modules must not be replaced
-            if self.payload[16:32] != _this_process(os.getpid()):
+            if self.payload[16:32] != process_name():
                 _arriving = {}
                 become_worker()
             try:
@@ -138,14 +132,9 @@ class Pickled(NamedTuple):
                 _arriving = None
 
 
-def _digest(payload: bytes) -> bytes:
-    return blake2b(payload, digest_size=16).digest()
-
-
-@functools.cache
-def _this_process(pid: int) -> bytes:
+def process_name() -> bytes:
     """Random name of this process; a forked process has a different name."""
-    return os.urandom(16)
+    return _names.setdefault(os.getpid(), os.urandom(16))
 
 
 class Arrived:

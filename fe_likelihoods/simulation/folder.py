@@ -25,6 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .by_value import process_name
 from .faults import RunFailed, TransientReason, UnusableModel, reason_of
 from .shared_files import RunningSimulation, of_this_library, running_simulation
 
@@ -42,9 +43,7 @@ __all__ = [
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
 _MOST_BELOW = 300  # entries of subfolders that are linked one by one; larger subfolders are links until they are used
-_MOST_USED = 3000  # entries of a subfolder that was used
-_DEEPEST = 3
-_MOST_BESIDE = 3000  # entries beside the working folder that ``..`` shows
+_MOST_USED = 3000  # entries of a subfolder that was used, and beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
 
 _mirror: "_Mirror | None" = None
@@ -54,7 +53,7 @@ _places: set[str] = set()  # folders for the folders of workers
 class Sender(NamedTuple):
     """The process that sends simulations: its name, machine and working folder, a place for folders, and `KEEP`."""
 
-    process: str
+    process: bytes
     machine: str
     folder: str
     place: str
@@ -64,18 +63,12 @@ class Sender(NamedTuple):
     def here(cls) -> "Sender":
         """This process."""
         keep = os.path.abspath(os.environ[KEEP]) if os.environ.get(KEEP) else ""
-        return cls(_name(os.getpid()), os.uname().nodename, working_folder(), _place(os.getpid()), keep)
+        return cls(process_name(), os.uname().nodename, working_folder(), _place(os.getpid()), keep)
 
     @classmethod
     def of_this_worker(cls) -> "Sender":
         """The process that this process works for, whose name is not known, in the working folder of this process."""
-        return cls.here()._replace(process="")
-
-
-@functools.cache
-def _name(pid: int) -> str:
-    """Random name of this process; a forked process has a different name."""
-    return os.urandom(16).hex()
+        return cls.here()._replace(process=b"")
 
 
 def working_folder() -> str:
@@ -94,7 +87,7 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
     `sender` is the process that has sent the function; None if it was not sent.
     """
     is_main = threading.current_thread() is threading.main_thread()
-    is_home = sender is None or sender.process == _name(os.getpid())
+    is_home = sender is None or sender.process == process_name()
     if running_simulation() is not None or (is_home and is_main):  # one after the other
         return function(item), ""
     thread = 0 if is_main else threading.get_ident()
@@ -118,7 +111,7 @@ def _is_remote(sender: Sender | None) -> bool:
 def get_ready(sender: Sender) -> None:
     """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
     is_main = threading.current_thread() is threading.main_thread()
-    if sender.process != _name(os.getpid()) and running_simulation() is None and is_main:
+    if sender.process != process_name() and running_simulation() is None and is_main:
         with contextlib.suppress(OSError):
             _mirror_for(sender)
 
@@ -155,7 +148,7 @@ def _run_in_mirror(
     reason = reason_of(error) if error is not None else result[1] if _is_failure(result) else ""
     is_kept = reason and sender.keep and mirror.has_changed
     kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
-    mirror.clean(anew=kept is not None or (simulation.has_programs and _has_children()))
+    mirror.clean(anew=kept is not None or simulation.has_programs)  # which may still write
     if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
         reason = _with(reason, f" (its folder is {kept})")
         error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
@@ -181,17 +174,6 @@ def _is_only_thread_of_dask() -> bool:
         return [worker.state.nthreads for worker in distributed.Worker._instances] == [1]
     except (AttributeError, ValueError):
         return False
-
-
-def _has_children() -> bool:
-    """Whether this process has started processes that it has not waited for; they may still write."""
-    if not hasattr(os, "waitid"):  # macOS before Python 3.13
-        return True
-    try:
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    except ChildProcessError:
-        return False
-    return True
 
 
 def shown(path: str) -> str | None:
@@ -298,7 +280,7 @@ class _Mirror:
         # folders that contain these paths must not be shown: they would be within themselves
         self._above = os.path.join(os.path.realpath(self.base), ""), os.path.join(self._place, "")
         parent = os.path.dirname(self.base)
-        for entry in _scan(parent, _MOST_BESIDE) if self.base else ():
+        for entry in _scan(parent, _MOST_USED) if self.base else ():
             with contextlib.suppress(FileExistsError):
                 os.symlink(entry.path, os.path.join(self._place, entry.name))
         self._build()
@@ -313,7 +295,8 @@ class _Mirror:
             folder, entry = waiting.pop(0)
             name = os.path.join(folder, entry.name)
             most = _MOST_USED if name in self._private else left
-            entries = _scan(entry.path, most + 1) if self._is_folder(name, entry) else None
+            is_shown = self._may_be_folder(entry) and (name in self._private or not entry.name.startswith("."))
+            entries = _scan(entry.path, most + 1) if is_shown else None
             if entries is not None and len(entries) <= most:
                 left -= 0 if name in self._private else len(entries)
                 os.mkdir(os.path.join(self.path, name))
@@ -331,11 +314,11 @@ class _Mirror:
             os.utime(os.path.join(self.path, name), ns=(0, 0))
         _mark(self.hop)
 
-    def _is_folder(self, name: str, entry: os.DirEntry) -> bool:
+    def _may_be_folder(self, entry: os.DirEntry) -> bool:
         """Whether a folder, or a link to one, may be shown as a folder."""
-        if not entry.is_dir() or any(each.startswith(os.path.realpath(entry.path) + os.sep) for each in self._above):
-            return False
-        return name in self._private or not (entry.name.startswith(".") or name.count(os.sep) >= _DEEPEST)
+        return entry.is_dir() and not any(
+            each.startswith(os.path.realpath(entry.path) + os.sep) for each in self._above
+        )
 
     def _stamped(self, name: str) -> tuple[str, Stamp | None]:
         path = os.path.join(self.base, name)

@@ -121,10 +121,7 @@ class RunningSimulation:
 
     def reads(self, path: Any) -> None:
         """Notice a file that was written while this simulation runs, but not by Python code of this simulation."""
-        if self.locked or not isinstance(path, str | bytes | os.PathLike):
-            return
-        path = _full(path)
-        if path.startswith(_SYSTEM) or self._is_own(path):
+        if self.locked or (path := _full(path)) is None or path.startswith(_SYSTEM) or self._is_own(path):
             return
         with contextlib.suppress(OSError):
             status = os.stat(path)
@@ -136,39 +133,27 @@ class RunningSimulation:
                 self.shared = UnguardedFile(path)
             _fresh.add(path)
 
-    def makes(self, path: Any, *_: Any) -> None:
+    def makes(self, path: Any) -> None:
         if (path := _full(path)) is not None and not os.path.lexists(path):
             self._made.add(path)
 
-    def renames(self, source: Any, path: Any, *_: Any) -> None:
-        self.writes(path)
-
-    def removes(self, path: Any, folder: int | None = None) -> None:
+    def removes(self, path: Any, folder: int | None) -> None:
         if folder in (None, -1):  # else within a folder, whose removal has an event of its own
             self.writes(path)
 
-    def connects(self, database: Any) -> None:
-        if isinstance(database, str | bytes | os.PathLike) and os.fsdecode(database) not in ("", ":memory:"):
-            self.writes(database)
-
-    def forks(self) -> None:
+    def starts(self, folder: Any = None) -> None:
+        """A process, or a program that may write in its folder."""
         self.has_programs = True
-
-    def starts(self, program: Any, command: Any, folder: Any, environment: Any) -> None:
-        self.has_programs = True
-        self.enters("." if folder is None else folder)
-
-    def starts_here(self, *_: Any) -> None:
-        self.has_programs = True
-        self.enters(".")
+        self.enters(folder)
 
     def enters(self, folder: Any) -> None:
-        """What runs in a shared folder may write there."""
         if isinstance(folder, str | bytes | os.PathLike):
             self.writes(os.path.join(os.path.realpath(os.fsdecode(folder)), "*"))
 
-    def writes(self, path: Any, *_: Any) -> None:
+    def writes(self, path: Any) -> None:
         """Wait for the lock before a file is written, unless it belongs to this simulation alone."""
+        if path in ("", ":memory:"):  # a database
+            return
         if (path := _full(path)) is None or self._is_own(path) or self.locked or _is_cache(path):
             return
         if self._has_made(path):
@@ -203,24 +188,21 @@ class RunningSimulation:
         return bool(self.place) and path.startswith(self.place + os.sep)
 
 
-_EVENTS = {
-    "open": RunningSimulation.opens,
-    "os.chdir": RunningSimulation.enters,
-    "os.fork": RunningSimulation.forks,
-    "os.link": RunningSimulation.renames,
-    "os.mkdir": RunningSimulation.writes,
-    "os.posix_spawn": RunningSimulation.starts_here,
-    "os.remove": RunningSimulation.removes,
-    "os.rename": RunningSimulation.renames,
-    "os.rmdir": RunningSimulation.removes,
-    "os.symlink": RunningSimulation.renames,
-    "os.system": RunningSimulation.starts_here,
-    "os.truncate": RunningSimulation.writes,
-    "shutil.rmtree": RunningSimulation.removes,
-    "sqlite3.connect": RunningSimulation.connects,
-    "subprocess.Popen": RunningSimulation.starts,
-    "tempfile.mkdtemp": RunningSimulation.makes,
+_EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
+    "open": lambda simulation, arguments: simulation.opens(*arguments),
+    "os.chdir": lambda simulation, arguments: simulation.enters(arguments[0]),
+    "os.fork": lambda simulation, _: simulation.starts(),
+    "os.posix_spawn": lambda simulation, _: simulation.starts("."),
+    "os.system": lambda simulation, _: simulation.starts("."),
+    "subprocess.Popen": lambda simulation, arguments: simulation.starts(arguments[2] or "."),
+    "tempfile.mkdtemp": lambda simulation, arguments: simulation.makes(arguments[0]),
 }
+for _event in ("os.mkdir", "os.truncate", "shutil.rmtree", "sqlite3.connect"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[0])
+for _event in ("os.link", "os.rename", "os.symlink"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[1])
+for _event in ("os.remove", "os.rmdir"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.removes(*arguments)
 
 
 def _hook(event: str, arguments: tuple) -> None:
@@ -228,7 +210,7 @@ def _hook(event: str, arguments: tuple) -> None:
         return
     if (simulation := running_simulation()) is not None:
         with of_this_library():
-            _EVENTS[event](simulation, *arguments)
+            _EVENTS[event](simulation, arguments)
 
 
 def running_simulation() -> RunningSimulation | None:
