@@ -14,7 +14,8 @@ from concurrent.futures import wait as wait_for
 from typing import Any
 
 from .by_value import Pickled
-from .worker import IdleWorkers, Worker, WorkerDied
+from .faults import RunFailed
+from .worker import IdleWorkers, Worker
 
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
@@ -190,6 +191,7 @@ class LocalPool:
                 result, error = None, raised
             with self._changed:
                 self._running.discard(job)
+                job.worker = None
             if error is None:
                 job.set_result(result)
             else:
@@ -216,15 +218,11 @@ class LocalPool:
         for _ in range(MAX_ATTEMPTS):
             worker = self._loaded(job)
             try:
-                worker.send(job.item)
-                answer = worker.receive()
-            except WorkerDied as error:
+                answer = worker.call(job.item)
+            except RunFailed as error:
                 reason = error.reason
                 self._free(job, None)
                 continue
-            except BaseException:  # the item cannot be pickled, or the answer cannot be unpickled
-                worker.kill()
-                raise
             self._free(job, worker)
             if answer.error is not None:
                 raise answer.error
@@ -243,7 +241,7 @@ class LocalPool:
             try:
                 worker.load(job.function)
                 return worker
-            except WorkerDied as error:
+            except RunFailed as error:
                 reason = error.reason
                 self._free(job, None)
             except BaseException:

@@ -1,19 +1,16 @@
 """A function that runs in another process, with time, memory and output limits."""
 
 import math
-import os
-import time
 from collections.abc import Callable
 from typing import Any
 
 from .by_value import Pickled
 from .faults import ChangedModel, RunFailed, TransientReason
-from .worker import Answer, IdleWorkers, Worker
+from .worker import IdleWorkers
 
 __all__ = ["Sandbox"]
 
 _START_LIMIT = 120.0  # [s] for starting a process and loading the function
-_POLL_INTERVAL = 0.1  # [s] between checks of the output size
 
 
 class Sandbox:
@@ -36,7 +33,7 @@ class Sandbox:
     ) -> None:
         self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
         self.max_output, self.runs_per_process = max_output, runs_per_process
-        self._workers = IdleWorkers(memory_limit=memory_limit, has_output=True)
+        self._workers = IdleWorkers(memory_limit=memory_limit, most_output=max_output)
         Pickled.of(function)  # an error is raised here instead of in the first call
 
     def __reduce__(self) -> tuple:
@@ -44,23 +41,18 @@ class Sandbox:
 
     def __call__(self, item: Any) -> Any:
         """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
-        worker = self._loaded(Pickled.of(self.function))
-        start = time.monotonic()
+        function = Pickled.of(self.function)
+        worker = self._workers.take(function.key)
         try:
-            worker.send(item)
-            answer = self._receive(worker, start)
-        except RunFailed as error:
-            worker.kill(error.reason)
-            reason = error.reason.with_text(error.reason + worker.kept)
-            raise RunFailed(reason, time.monotonic() - start) from None
-        except BaseException:
-            worker.kill()
+            worker.load(function, _START_LIMIT)
+        except ChangedModel:
             raise
+        except ValueError as error:  # it cannot be loaded there
+            raise RunFailed(TransientReason(str(error))) from error
+        answer = worker.call(item, math.inf if self.time_limit is None else self.time_limit)
         if worker.calls >= (self.runs_per_process or math.inf):
             worker.kill()
         else:
-            os.ftruncate(worker.output.fileno(), 0)
-            os.lseek(worker.output.fileno(), 0, os.SEEK_SET)
             self._workers.give_back(worker)
         if answer.error is not None:
             raise answer.error
@@ -69,28 +61,3 @@ class Sandbox:
     def close(self) -> None:
         """End the idle processes."""
         self._workers.close()
-
-    def _loaded(self, function: Pickled) -> Worker:
-        """A process that has loaded the function."""
-        worker = self._workers.take(function.key)
-        try:
-            worker.load(function, _START_LIMIT)
-        except BaseException as error:
-            worker.kill()
-            if isinstance(error, ValueError) and not isinstance(error, ChangedModel):  # it cannot be loaded there
-                raise RunFailed(TransientReason(str(error))) from error
-            raise
-        return worker
-
-    def _receive(self, worker: Worker, start: float) -> Answer:
-        """Answer of a worker; RunFailed if there is none within the limit, or it dies or prints too much."""
-        limit = math.inf if self.time_limit is None else self.time_limit
-        while (left := start + limit - time.monotonic()) > 0.0:
-            before = time.monotonic()
-            answer = worker.receive(min(left, _POLL_INTERVAL))
-            start += time.monotonic() - before if worker.waits else 0.0
-            if os.fstat(worker.output.fileno()).st_size > self.max_output:
-                raise RunFailed(TransientReason(f"stopped because it printed more than {self.max_output} bytes"))
-            if answer is not None:
-                return answer
-        raise RunFailed(TransientReason(f"stopped at the time limit of {limit:g} s", time_limit=limit))

@@ -35,7 +35,7 @@ from .faults import RunFailed, TransientReason, is_transient
 from .folder import discard, working_folder
 from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
-__all__ = ["Answer", "IdleWorkers", "Worker", "WorkerDied", "describe_exit", "last_lines", "serve"]
+__all__ = ["Answer", "IdleWorkers", "Worker", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -44,11 +44,7 @@ _BOOT = (
 _WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
-_CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
-
-
-class WorkerDied(RunFailed):
-    """A worker process has ended before it answered."""
+_CHECK = 0.2  # [s] between checks that the process lives and of its output, while waiting for its answer
 
 
 def _renew_starter() -> None:
@@ -71,18 +67,15 @@ class Worker:
     """A process that calls a function. Its methods may be called from one thread, apart from `kill`.
 
     It is killed by `kill`, when this object is garbage-collected, or when this process ends. `environment` adds
-    variables; `memory_limit` [bytes] of the address space (0: none) makes allocations fail beyond it; `output` receives
-    both streams if it `has_output` (default: the streams of this process). `keys` are the keys of loaded functions
-    (`Pickled`), `calls` counts items sent, `waits` says whether its simulation waits for another one
-    (`fe_likelihoods.simulation.shared_files`), as far as received, and `kept` where the folder of a failed simulation
-    was kept, to be added to the reason; "" before `kill`.
+    variables; `memory_limit` [bytes] of the address space (0: none) makes allocations fail beyond it; `most_output`
+    [bytes] is for a call, whose output is not shown then. `keys` are the keys of loaded functions (`Pickled`), `calls`
+    counts items sent.
     """
 
     def __init__(
-        self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, has_output: bool = False
+        self, environment: Mapping[str, str] | None = None, memory_limit: int = 0, most_output: int = 0
     ) -> None:
-        self.output = tempfile.TemporaryFile() if has_output else None
-        self.kept, self.waits = "", False
+        self._most, self._output = most_output, tempfile.TemporaryFile() if most_output else None
         self._connection, theirs = Pipe()
         with theirs:
             texts = [[str(text) for text in texts] for texts in (sys.path, sys.argv)]
@@ -93,8 +86,8 @@ class Worker:
                 env={**os.environ, **(environment or {})},
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
-                stdout=self.output,
-                stderr=self.output,
+                stdout=self._output,
+                stderr=self._output,
                 start_new_session=True,
                 cwd=working_folder() or None,
             )
@@ -110,63 +103,88 @@ class Worker:
         """Whether the process runs and is a child of this process (not of the one this was forked from)."""
         return self._owner == os.getpid() and not _ended(self._process)
 
-    def load(self, function: Pickled, seconds: float | None = None) -> None:
+    def load(self, function: Pickled, seconds: float = math.inf) -> None:
         """Send the function to call, unless it is loaded, and wait until it is.
 
-        WorkerDied if the process dies or does not answer within `seconds`; ValueError if it cannot load the function.
+        RunFailed if the process dies or does not answer within `seconds`; ValueError if it cannot load the function.
         """
         self._key = function.key
-        if function.key in self.keys:
-            return
-        self._send(_LOAD + pickle.dumps(function, protocol=5))
-        answer = self.receive(seconds)
-        if answer is None:
-            raise WorkerDied(TransientReason(f"the worker process did not start within {seconds:g} s"))
-        if answer.error is not None:
-            raise answer.error
-        self.keys.keep(function.key, True, len(function.payload))
+        if function.key not in self.keys:
+            slow = TransientReason(f"the worker process did not start within {seconds:g} s")
+            answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow)
+            if answer.error is not None:
+                raise answer.error
+            self.keys.keep(function.key, True, len(function.payload))
 
-    def send(self, item: Any) -> None:
-        """Send an item for the function that was loaded last; `receive` returns the answer."""
-        self.keys.use(self._key)
-        self._send(self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5))
+    def call(self, item: Any, seconds: float = math.inf) -> "Answer":
+        """The answer of the function that was loaded last, for an item.
+
+        RunFailed if the process dies, prints too much or does not answer within `seconds`, without the time in which
+        its simulation waits for another one (`fe_likelihoods.simulation.shared_files`).
+        """
         self.calls += 1
+        self.keys.use(self._key)
+        if self._output is not None:
+            os.ftruncate(self._output.fileno(), 0)
+            os.lseek(self._output.fileno(), 0, os.SEEK_SET)
+        message = self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5)
+        slow = TransientReason(f"stopped at the time limit of {seconds:g} s", time_limit=seconds)
+        return self._ask(message, seconds, slow)
 
-    def receive(self, seconds: float | None = None) -> "Answer | None":
-        """The answer, None if there is none within `seconds`; WorkerDied if the process has died."""
-        stop = math.inf if seconds is None else time.monotonic() + seconds
+    def _ask(self, message: bytes, seconds: float, slow: TransientReason) -> "Answer":
+        """Answer to a message; without one, the process is killed, and its simulation's folder may be kept."""
+        start = time.monotonic()
+        try:
+            with suppress(OSError):  # `_receive` notices that the process has died
+                self._connection.send_bytes(message)
+            return self._receive(start + seconds, slow)
+        except RunFailed as error:
+            seconds = time.monotonic() - start
+            raise RunFailed(error.reason.with_text(error.reason + self.kill(error.reason)), seconds) from None
+        except BaseException:
+            self.kill()
+            raise
+
+    def _receive(self, stop: float, slow: TransientReason) -> "Answer":
+        waits = False
         try:
             while True:
-                if self._poll(1000.0 * min(_CHECK, max(0.0, stop - time.monotonic()))):
+                before = time.monotonic()
+                is_ready = self._poll(1000.0 * max(0.0, min(_CHECK, stop - before)))
+                stop += time.monotonic() - before if waits else 0.0
+                if is_ready:
                     message = self._connection.recv_bytes()
                     if message not in _WAITS:
                         return Answer(*pickle.loads(message))
-                    self.waits = message == _WAITS[True]
+                    waits = message == _WAITS[True]
                 # a program that the function has started may hold the connection open
                 elif _ended(self._process) and not self._poll(0):
                     raise EOFError
-                elif time.monotonic() >= stop:
-                    return None
+                if self._output is not None and os.fstat(self._output.fileno()).st_size > self._most:
+                    raise RunFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
+                if time.monotonic() >= stop:
+                    raise RunFailed(slow)
         except (EOFError, OSError):
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
                 time.sleep(0.001)
-            reason = describe_exit(self.kill("the worker process died"), "the worker process") + self.kept
-            said = "" if self.output is None else last_lines(self.output, 1)
-            raise WorkerDied(TransientReason("; ".join(filter(None, [reason, said])))) from None
+            self._end()
+            said = "" if self._output is None else last_lines(self._output, 1)
+            reason = "; ".join(filter(None, [describe_exit(self._process.wait(), "the worker process"), said]))
+            raise RunFailed(TransientReason(reason)) from None
 
-    def _send(self, message: bytes) -> None:
-        with suppress(OSError):  # `receive` reports that the process has died
-            self._connection.send_bytes(message)
-
-    def kill(self, reason: str = "") -> int:
-        """Kill the process and its session; returns its exit code, as in `subprocess`.
-
-        With the `reason` why its simulation has failed, the simulation's folder may be kept, see `kept`.
-        """
+    def kill(self, reason: str = "") -> str:
+        """Kill the process and its session; with the `reason` of a failure, returns what to add to it."""
         self._end()
-        self.kept = discard(self._process.pid, reason)
-        return self._process.wait()
+        self._process.wait()
+        return discard(self._process.pid, reason)
+
+
+class Answer(NamedTuple):
+    """Answer of a worker: the result of the function, or the exception that it has raised."""
+
+    value: Any
+    error: BaseException | None
 
 
 class IdleWorkers:
@@ -192,13 +210,6 @@ class IdleWorkers:
         """End the processes."""
         while self._workers:
             self._workers.pop().kill()
-
-
-class Answer(NamedTuple):
-    """Answer of a worker: the result of the function, or the exception that it has raised."""
-
-    value: Any
-    error: BaseException | None
 
 
 def _ended(process: subprocess.Popen) -> bool:
