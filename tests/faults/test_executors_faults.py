@@ -130,7 +130,7 @@ def test_a_pool_that_is_closed_while_a_process_loads_ends_that_process(tmp_path)
     function = LoadsOnce(tmp_path)  # only the first process can load it
     others, pool = workers_now(), LocalPool(2)
     futures = pool.submit_all(function, [1, 2, 3])
-    done = [future.result() for future, _ in zip(as_completed(futures), range(2), strict=False)]
+    done = [future.result() for _, future in zip(range(2), as_completed(futures), strict=False)]
     assert len(done) == 2
     workers = list(workers_now() - others)
     assert len(workers) == 2
