@@ -4,13 +4,13 @@ The rule for ``pool=``:
 
 * None: in this process.
 * a whole number: a `LocalPool` of that many processes.
-* an object with ``gather`` (a client of dask.distributed): ``map(function, groups of items, pure=False)``.
+* an object with ``gather`` (a client of dask.distributed): ``map(function, items, pure=False)``.
 * any other object with ``map``: ``list(pool.map(function, items))``, and for single items ``submit`` or
   ``apply_async``. This covers the executors of concurrent.futures, loky and mpi4py.futures and the pools of
   multiprocessing and schwimmbad.
 
-The function (model and measurements) may be large and is sent by value (`fe_likelihoods.simulation.by_value`) to each
-worker once, and again when anything that it uses has changed; later tasks consist of its digest and the parameters.
+The function (model and measurements) is sent by value (`fe_likelihoods.simulation.by_value`): by a `LocalPool` to each
+worker once, and again when anything that it uses has changed; by other pools with each item. Workers load it once.
 ``submit(function, item)`` returns a `Future` with the result that ``map`` would return, even if the item kills every
 process that runs it. A pool that only has ``map`` cannot submit items: its attribute ``submits`` is False. Results do
 not depend on the pool, to the last bit.
