@@ -6,8 +6,8 @@ notebook functions work. The worker imports this library, installed packages and
 
 * A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
   the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* If a value in a module or class cannot be sent, such as an open file, the other values are sent; a simulation that
-  uses the missing value ends the run. A lock becomes a new lock.
+* If a value of a module cannot be sent, such as an open file, the other values are sent; a simulation that uses the
+  missing value ends the run. A lock becomes a new lock.
 * A worker refuses everything if its version of this library has different source code.
 """
 
@@ -26,6 +26,7 @@ from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import cloudpickle
+import numpy as np
 
 from samplers.interrupts import become_worker
 
@@ -364,7 +365,7 @@ def _refuse_a_name(value: Any) -> None:
 
 def _is_array(value: Any) -> bool:
     """Whether a value is an array of numbers, which refers to no code."""
-    return not getattr(getattr(value, "dtype", None), "hasobject", True)
+    return type(value) is np.ndarray and not value.dtype.hasobject
 
 
 class _Lock:
