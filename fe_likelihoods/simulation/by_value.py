@@ -33,7 +33,17 @@ from samplers.interrupts import become_worker
 from .faults import ChangedModel
 from .user_code import SCRIPTS, is_of_user, sources_digest
 
-__all__ = ["Arrived", "NotSent", "Pickled", "Recent", "dumps", "is_arriving", "process_name", "without_addresses"]
+__all__ = [
+    "Arrived",
+    "CannotLoad",
+    "NotSent",
+    "Pickled",
+    "Recent",
+    "dumps",
+    "is_arriving",
+    "process_name",
+    "without_addresses",
+]
 
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.cache(len))
@@ -85,6 +95,10 @@ class Recent(OrderedDict):
             del self._sizes[self.popitem(last=False)[0]]
 
 
+class CannotLoad(ValueError):
+    """A function that cannot be unpickled in a worker process."""
+
+
 class Pickled(NamedTuple):
     """A function as it is sent to workers."""
 
@@ -107,7 +121,7 @@ class Pickled(NamedTuple):
     def load(self) -> "Arrived":
         """The function, in a worker.
 
-        ValueError if it cannot be unpickled; ChangedModel if this process has another version of this library, or a
+        CannotLoad if it cannot be unpickled; ChangedModel if this process has another version of this library, or a
         file that the model depends on differs.
         """
         global _arriving
@@ -128,7 +142,7 @@ class Pickled(NamedTuple):
                 raise
             except Exception as error:
                 text = without_addresses(f"{type(error).__name__}: {error}")
-                raise ValueError(f"a function cannot be loaded in a worker process: {text}") from error
+                raise CannotLoad(f"a function cannot be loaded in a worker process: {text}") from error
             finally:
                 _arriving = None
 

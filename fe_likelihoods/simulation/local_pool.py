@@ -15,7 +15,7 @@ from typing import Any
 
 from .by_value import Pickled
 from .faults import RunFailed
-from .worker import IdleWorkers, Worker
+from .worker import LoadingFailed, Worker, Workers
 
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
@@ -96,7 +96,7 @@ class LocalPool:
         self._running: set[_Job] = set()
         self._threads: set[threading.Thread] = set()
         self._n_idle = 0  # threads that wait for an item
-        self._workers = IdleWorkers(environment=self._environment)
+        self._workers = Workers(environment=self._environment)
 
     def __enter__(self) -> "LocalPool":
         return self
@@ -214,46 +214,27 @@ class LocalPool:
 
     def _result(self, job: _Job) -> Any:
         """Result of an item, from another process if its process dies."""
-        reason = ""
-        for _ in range(MAX_ATTEMPTS):
-            worker = self._loaded(job)
-            try:
-                answer = worker.call(job.item)
-            except RunFailed as error:
-                reason = error.reason
-                self._free(job, None)
-                continue
-            self._free(job, worker)
-            if answer.error is not None:
-                raise answer.error
-            return answer.value
-        return None, reason
 
-    def _loaded(self, job: _Job) -> Worker:
-        """A process that has loaded the function of an item."""
-        reason = ""
-        for _ in range(MAX_ATTEMPTS):
-            worker = self._workers.take(job.function.key)
+        def watch(worker: Worker | None) -> None:
             with self._changed:
                 job.worker = worker
-                if job.given_up:
-                    worker.kill()
-            try:
-                worker.load(job.function)
-                return worker
-            except RunFailed as error:
-                reason = error.reason
-                self._free(job, None)
-            except BaseException:
-                self._free(job, worker)
-                raise
-        raise RuntimeError(f"{reason} while loading the model; see its output on stderr")
+            if job.given_up:
+                raise CancelledError
 
-    def _free(self, job: _Job, worker: Worker | None) -> None:
-        """The process of an item is idle, or has died; `CancelledError` if the item was given up."""
-        with self._changed:
-            job.worker = None
-        if worker is not None:
-            self._workers.give_back(worker)
-        if job.given_up:
-            raise CancelledError
+        deaths = loads = 0
+        while not job.given_up:
+            try:
+                answer = self._workers.run(job.function, job.item, watch=watch)
+            except LoadingFailed as error:
+                loads += 1
+                if loads == MAX_ATTEMPTS:
+                    raise RuntimeError(f"{error.reason} while loading the model; see its output on stderr") from None
+            except RunFailed as error:
+                deaths, loads = deaths + 1, 0
+                if deaths == MAX_ATTEMPTS:
+                    return None, error.reason
+            else:
+                if answer.error is not None:
+                    raise answer.error
+                return answer.value
+        raise CancelledError

@@ -4,9 +4,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from .by_value import Pickled
-from .faults import ChangedModel, RunFailed, TransientReason
-from .worker import IdleWorkers
+from .by_value import CannotLoad, Pickled
+from .faults import RunFailed, TransientReason
+from .worker import Workers
 
 __all__ = ["Sandbox"]
 
@@ -33,7 +33,9 @@ class Sandbox:
     ) -> None:
         self.function, self.time_limit, self.memory_limit = function, time_limit, memory_limit
         self.max_output, self.runs_per_process = max_output, runs_per_process
-        self._workers = IdleWorkers(memory_limit=memory_limit, most_output=max_output)
+        self._workers = Workers(
+            _START_LIMIT, runs_per_process or math.inf, memory_limit=memory_limit, most_output=max_output
+        )
         Pickled.of(function)  # an error is raised here instead of in the first call
 
     def __reduce__(self) -> tuple:
@@ -41,19 +43,10 @@ class Sandbox:
 
     def __call__(self, item: Any) -> Any:
         """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
-        function = Pickled.of(self.function)
-        worker = self._workers.take(function.key)
-        try:
-            worker.load(function, _START_LIMIT)
-        except ChangedModel:
-            raise
-        except ValueError as error:  # it cannot be loaded there
-            raise RunFailed(TransientReason(str(error))) from error
-        answer = worker.call(item, math.inf if self.time_limit is None else self.time_limit)
-        if worker.calls >= (self.runs_per_process or math.inf):
-            worker.kill()
-        else:
-            self._workers.give_back(worker)
+        limit = math.inf if self.time_limit is None else self.time_limit
+        answer = self._workers.run(Pickled.of(self.function), item, limit)
+        if isinstance(answer.error, CannotLoad):
+            raise RunFailed(TransientReason(str(answer.error))) from answer.error
         if answer.error is not None:
             raise answer.error
         return answer.value

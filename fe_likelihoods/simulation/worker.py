@@ -35,7 +35,7 @@ from .faults import RunFailed, TransientReason, is_transient
 from .folder import discard, working_folder
 from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
-__all__ = ["Answer", "IdleWorkers", "Worker", "describe_exit", "last_lines", "serve"]
+__all__ = ["Answer", "LoadingFailed", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -45,6 +45,10 @@ _WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for anoth
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.2  # [s] between checks that the process lives and of its output, while waiting for its answer
+
+
+class LoadingFailed(RunFailed):
+    """A worker process that died, or took too long, before it was given an item."""
 
 
 def _renew_starter() -> None:
@@ -103,20 +107,25 @@ class Worker:
         """Whether the process runs and is a child of this process (not of the one this was forked from)."""
         return self._owner == os.getpid() and not _ended(self._process)
 
-    def load(self, function: Pickled, seconds: float = math.inf) -> None:
-        """Send the function to call, unless it is loaded, and wait until it is.
+    def load(self, function: Pickled, seconds: float) -> "Answer | None":
+        """Send the function to call, unless it is loaded; an answer with an exception if it cannot be loaded.
 
-        RunFailed if the process dies or does not answer within `seconds`; ValueError if it cannot load the function.
+        LoadingFailed if the process dies or does not answer within `seconds`.
         """
         self._key = function.key
-        if function.key not in self.keys:
-            slow = TransientReason(f"the worker process did not start within {seconds:g} s")
+        if function.key in self.keys:
+            return None
+        slow = TransientReason(f"the worker process did not start within {seconds:g} s")
+        try:
             answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow)
-            if answer.error is not None:
-                raise answer.error
-            self.keys.keep(function.key, True, len(function.payload))
+        except RunFailed as error:
+            raise LoadingFailed(error.reason) from None
+        if answer.error is not None:
+            return answer
+        self.keys.keep(function.key, True, len(function.payload))
+        return None
 
-    def call(self, item: Any, seconds: float = math.inf) -> "Answer":
+    def call(self, item: Any, seconds: float) -> "Answer":
         """The answer of the function that was loaded last, for an item.
 
         RunFailed if the process dies, prints too much or does not answer within `seconds`, without the time in which
@@ -141,9 +150,6 @@ class Worker:
         except RunFailed as error:
             seconds = time.monotonic() - start
             raise RunFailed(error.reason.with_text(error.reason + self.kill(error.reason)), seconds) from None
-        except BaseException:
-            self.kill()
-            raise
 
     def _receive(self, stop: float, slow: TransientReason) -> "Answer":
         waits = False
@@ -187,29 +193,55 @@ class Answer(NamedTuple):
     error: BaseException | None
 
 
-class IdleWorkers:
-    """Processes that are kept for later calls; new ones have the `options` of a `Worker`."""
+class Workers:
+    """Processes that are kept for later calls; new ones have the `options` of a `Worker`.
 
-    def __init__(self, **options: Any) -> None:
-        self._options, self._workers, self._lock = options, [], threading.Lock()
+    A process that does not load a function within `start_limit` [s] is killed, and replaced after `most_calls`.
+    """
 
-    def take(self, key: bytes) -> Worker:
+    def __init__(self, start_limit: float = math.inf, most_calls: float = math.inf, **options: Any) -> None:
+        self._start_limit, self._most_calls, self._options = start_limit, most_calls, options
+        self._idle: list[Worker] = []
+        self._lock = threading.Lock()
+
+    def run(
+        self,
+        function: Pickled,
+        item: Any,
+        seconds: float = math.inf,
+        watch: Callable[[Worker | None], None] = lambda worker: None,
+    ) -> Answer:
+        """Answer of a function for an item, or of a process that cannot load it; RunFailed without an answer.
+
+        `watch` is called with the process, and with None when it is idle again.
+        """
+        worker = self._take(function.key)
+        try:
+            watch(worker)
+            answer = worker.load(function, self._start_limit) or worker.call(item, seconds)
+            watch(None)
+        except BaseException:
+            worker.kill()
+            raise
+        if worker.calls < self._most_calls:
+            self._idle.append(worker)
+        else:
+            worker.kill()
+        return answer
+
+    def _take(self, key: bytes) -> Worker:
         """A process, preferably one that has loaded the function with a key."""
         with self._lock:
-            self._workers.sort(key=lambda worker: key in worker.keys)
-            while self._workers:
-                if (worker := self._workers.pop()).alive:
+            self._idle.sort(key=lambda worker: key in worker.keys)
+            while self._idle:
+                if (worker := self._idle.pop()).alive:
                     return worker
         return Worker(**self._options)
 
-    def give_back(self, worker: Worker) -> None:
-        """Keep a process that has answered."""
-        self._workers.append(worker)
-
     def close(self) -> None:
-        """End the processes."""
-        while self._workers:
-            self._workers.pop().kill()
+        """End the idle processes."""
+        while self._idle:
+            self._idle.pop().kill()
 
 
 def _ended(process: subprocess.Popen) -> bool:
