@@ -223,10 +223,11 @@ class Workers:
         except BaseException:
             worker.kill()
             raise
-        if worker.calls < self._most_calls:
-            self._idle.append(worker)
-        else:
+        if worker.calls >= self._most_calls:
             worker.kill()
+            return answer
+        with self._lock:
+            self._idle.append(worker)
         return answer
 
     def _take(self, key: bytes) -> Worker:
