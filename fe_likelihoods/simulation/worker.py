@@ -201,8 +201,7 @@ class Workers:
 
     def __init__(self, start_limit: float = math.inf, most_calls: float = math.inf, **options: Any) -> None:
         self._start_limit, self._most_calls, self._options = start_limit, most_calls, options
-        self._idle: list[Worker] = []
-        self._lock = threading.Lock()
+        self._idle: list[Worker] = []  # without a lock, which a forked process could find locked
 
     def run(
         self,
@@ -223,19 +222,18 @@ class Workers:
         except BaseException:
             worker.kill()
             raise
-        if worker.calls >= self._most_calls:
-            worker.kill()
-            return answer
-        with self._lock:
+        if worker.calls < self._most_calls:
             self._idle.append(worker)
+        else:
+            worker.kill()
         return answer
 
     def _take(self, key: bytes) -> Worker:
         """A process, preferably one that has loaded the function with a key."""
-        with self._lock:
-            self._idle.sort(key=lambda worker: key in worker.keys)
-            while self._idle:
-                if (worker := self._idle.pop()).alive:
+        for worker in sorted(self._idle.copy(), key=lambda worker: key not in worker.keys):
+            with suppress(ValueError):  # another thread has taken it
+                self._idle.remove(worker)
+                if worker.alive:
                     return worker
         return Worker(**self._options)
 
