@@ -6,14 +6,17 @@ notebook functions work. The worker imports this library, installed packages and
 
 * A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
   the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* If a value of a module cannot be sent, such as an open file, the other values are sent; a simulation that uses the
-  missing value ends the run. A lock becomes a new lock.
+* If a value in a module or class cannot be sent, such as an open file, the other values are sent; a simulation that
+  uses the missing value ends the run. A lock becomes a new lock.
 * A worker refuses everything if its version of this library has different source code.
 """
 
+import builtins
+import contextlib
 import dis
 import functools
 import importlib.machinery
+import importlib.util
 import io
 import os
 import pickle
@@ -22,11 +25,11 @@ import sys
 import threading
 import types
 from collections import OrderedDict
+from collections.abc import Mapping
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import cloudpickle
-import numpy as np
 
 from samplers.interrupts import become_worker
 
@@ -46,8 +49,10 @@ __all__ = [
 ]
 
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
 _CACHED = type(functools.cache(len))
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
+_OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
 _lock = threading.RLock()
 _arriving: dict[str, types.ModuleType] | None = None  # modules of the function that is being loaded
@@ -136,8 +141,7 @@ class Pickled(NamedTuple):
                 _arriving = {}
                 become_worker()
             try:
-                _, function = pickle.loads(memoryview(self.payload)[32:])
-                return Arrived(function, _arriving or {})
+                return Arrived(pickle.loads(memoryview(self.payload)[32:]), _arriving or {})
             except ChangedModel:
                 raise
             except Exception as error:
@@ -173,106 +177,63 @@ class Arrived:
 def dumps(thing: Any) -> bytes:
     """Pickle an object, with user code and its values by value."""
     with _lock:
-        finder = _Pickler(io.BytesIO())
+        pickler = _Pickler(file := io.BytesIO())
         try:
-            finder.dump(thing)
-            pickler = _Pickler(file := io.BytesIO(), finder.find())
-            pickler.dump((list(finder.modules.values()), thing))
+            pickler.dump(thing)
         finally:
-            for module in finder.registered:
+            for module in pickler.registered:
                 cloudpickle.unregister_pickle_by_value(module)
         return file.getvalue()
 
 
+class _Trial(cloudpickle.Pickler):
+    """Pickler that leaves out functions, classes and modules; fails for objects that cannot be sent."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, _CACHED | functools.cached_property):
+            return abs, (), getattr(obj, "__wrapped__", None) or obj.func
+        if not isinstance(obj, types.FunctionType | type | types.ModuleType | types.CodeType):
+            return NotImplemented
+        if not isinstance(obj, types.FunctionType) or not (obj.__module__ is None or is_of_user(obj.__module__)):
+            return abs, (0,)
+        values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
+        return abs, (0,), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
+
+
 class _Pickler(cloudpickle.Pickler):
-    """Pickler whose functions keep their module: all functions of a module share one namespace with its values.
+    """Pickler whose functions keep their module: all functions of a module share one namespace with its values."""
 
-    `contents` has the values of the modules that are sent, by name. Without it, modules are pickled without values, to
-    find these modules and values: a module can refer to any other one.
-    """
-
-    def __init__(self, file: io.BytesIO, contents: dict[str, dict[str, Any]] | None = None) -> None:
+    def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        self.contents = contents
-        self.modules: dict[str, types.ModuleType] = {}  # that are sent
         self.registered: list[types.ModuleType] = []
-        self._used: dict[str, dict[str, Any]] = {}  # globals of functions, by module
-        self._known: dict[Any, types.ModuleType | None] = {}
+        self._namespaces: dict[str, _Namespace] = {}
+        self._of_user: dict[Any, types.ModuleType | None] = {}
 
     def _module(self, name: Any) -> types.ModuleType | None:
         """The module with a name if it is sent; None if the worker imports it."""
-        if name not in self._known:
+        if name not in self._of_user:
             module = sys.modules.get(name) if isinstance(name, str) else None
             is_sent = is_of_user(module) and module.__name__ == name
-            if not is_sent or str(vars(module).get("__file__")).endswith(_COMPILED):
-                module = None
-            self._known[name] = module
-            if module is not None:
-                self.modules[name] = module
-                self._module(name.rpartition(".")[0])
+            self._of_user[name] = (
+                module if is_sent and not str(vars(module).get("__file__")).endswith(_COMPILED) else None
+            )
+            if self._of_user[name] is not None:
                 if name not in cloudpickle.list_registry_pickle_by_value():
                     cloudpickle.register_pickle_by_value(module)
                     self.registered.append(module)
-        return self._known[name]
-
-    def find(self) -> dict[str, dict[str, Any]]:
-        """Values of all modules that are sent; in place of a value that cannot be sent, a `NotSent`."""
-        found: dict[str, dict[str, Any]] = {}
-        while True:
-            new = [
-                (name, key, value)
-                for name, module in list(self.modules.items())
-                for key, value in self._values(name, module).items()
-                if key not in found.setdefault(name, {})
-            ]
-            if not new:
-                return found
-            for name, key, value in new:
-                found[name][key] = self._sendable(key, value)
-
-    def _values(self, name: str, module: types.ModuleType) -> dict[str, Any]:
-        """Values of a module: all of them, but no modules of a package; those that functions use of a script."""
-        values = vars(module).copy()  # other threads may change it
-        if name in SCRIPTS:
-            return {key: values[key] for key in ("__file__", "__package__") if key in values} | self._used.get(name, {})
-        return {
-            key: value
-            for key, value in values.items()
-            if key not in _OF_THE_IMPORT and not is_of_user(sys.modules.get(f"{name}.{key}"))
-        }
-
-    def _sendable(self, key: str, value: Any) -> Any:
-        """A value, or its replacement if it cannot be sent."""
-        if isinstance(value, _LOCKS):
-            return _Lock(value)
-        try:
-            self.dump(value)
-            _refuse_a_name(value)
-        except Exception as error:
-            self.clear_memo()  # of parts of this value
-            return NotSent(key, f"{type(error).__name__}: {without_addresses(str(error))}")
-        return value
+        return self._of_user[name]
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, types.FunctionType):
             return self._function(obj)
         if isinstance(obj, types.ModuleType):
-            if self._module(obj.__name__) is not obj:
-                return NotImplemented
-            contents = None if self.contents is None else self.contents[obj.__name__]
-            parent = self._module(obj.__name__.rpartition(".")[0])
-            return _new_module, (obj.__name__,), (parent, contents), None, None, _fill_module
+            return self._reduce_module(obj) if self._module(obj.__name__) is obj else NotImplemented
         if isinstance(obj, _CACHED) and self._module(obj.__module__) is not None:  # pickled by its name otherwise
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
         if isinstance(obj, functools.cached_property):  # with a lock in Python 3.11
             return functools.cached_property, (obj.func,), {"attrname": obj.attrname}
-        if isinstance(obj, type):
-            return self._class(obj)
-        if self.contents is None and _is_array(obj):
-            return abs, (0,)
-        return NotImplemented
-
-    def _class(self, obj: type) -> Any:
+        if not isinstance(obj, type):
+            return NotImplemented
         self._module(obj.__module__)
         reduced = super().reducer_override(obj)
         if reduced is NotImplemented or len(reduced) != 6:
@@ -280,46 +241,117 @@ class _Pickler(cloudpickle.Pickler):
         # a new class for each function, since the methods of an earlier class may refer to earlier values
         make, (*arguments, _, extra), (state, slots), *tail = reduced
         members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
-        state = {name: value for name, value in state.items() if not isinstance(value, members)}
-        state |= {name: _Lock(value) for name, value in state.items() if isinstance(value, _LOCKS)}
+        state = {name: self._sendable(name, each) for name, each in state.items() if not isinstance(each, members)}
         return make, (*arguments, None, extra), (state, slots), *tail
+
+    def _reduce_module(self, module: types.ModuleType) -> tuple:
+        name, values = module.__name__, vars(module)
+        present = values.copy()  # other threads may change it
+        if name in SCRIPTS:
+            present = {key: present[key] for key in ("__file__", "__package__") if key in present}
+        else:
+            # modules of a package are sent where a function names them
+            present = {key: value for key, value in present.items() if self._module(f"{name}.{key}") is None}
+        parent = self._module(name.rpartition(".")[0])
+        sent = {key: self._sendable(key, value) for key, value in present.items() if key not in _OF_THE_IMPORT}
+        return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; a user function gets the namespace of its module."""
-        self._module(function.__module__)
-        module = self._module(function.__globals__.get("__name__"))
-        reduced = super().reducer_override(function)
-        if module is None or reduced is NotImplemented or vars(module) is not function.__globals__:
-            return reduced
-        make, (code, _, *arguments), (attributes, slots), *tail = reduced
-        used = slots["__globals__"]
-        if self.contents is None:
-            self._used.setdefault(module.__name__, {}).update(used)
-            package = (vars(module).get("__package__") or "").split(".")
-            places = ["", *(".".join([*package[: k + 1], ""]) for k in range(len(package)))]
-            for name in [each.__name__ for each in used.values() if isinstance(each, types.ModuleType)]:
-                self._module(name)
-            for name in [f"{place}{name}" for place in places for name in _imported(code)]:
-                self._module(name)
-            values = _Globals({})
+        module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
+        if module is None or vars(module) is not function.__globals__:
+            self._module(function.__module__)
+            return super().reducer_override(function)
+        namespace = self._namespaces.setdefault(module.__name__, _Namespace(module))
+        used = {}
+        if module.__name__ in SCRIPTS:
+            used = {name: _new_lock(value) for name, value in vars(module).copy().items() if name in names.all}
+        imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
+        state = (
+            used,
+            [*filter(None, map(self._module, imported)), *_named_modules(vars(module), names.all)],
+            {name: getattr(function, name) for name in _OF_A_FUNCTION},
+            [cell for cell in function.__closure__ or ()],
+            vars(function),
+        )
+        code = function.__code__
+        return _new_function, (code, namespace, len(code.co_freevars)), state, None, None, _fill_function
+
+    def _sendable(self, name: str, value: Any) -> Any:
+        """A value in a module or class, or its replacement if it cannot be pickled."""
+        if isinstance(value, types.FunctionType):
+            plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
         else:
-            contents = self.contents[module.__name__]
-            values = _Globals({name: contents[name] for name in used if name in contents})
-        state = attributes, slots | {"__globals__": values}
-        return make, (code, _Namespace(module), *arguments), state, *tail
+            plain = isinstance(value, _PLAIN) or not getattr(getattr(value, "dtype", None), "hasobject", True)
+        if plain or isinstance(value, _LOCKS):
+            return _new_lock(value)
+        try:
+            _Trial(io.BytesIO(), protocol=5).dump(value)
+            _refuse_a_name(value)
+        except Exception as error:
+            return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
+        return value
+
+
+class _Names(NamedTuple):
+    """Names in the code of a function and of the functions inside it."""
+
+    all: frozenset[str]
+    imported: frozenset[str]  # modules (with a dot per level of a relative import) and names imported from them
 
 
 @functools.lru_cache(maxsize=4096)
-def _imported(code: types.CodeType) -> frozenset[str]:
-    """Names of modules that code imports while it runs, without the package where the import is relative."""
-    found, module = set(), ""
+def _names_in(code: types.CodeType) -> _Names:
+    imported: set[str] = set()
+    before: list[Any] = [0, None]
     for step in dis.get_instructions(code):
         if step.opname == "IMPORT_NAME":
-            found.add(module := step.argval)
-        elif step.opname == "IMPORT_FROM":
-            found.add(f"{module}.{step.argval}".lstrip("."))
-    inner = [_imported(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return frozenset(found).union(*inner)
+            level, items = before[-2:]
+            module = "." * level + step.argval
+            imported |= {module, *(f"{module}{'.' if step.argval else ''}{item}" for item in items or ())}
+        before.append(step.argval)
+    inner = [_names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return _Names(
+        frozenset(code.co_names).union(*(names.all for names in inner)),
+        frozenset(imported).union(*(names.imported for names in inner)),
+    )
+
+
+def _resolved(imported: frozenset[str], package: str) -> set[str]:
+    """Full names of modules."""
+    found = set()
+    for name in imported:
+        with contextlib.suppress(ImportError):
+            found.add(importlib.util.resolve_name(name, package))
+    return found
+
+
+def _named_modules(values: Mapping[str, Any], names: frozenset[str]) -> list[types.ModuleType]:
+    """Modules that code names, also as ``package.module``; a worker must import them too."""
+    found = []
+    for module in [values[name] for name in sorted(names & values.keys())]:
+        if isinstance(module, types.ModuleType):
+            inner = {name: sys.modules.get(f"{module.__name__}.{name}") for name in names & vars(module).keys()}
+            found += [module, *(_named_modules(inner, names) if hasattr(module, "__path__") else ())]
+    return found
+
+
+def _new_function(code: types.CodeType, namespace: dict[str, Any], n_cells: int) -> types.FunctionType:
+    namespace.setdefault("__builtins__", builtins)
+    cells = tuple(types.CellType() for _ in range(n_cells)) or None  # as a function that was not sent
+    return types.FunctionType(code, namespace, None, None, cells)
+
+
+def _fill_function(function: types.FunctionType, state: tuple) -> None:
+    used, _, attributes, cells, others = state
+    if _arriving is not None:
+        function.__globals__.update(used)
+    for name, value in attributes.items():
+        setattr(function, name, value)
+    for cell, sent in zip(function.__closure__ or (), cells, strict=True):
+        with contextlib.suppress(ValueError):  # an empty cell
+            cell.cell_contents = sent.cell_contents
+    vars(function).update(others)
 
 
 class _Namespace:
@@ -332,20 +364,6 @@ class _Namespace:
         return vars, (self._module,)
 
 
-class _Globals:
-    """The globals that a function uses: it may run before its module is filled. Not in the process that sends them."""
-
-    def __init__(self, values: dict[str, Any]) -> None:
-        self._values = values
-
-    def __reduce__(self) -> tuple:
-        return _if_arriving, (self._values,)
-
-
-def _if_arriving(values: dict[str, Any]) -> dict[str, Any]:
-    return {} if _arriving is None else values
-
-
 def _new_module(name: str) -> types.ModuleType:
     if _arriving is None and name in sys.modules:  # at home
         return sys.modules[name]
@@ -355,7 +373,7 @@ def _new_module(name: str) -> types.ModuleType:
     return module
 
 
-def _fill_module(module: types.ModuleType, state: tuple[Any, dict[str, Any]]) -> None:
+def _fill_module(module: types.ModuleType, state: tuple[Any, Mapping[str, Any]]) -> None:
     if _arriving is not None:
         parent, values = state
         vars(module).update(values)
@@ -367,9 +385,13 @@ def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
     return functools.lru_cache(maxsize, typed)(function)
 
 
+def _new_lock(value: Any) -> Any:
+    return _Lock(isinstance(value, _LOCKS[1])) if isinstance(value, _LOCKS) else value
+
+
 def _refuse_a_name(value: Any) -> None:
     """Raise TypeError if an object is pickled as its name in a user module, as compiled functions are."""
-    if isinstance(value, types.FunctionType | types.ModuleType | type | _CACHED) or _is_array(value):
+    if isinstance(value, types.FunctionType | _CACHED):
         return
     reduce = cloudpickle.Pickler.dispatch_table.get(type(value), lambda value: value.__reduce_ex__(4))
     name = reduce(value)
@@ -377,19 +399,14 @@ def _refuse_a_name(value: Any) -> None:
         raise TypeError("it is known by its name only")
 
 
-def _is_array(value: Any) -> bool:
-    """Whether a value is an array of numbers, which refers to no code."""
-    return type(value) is np.ndarray and not value.dtype.hasobject
-
-
 class _Lock:
     """A lock, which becomes a new lock in the receiving process."""
 
-    def __init__(self, lock: Any) -> None:
-        self._make = threading.RLock if isinstance(lock, _LOCKS[1]) else threading.Lock
+    def __init__(self, reentrant: bool) -> None:
+        self._reentrant = reentrant
 
     def __reduce__(self) -> tuple:
-        return self._make, ()
+        return (threading.RLock if self._reentrant else threading.Lock), ()
 
 
 class NotSent:
