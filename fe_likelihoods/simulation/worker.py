@@ -115,8 +115,8 @@ class Worker:
         self._key = function.key
         if function.key in self.keys:
             return None
-        slow = TransientReason(f"the worker process did not start within {seconds:g} s")
         try:
+            slow = "the worker process did not start within {:g} s"
             answer = self._ask(_LOAD + pickle.dumps(function, protocol=5), seconds, slow)
         except RunFailed as error:
             raise LoadingFailed(error.reason) from None
@@ -137,21 +137,23 @@ class Worker:
             os.ftruncate(self._output.fileno(), 0)
             os.lseek(self._output.fileno(), 0, os.SEEK_SET)
         message = self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5)
-        slow = TransientReason(f"stopped at the time limit of {seconds:g} s", time_limit=seconds)
-        return self._ask(message, seconds, slow)
+        return self._ask(message, seconds, "stopped at the time limit of {:g} s")
 
-    def _ask(self, message: bytes, seconds: float, slow: TransientReason) -> "Answer":
+    def _ask(self, message: bytes, seconds: float, slow: str) -> "Answer":
         """Answer to a message; without one, the process is killed, and its simulation's folder may be kept."""
         start = time.monotonic()
         try:
             with suppress(OSError):  # `_receive` notices that the process has died
                 self._connection.send_bytes(message)
-            return self._receive(start + seconds, slow)
+            if (answer := self._receive(start + seconds)) is not None:
+                return answer
+            reason = TransientReason(slow.format(seconds), time_limit=seconds)
         except RunFailed as error:
-            seconds = time.monotonic() - start
-            raise RunFailed(error.reason.with_text(error.reason + self.kill(error.reason)), seconds) from None
+            reason = error.reason
+        raise RunFailed(reason.with_text(reason + self.kill(reason)), time.monotonic() - start)
 
-    def _receive(self, stop: float, slow: TransientReason) -> "Answer":
+    def _receive(self, stop: float) -> "Answer | None":
+        """The answer; None if there is none until the time `stop`."""
         waits = False
         try:
             while True:
@@ -169,7 +171,7 @@ class Worker:
                 if self._output is not None and os.fstat(self._output.fileno()).st_size > self._most:
                     raise RunFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
                 if time.monotonic() >= stop:
-                    raise RunFailed(slow)
+                    return None
         except (EOFError, OSError):
             give_up = time.monotonic() + 5.0
             while not _ended(self._process) and time.monotonic() < give_up:  # it may end by itself, with its exit code
