@@ -44,7 +44,8 @@ _BOOT = (
 _WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
-_CHECK = 0.2  # [s] between checks that the process lives and of its output, while waiting for its answer
+_CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
+_CHECK_OUTPUT = 0.1  # [s] the same for a process whose output is limited
 
 
 class LoadingFailed(RunFailed):
@@ -154,11 +155,11 @@ class Worker:
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
-        waits = False
+        waits, pause = False, _CHECK if self._output is None else _CHECK_OUTPUT
         try:
             while True:
                 before = time.monotonic()
-                is_ready = self._poll(1000.0 * max(0.0, min(_CHECK, stop - before)))
+                is_ready = self._poll(1000.0 * max(0.0, min(pause, stop - before)))
                 stop += time.monotonic() - before if waits else 0.0
                 if is_ready:
                     message = self._connection.recv_bytes()
