@@ -214,7 +214,7 @@ class _Workers:
     """
 
     def __init__(self) -> None:
-        self._seen: dict[Any, float] = {}  # when a worker or a job that has started was last present
+        self._seen: dict[Any, float] = {}  # when workers and jobs that have started were last present, or are due
 
     def start_lost(self, cluster: Any) -> None:
         """Note which workers and jobs are present, and start those again that the cluster has lost."""
@@ -227,12 +227,13 @@ class _Workers:
         self._seen |= {name: now for name in here & wanted.keys()}
         absent = self._seen.keys() - here
         ended = {n for n in absent & jobs.keys() & known if now - self._seen[n] > SECONDS_TO_RETURN}
-        lost = ended | (absent - jobs.keys())
+        lost = ended | {n for n in absent - jobs.keys() if now >= self._seen[n]}
         if lost:
             what = f"{len(lost)} of its {len(wanted)} {'jobs' if ended else 'workers'}"
             logger.warning("The dask cluster has given up %s: starting them again", what)
-            for name in lost:
-                del self._seen[name]
+            for name in lost & jobs.keys():
+                del self._seen[name]  # the new job may be in the queue for long
+            self._seen |= {name: now + SECONDS_TO_RETURN for name in lost - jobs.keys()}
             if ended:
                 cluster.sync(cluster.scale_down, ended)
             cluster.scale(sum(len(spec.get("group", " ")) for spec in wanted.values()))

@@ -222,6 +222,19 @@ def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypa
     assert client.asked == [2]  # once
 
 
+@pytest.mark.parametrize(("seconds", "asked"), [(0.0, [2, 2]), (60.0, [2])])
+def test_a_worker_that_dies_before_it_was_seen_again_is_started_once_more(seconds, asked, monkeypatch):
+    monkeypatch.setattr(dask_executor, "SECONDS_TO_RETURN", seconds)
+    cluster = Cluster(restarts=False)
+    cluster.workers = dict.fromkeys(cluster.worker_spec)
+    workers = dask_executor._Workers()
+    workers.start_lost(cluster)
+    cluster.workers = {}
+    for _ in range(2):
+        workers.start_lost(cluster)
+    assert cluster.asked == asked
+
+
 @pytest.mark.slow
 @needs("dask")
 @needs("distributed")
