@@ -147,7 +147,7 @@ def test_reason_and_duration_in_process_and_isolated(name, guarded):
 def test_a_killed_process_is_a_failure_and_the_next_run_succeeds(name, guarded):
     reason, seconds = failure(guarded, getattr(bad, name))
     assert reason.startswith(DEADLY[name])
-    assert (seconds >= 1.0) == name.startswith("HANGS")
+    assert seconds >= 1.0 or not name.startswith("HANGS")
     np.testing.assert_array_equal(guarded.simulate(THETA), line(THETA))
 
 
