@@ -79,7 +79,7 @@ class CheckedModel:
     @property
     def compared(self) -> int:
         """Number of earlier simulations that were compared with a new one."""
-        return self._repeated + (0 if self.rows is None else self.rows.again.compared)
+        return self._repeated + (0 if self.rows is None else self.rows.compared)
 
     def complete(self, opened: Opened | None) -> None:
         """Add the files that simulations opened to the model's label."""
