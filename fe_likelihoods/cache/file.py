@@ -39,21 +39,10 @@ ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
 RETRY_SECONDS = 60.0  # wait after a failed access to the file
 # results of SQLite whose cause is outside of the file: locks, rights, the disk, memory, wrong use
-OUTSIDE = (
-    0,
-    sqlite3.SQLITE_PERM,
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_NOMEM,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_INTERRUPT,
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_PROTOCOL,
-    sqlite3.SQLITE_AUTH,
-    sqlite3.SQLITE_NOLFS,
-)
+OUTSIDE = {
+    getattr(sqlite3, f"SQLITE_{name}")
+    for name in "OK PERM BUSY LOCKED NOMEM READONLY INTERRUPT IOERR FULL CANTOPEN PROTOCOL AUTH NOLFS".split()
+}
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
 _lock = threading.RLock()  # held while a file is used, and while this process forks
@@ -145,42 +134,36 @@ class CacheFile:
         with _lock:
             if time.monotonic() < self.retry_times.get(what, -math.inf):
                 return otherwise
-            for is_last in (False, True):
+            try:
                 try:
                     result = action(self.connection())
-                    self.retry_times.pop(what, None)
-                    return result
-                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
-                    self.close()  # also ends a transaction
-                    failure = error
-                except BaseException:
+                except (sqlite3.Error, UnicodeDecodeError) as error:
                     self.close()
-                    raise
-                if is_last or not self.writable or not isinstance(failure, sqlite3.Error | UnicodeDecodeError):
-                    break
-                if not _is_damage(failure):
-                    break
-                try:
-                    self.set_aside(str(failure))
-                except (OSError, ValueError) as error:
-                    failure = error
-                    break
-            if what not in self.retry_times:
-                text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
-                logger.warning(text, self.path, what, failure, RETRY_SECONDS)
-            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
-            return otherwise
+                    if not self.writable or not _is_damage(error):
+                        raise
+                    self.set_aside(str(error))
+                    result = action(self.connection())
+            except BaseException as failure:
+                self.close()  # also ends a transaction
+                if not isinstance(failure, sqlite3.Error | OSError | ValueError | MemoryError):
+                    raise  # a damaged size may need too much memory
+                if what not in self.retry_times:
+                    text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
+                    logger.warning(text, self.path, what, failure, RETRY_SECONDS)
+                self.retry_times[what] = time.monotonic() + RETRY_SECONDS
+                return otherwise
+            self.retry_times.pop(what, None)
+            return result
 
     def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
         """Result of an action that the user has called explicitly; OSError if the file cannot be used."""
         with _lock:
             try:
                 return action(self.connection())
-            except (sqlite3.Error, ValueError) as error:
+            except BaseException as error:
                 self.close()
-                raise OSError(f"{self.path} cannot be used: {error}") from error
-            except BaseException:
-                self.close()
+                if isinstance(error, sqlite3.Error | ValueError):
+                    raise OSError(f"{self.path} cannot be used: {error}") from error
                 raise
 
     def select(self, query: str, values: tuple = ()) -> list[tuple]:
@@ -308,12 +291,12 @@ class CacheFile:
             connection = self._connect(options)
             try:
                 self._identify(connection)
-                return connection
+                break
             except BaseException as error:
                 connection.close()
                 if not isinstance(error, sqlite3.OperationalError) or "immutable" in options:
                     raise
-        raise AssertionError
+        return connection
 
     def _connect(self, options: str) -> sqlite3.Connection:
         uri = f"{self.path.as_uri()}?{options}"
