@@ -10,7 +10,7 @@ import hashlib
 import sqlite3
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +23,10 @@ __all__ = [
     "MIN_STOPS",
     "STORE",
     "CachedRows",
+    "Place",
     "Row",
     "is_undamaged",
-    "pack_row",
+    "pack_rows",
     "reason_of",
     "select_rows",
     "simulation_keys",
@@ -78,6 +79,14 @@ class Row(NamedTuple):
     size: int | None
 
 
+class Place(NamedTuple):
+    """Where rows belong: their generation, and the numbers of the processor and of the process that stores them."""
+
+    generation: int
+    cpu: int = 0
+    session: int = 0
+
+
 class CachedRows(NamedTuple):
     """Stored rows for n simulations of `width` numbers each; None where nothing is stored."""
 
@@ -122,33 +131,34 @@ def source_number(fingerprint: str) -> int:
     return int.from_bytes(hashlib.blake2b(fingerprint.encode(), digest_size=8).digest(), signed=True)
 
 
-def pack_row(
-    key: bytes,
-    source: int,
-    generation: int,
-    theta: np.ndarray,
-    value: np.ndarray,
-    reason: str,
+def pack_rows(
+    fingerprint: str,
+    thetas: np.ndarray,
+    values: np.ndarray,
+    reasons: Sequence[str],
     seconds: float,
-    cpu: int,
-    session: int,
-    of_model: bool,
-) -> Row | None:
-    """A simulation as it is stored; None if its failure has a cause that may be gone.
+    place: Place,
+    of_model: bool = False,
+) -> list[Row]:
+    """Simulations as they are stored: statistics, or responses `of_model`; `seconds` is the wall time of all [s].
 
-    Faults of the infrastructure are not stored, except time limits in the rows of a model; nor is, in these rows, a
-    failure that depends on the measurements.
+    Failures whose cause may be gone are left out: faults of the infrastructure, except time limits in the rows of a
+    model, and in these rows failures that depend on the measurements.
     """
-    limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
-    if isinstance(reason, MisfitReason) if of_model else isinstance(reason, TransientReason):
-        return None
-    if isinstance(reason, TransientReason) and not limit:
-        return None
-    data = b"" if reason else np.asarray(value, dtype="<f8").tobytes()
-    text = reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
-    parameters = np.asarray(theta, dtype="<f8").tobytes()
-    values = key, source, generation, parameters, data, text, limit, float(seconds), cpu, session
-    return Row(*values, _checksum(*values), len(data) if of_model else None)
+    source, rows = source_number(fingerprint), []
+    keys = simulation_keys(fingerprint, thetas, place.generation)
+    for key, theta, value, reason in zip(keys, thetas, values, reasons, strict=True):
+        limit = reason.time_limit if isinstance(reason, TransientReason) else 0.0
+        if isinstance(reason, MisfitReason if of_model else TransientReason):
+            continue
+        if isinstance(reason, TransientReason) and not limit:
+            continue
+        data = b"" if reason else np.asarray(value, dtype="<f8").tobytes()
+        text = reason[:MAX_REASON_LENGTH].encode("utf-8", "backslashreplace")
+        parameters = np.asarray(theta, dtype="<f8").tobytes()
+        packed = key, source, place.generation, parameters, data, text, limit, seconds / len(keys), *place[1:]
+        rows.append(Row(*packed, _checksum(*packed), len(data) if of_model else None))
+    return rows
 
 
 def _checksum(key, source, generation, theta, value, reason, time_limit, seconds, cpu, session) -> int:  # noqa: ANN001

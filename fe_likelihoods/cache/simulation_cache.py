@@ -35,9 +35,10 @@ from .rows import (
     MIN_STOPS,
     STORE,
     CachedRows,
+    Place,
     Row,
     is_undamaged,
-    pack_row,
+    pack_rows,
     reason_of,
     select_rows,
     simulation_keys,
@@ -247,50 +248,11 @@ class SimulationCache:
         reasons: Sequence[str],
         seconds: float,
         generation: int | None = None,
-        cpu: int = 0,
-        session: int = 0,
         of_model: bool = False,
     ) -> None:
-        """Store simulations and evict the oldest, in one transaction.
-
-        Parameters
-        ----------
-        fingerprint, thetas, generation
-            See the notes of the class.
-        values : (n, width) float
-            Sums of squared residuals [SI unit of the channel, squared] or other statistics; responses [SI] if
-            `of_model`.
-        reasons : sequence of n str
-            Reasons of failures; empty where the simulation succeeded. Some are not stored, see `pack_row`.
-        seconds : float
-            Wall time of all simulations together [s].
-        cpu, session : int
-            Numbers of the processor and of the process, see `fe_likelihoods.cache.labels.Trust`.
-        of_model : bool
-            Whether these are rows of a model, for any measurements.
-        """
-        self.write(self.pack(fingerprint, thetas, values, reasons, seconds, generation, cpu, session, of_model))
-
-    def pack(
-        self,
-        fingerprint: str,
-        thetas: np.ndarray,
-        values: np.ndarray,
-        reasons: Sequence[str],
-        seconds: float,
-        generation: int | None,
-        cpu: int,
-        session: int,
-        of_model: bool,
-    ) -> list[Row]:
-        """Rows for `write`, from the arguments of `store`."""
-        generation = self._given_or_latest(fingerprint, generation)
-        keys, source = simulation_keys(fingerprint, thetas, generation), source_number(fingerprint)
-        rows = [
-            pack_row(key, source, generation, theta, value, reason, seconds / len(keys), cpu, session, of_model)
-            for key, theta, value, reason in zip(keys, thetas, values, reasons, strict=True)
-        ]
-        return [row for row in rows if row is not None]
+        """Store simulations and evict the oldest, in one transaction, see `pack_rows`."""
+        place = Place(self._given_or_latest(fingerprint, generation))
+        self.write(pack_rows(fingerprint, thetas, values, reasons, seconds, place, of_model))
 
     def write(self, rows: list[Row]) -> None:
         """Store rows, and those that wait, and evict the oldest, in one transaction."""

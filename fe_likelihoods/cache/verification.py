@@ -40,7 +40,7 @@ from .comparison import (
     simulate_again,
 )
 from .labels import Trust, labels_of, shared_trust
-from .rows import CachedRows, Row, reason_of, source_number
+from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
 from .simulation_cache import SimulationCache, rows_to_compare
 
 __all__ = ["StaleCache", "VerifiedCache", "choose_rows"]
@@ -154,16 +154,16 @@ class VerifiedCache:
                     return
                 trust.begin(self.cache.file, run.model, set())
                 stored = trust.find(self.cache.file, run.model)
-            place = stored.generation, trust.cpu, trust.session
+            place = Place(stored.generation, trust.cpu, trust.session)
         rows = []
         if misfit is not None:
-            rows += self.cache.pack(fingerprint, thetas, misfit, reasons, seconds, *place, of_model=False)
+            rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
         if simulated and (responses is not None or any(reasons)):
             finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
             values = np.zeros((len(thetas), 0)) if responses is None else responses
             chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
             why = ["" if finite[row] else reasons[row] for row in chosen]
-            rows += self.cache.pack(run.model.fingerprint, thetas[chosen], values[chosen], why, 0.0, *place, True)
+            rows += pack_rows(run.model.fingerprint, thetas[chosen], values[chosen], why, 0.0, place, True)
         self.cache.write(rows)
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
