@@ -140,12 +140,8 @@ class VerifiedCache:
         responses: np.ndarray | None,
         seconds: float,
         run: VerifyingRun,
-        simulated: bool = True,
     ) -> None:
-        """Store simulations under the model's label: statistics and responses, if given, and failures of the model.
-
-        With `simulated` false, they are statistics of responses that are stored already.
-        """
+        """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust = self._trust
         with trust.lock:
             stored = trust.find(self.cache.file, run.model)
@@ -158,7 +154,7 @@ class VerifiedCache:
         rows = []
         if misfit is not None:
             rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
-        if simulated and (responses is not None or any(reasons)):
+        if responses is not None or any(reasons):
             finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
             values = np.zeros((len(thetas), 0)) if responses is None else responses
             chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]

@@ -143,8 +143,7 @@ class KnownSimulations:
                     requested.response[row] = np.nan
             self._note(requested, rows[new], run)
             if stored_rows is not None:
-                arguments = requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run
-                stored_rows.store(self._key, *arguments, simulated=False)
+                stored_rows.store(self._key, requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run)
         requested.cached[rows] = True
 
     def _note(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:

@@ -105,11 +105,6 @@ class ModelLabel:
         return _joined(items or {"kernels": KERNEL_HASH})
 
     @property
-    def text(self) -> str:
-        """The whole label: `code`, and a digest of the opened files."""
-        return f"{self.code} {_joined(self.opened.items())}"
-
-    @property
     def known(self) -> Opened | None:
         """What simulations of this process opened; None before the first simulation."""
         return self.opened if self._was_observed else None

@@ -340,7 +340,7 @@ def test_values_and_code_are_compared_by_value():
     known = ModelLabel(thing)
     thing.calls = 3
     assert known.changed(thing) == {"Counted().calls"}
-    assert pickle.loads(pickle.dumps(known)).text == known.text
+    assert pickle.loads(pickle.dumps(known)).code == known.code
 
 
 def test_files_that_a_simulation_writes_do_not_count(tmp_path):
