@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..noise.statistics import Statistic, needs_response
-from ..signals.comparison import Comparison, measured_values
+from ..signals.comparison import Comparison
 from ..simulation.faults import TransientReason
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
@@ -39,11 +39,6 @@ class VerifyingRun(NamedTuple):
     statistic: Statistic | None  # that is stored; None: sums of squares
     n_numbers: int  # length of the statistic
     tolerance: float | None = None  # as for `SimulationCache`
-
-    @property
-    def n_steps(self) -> int:
-        """Number of measured samples."""
-        return measured_values(self.measured).shape[1]
 
 
 class Simulated(NamedTuple):

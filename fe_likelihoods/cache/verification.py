@@ -19,7 +19,6 @@ Likelihoods of one model and file share their verified and stored rows (`fe_like
 """
 
 import logging
-import random
 import time
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -107,7 +106,7 @@ class VerifiedCache:
         self.cache, self._trust = cache, trust
         self.compared, self.unverified, self.seconds = 0, 0, 0.0
         self._model: Any = None  # model of the last look-up in this process
-        self._random = random.Random()  # separate, so that the user's random number streams do not change
+        self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
     def __getstate__(self) -> tuple:
         return self.cache, self._trust
@@ -256,7 +255,7 @@ class VerifiedCache:
             logger.warning(text, cache.path, type(run.model).__name__, most)
         start = time.monotonic()
         for generation in present:
-            chosen = choose_rows(rows[generation], n - before, np.random.default_rng())
+            chosen = choose_rows(rows[generation], n - before, self._random)
             result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, fingerprint, run)
             if result.row is not None:
                 continue
@@ -322,7 +321,7 @@ class VerifiedCache:
         """The row that was stored last, and the others in random order, failures last."""
         if latest is not None:
             yield latest
-        shuffled = self._random.sample(rows, len(rows))
+        shuffled = [rows[place] for place in self._random.permutation(len(rows))]
         yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
     def _compare(self, rows: Iterable[Row], n: int, size: int, fingerprint: str, run: VerifyingRun) -> _Comparison:

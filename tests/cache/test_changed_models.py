@@ -145,6 +145,21 @@ def test_a_new_generation_begins_after_a_change(workshop, texts, caplog):
     np.testing.assert_array_equal(third.simulator.statistics(POINTS), first.simulator.statistics(POINTS))
 
 
+def test_a_hidden_change_of_an_adopted_model_begins_a_generation(workshop, monkeypatch, caplog):
+    model = MODEL.replace("import helper", "import helper, sys").replace(
+        "* TIME", "* TIME * getattr(sys, 'hidden', 1.0)"
+    )
+    workshop.write(model=model)
+    workshop.run()
+    workshop.write(model=model.replace("x = ", "strain = ").replace("law(x)", "law(strain)"))
+    assert workshop.run().simulations == 0
+    monkeypatch.setattr(sys, "hidden", 2.0, raising=False)
+    changed = workshop.run()
+    assert "differ from new ones" in caplog.text and changed.simulations == 300
+    np.testing.assert_array_equal(changed.simulator.statistics(POINTS), true_values(workshop))
+    assert workshop.run().simulations == 0
+
+
 OPENED = {
     "file": ("return t[0] * np.loadtxt('k.txt') * TIME", "k.txt", "2.5", "3.5"),
     "module": ("import late; return t[0] * late.k * TIME", "late.py", "k = 2.5", "k = 3.5 "),

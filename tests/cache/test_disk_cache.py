@@ -146,6 +146,18 @@ def test_a_batch_needs_two_queries_and_one_write(path, thetas):
     assert statements == []  # served by the cache in memory
 
 
+def test_statistics_responses_and_failures_are_written_in_one_transaction(path, thetas):
+    """Or a program that is killed in between would repeat simulations."""
+    likelihood = likelihood_of(Batched(), path)
+    likelihood.misfit(thetas[:1] + 1.0)
+    statements = []
+    likelihood.simulator.cache.file.connection().set_trace_callback(statements.append)
+    likelihood.simulator.chunk_size = 1000
+    likelihood.simulate(thetas)
+    kinds = [statement.split()[0] for statement in statements]
+    assert kinds.count("BEGIN") == kinds.count("COMMIT") == 1 and kinds.count("INSERT") == 600
+
+
 def test_a_stored_simulation_needs_the_fingerprint_of_its_model_once(path, monkeypatch):
     """It is a digest of the record: 0.1 ms for a record of 10 000 samples."""
     digest, digests = LinearOscillator.fingerprint.fget, []
