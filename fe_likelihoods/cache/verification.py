@@ -313,7 +313,8 @@ class VerifiedCache:
                 if not result.compared:
                     self._pause(start)
                     return True
-                trust.verified[kind] += result.compared
+                # rows that are due and that nobody has requested are not compared later
+                trust.verified[kind] = max(trust.verified[kind] + result.compared, served // ROWS_PER_VERIFICATION)
             trust.served[kind] = served
             return True
 
