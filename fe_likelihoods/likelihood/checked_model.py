@@ -94,13 +94,15 @@ class CheckedModel:
         `earlier` returns a known simulation, parameters and statistics, to repeat if this process has run none. Raises
         `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
         """
-        if not self._points and self.has_results:
-            self._points += earlier()
-        elif not self._points and (changed := self._changed(run.model)):
+        if not self._points and not self.has_results:
+            start, changed = time.monotonic(), self._changed(run.model)
             self._renew(changed)
             if not changed.keys() <= self.label.changing:  # nothing was used yet: the model is labelled as it is now
                 self._require_what_was_sent(run.model, changed)
                 self._set_up(run.model, run.statistic, None if self.rows is None else self.rows.cache, run.pool)
+            self._is_due, self._last_seconds = True, time.monotonic() - start
+            return
+        self._points = self._points or earlier()
         self._is_due = time.monotonic() >= self._not_before
         if self._is_due:
             self._require_same(run)
