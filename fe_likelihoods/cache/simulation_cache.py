@@ -268,29 +268,21 @@ class SimulationCache:
             self._waiting = [] if written else [row for row in rows if not row.size][-MAX_WAITING_ROWS:]
 
     def _insert(self, connection: sqlite3.Connection, rows: list[Row]) -> None:
-        responses = 0
+        responses, limit = 0, (self.max_response_bytes,)
         with transaction(connection):
             connection.executemany(STORE, rows)
             evict = "DELETE FROM rows WHERE id <= (SELECT max(id) FROM rows) - ?"
             self.evictions += connection.execute(evict, (self.max_rows,)).rowcount
-            if any(row.size for row in rows):
-                query = "SELECT total(size) - ? FROM rows WHERE size > 0"
-                ((excess,),) = connection.execute(query, (self.max_response_bytes,))
-                oldest = "SELECT id, size FROM rows WHERE size > 0 ORDER BY id"
-                for age, size in connection.execute(oldest).fetchall() if excess > 0 else ():
-                    if excess <= 0:
-                        break
-                    connection.execute("DELETE FROM rows WHERE id = ?", (age,))
-                    excess -= size
-                    responses += 1
+            too_many = "SELECT total(size) > ? FROM rows WHERE size > 0"
+            if any(row.size for row in rows) and connection.execute(too_many, limit).fetchone()[0]:
+                sums = "SELECT id, sum(size) OVER (ORDER BY id DESC) AS newest FROM rows WHERE size > 0"
+                evict = f"DELETE FROM rows WHERE id IN (SELECT id FROM ({sums}) WHERE newest > ?)"
+                responses = connection.execute(evict, limit).rowcount
         self.evictions += responses
         if responses and not self._said_evicted:
             self._said_evicted = True
-            logger.info(
-                "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)",
-                self.path,
-                self.max_response_bytes,
-            )
+            text = "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)"
+            logger.info(text, self.path, self.max_response_bytes)
 
     def are_stored(self, fingerprint: str, thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
         """Whether rows are stored (n,). They are not verified, not checked for damage, and not counted as hits."""
