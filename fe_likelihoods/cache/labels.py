@@ -13,7 +13,7 @@ import uuid
 import weakref
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -116,16 +116,17 @@ class Trust:
                 self._update(file)
             elif self.stored:  # another length of the record, for example
                 other = next(iter(self.stored.values()))
-                self.put(file, model, other.generation, other.compared)
+                self.put(file, {source}, other.generation, other.compared)
         return self.stored.get(source)
 
-    def put(self, file: CacheFile, model: Model, generation: int, compared: int) -> None:
-        """Add the label to a generation in the file, after `compared` of its rows were compared."""
-        source = source_number(model.fingerprint)
-        number = self.stored[source].id if source in self.stored else secrets.randbits(62)
-        files = self.label.opened.files
-        self.stored[source] = StoredLabel(number, source, self.label.code, files, generation, compared)
-        self._write(file, [self.stored[source]])
+    def put(self, file: CacheFile, sources: Iterable[int], generation: int, compared: int) -> None:
+        """Add the label of some models to a generation in the file, after `compared` of its rows were compared."""
+        code, files, labels = self.label.code, self.label.opened.files, []
+        for source in sources:
+            number = self.stored[source].id if source in self.stored else secrets.randbits(62)
+            self.stored[source] = StoredLabel(number, source, code, files, generation, compared)
+            labels.append(self.stored[source])
+        self._write(file, labels)
 
     def begin(self, file: CacheFile, model: Model, used: set[int]) -> None:
         """Begin a generation, or continue the generation that another process has begun under the same label."""
@@ -133,11 +134,7 @@ class Trust:
         generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
         if generation in used:  # it contains rows that differ
             generation = secrets.randbits(62) | 1
-        self.put(file, model, generation, OWN)
-        self.stored = {
-            source: each._replace(generation=generation, compared=OWN) for source, each in self.stored.items()
-        }
-        self._write(file, list(self.stored.values()))
+        self.put(file, {*self.stored, source_number(model.fingerprint)}, generation, OWN)
         self.generations.clear()
 
     def complete(self, file: CacheFile, opened: Opened | None) -> None:

@@ -233,12 +233,12 @@ class VerifiedCache:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
         trust, cache = self._trust, self.cache
         stored, n = trust.find(cache.file, run.model), rows_to_compare(cache.verify)
-        before = 0 if stored is None else stored.compared
+        before, source = 0 if stored is None else stored.compared, source_number(run.model.fingerprint)
         if before >= n > 0:
             return stored.generation
         present = cache.generations_of(fingerprint) if stored is None else [stored.generation]
         if stored is None and present and not n:
-            trust.put(cache.file, run.model, present[0], 0)
+            trust.put(cache.file, {source}, present[0], 0)
             return present[0]
         rows = {each: cache.candidates(fingerprint, each, width) for each in present}
         present = [each for each in present if min(n, len(rows[each])) > before]
@@ -262,14 +262,14 @@ class VerifiedCache:
             if result.compared < len(chosen) / 2:
                 self._pause(start)
                 return None
-            trust.put(cache.file, run.model, generation, before + result.compared)
+            trust.put(cache.file, {source}, generation, before + result.compared)
             trust.verified[fingerprint, True] += result.compared
             if stored is None:
                 text = "%s: %d stored simulations of this %s agree with new ones: all are used"
                 logger.warning(text, cache.path, result.compared, type(run.model).__name__)
             return generation
         self._begin(fingerprint, run)
-        return trust.stored[source_number(run.model.fingerprint)].generation
+        return trust.stored[source].generation
 
     def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
         used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.model.fingerprint)}
