@@ -40,6 +40,11 @@ class VerifyingRun(NamedTuple):
     n_numbers: int  # length of the statistic
     tolerance: float | None = None  # as for `SimulationCache`
 
+    @property
+    def accepted(self) -> float:
+        """Accepted difference of two responses on one processor, relative to their norm."""
+        return response_tolerance(self.model) if self.tolerance is None else self.tolerance
+
 
 class Simulated(NamedTuple):
     """A simulation that was run again."""

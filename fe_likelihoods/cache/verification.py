@@ -379,10 +379,8 @@ class VerifiedCache:
         if not reason and row.size is not None:  # a response
             batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
             (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-        tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
-        if run.tolerance is None and not row.cpu == self._trust.cpu != 0:
-            tolerance = max(tolerance, DEFAULT_TOLERANCE)
-        return _difference(misfit, reason, new, run, tolerance)
+        other = run.tolerance is None and not row.cpu == self._trust.cpu != 0
+        return _difference(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
 
     def _use_no_rows(self, result: _Comparison, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
@@ -394,8 +392,7 @@ class VerifiedCache:
         self.seconds += time.perf_counter() - start
         scatter, spread = "", 0.0
         if not is_transient(once_more.reason):
-            tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
-            scatter, spread = _difference(new.misfit, new.reason, once_more, run, tolerance, "first")
+            scatter, spread = _difference(new.misfit, new.reason, once_more, run, run.accepted, "first")
         served = trust.served.total()
         trust.start_again()
         labels = labels_of(self.cache.file, source_number(run.model.fingerprint))

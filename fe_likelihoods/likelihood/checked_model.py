@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun, difference_of, is_transient, response_tolerance, simulate_again
+from ..cache.comparison import VerifyingRun, difference_of, is_transient, simulate_again
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
@@ -180,13 +180,14 @@ class CheckedModel:
     def _repeat(self, run: VerifyingRun) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
         thetas = np.array([theta for theta, _ in self._points])
-        tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
 
         def same_as(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
             new = simulate_again(run, thetas)
             self._repeated += len(thetas)
             pairs = zip(earlier, new, strict=True)
-            agree = (is_transient(n.reason) or not (n.reason or difference_of(e, n, run, tolerance)) for e, n in pairs)
+            agree = (
+                is_transient(n.reason) or not (n.reason or difference_of(e, n, run, run.accepted)) for e, n in pairs
+            )
             return all(agree), [each.misfit for each in new]
 
         same, repeated = same_as([misfit for _, misfit in self._points])
