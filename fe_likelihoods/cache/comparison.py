@@ -1,34 +1,21 @@
 """Repeated simulations, and how much two simulations with the same parameters may differ."""
 
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..noise.statistics import Statistic, needs_response
-from ..signals.comparison import Comparison, measured_values
+from ..signals.comparison import Comparison
 from ..simulation.faults import TransientReason
 from ..simulation.label import ModelLabel
-from ..simulation.model import (
-    Model,
-    SimulationBatch,
-    misfit_of_responses,
-    most_responses,
-    simulate_batch,
-)
+from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
 from ..simulation.opened import Opened, observing
 from ..simulation.user_code import is_of_user
-from .file import CacheFile
-from .labels import Trust, labels_of
-from .rows import StoredSimulation, source_number
 
 __all__ = [
     "DEFAULT_TOLERANCE",
-    "Repetition",
     "Simulated",
     "VerifyingRun",
     "difference_of",
@@ -36,7 +23,6 @@ __all__ = [
     "largest_difference",
     "observed",
     "response_tolerance",
-    "row_of_response",
     "simulate_again",
 ]
 
@@ -55,9 +41,9 @@ class VerifyingRun(NamedTuple):
     tolerance: float | None = None  # as for `SimulationCache`
 
     @property
-    def n_steps(self) -> int:
-        """Number of measured samples."""
-        return measured_values(self.measured).shape[1]
+    def accepted(self) -> float:
+        """Accepted difference of two responses on one processor, relative to their norm."""
+        return response_tolerance(self.model) if self.tolerance is None else self.tolerance
 
 
 class Simulated(NamedTuple):
@@ -99,52 +85,6 @@ def simulate_again(
             norms = np.linalg.norm(batch.response, axis=2)
         rows += map(Simulated, misfit, reasons, norms)
     return rows
-
-
-class Repetition:
-    """Runs stored simulations again, for one likelihood; `found` are new ones in the present search or verification.
-
-    Counted are rows that were `compared`, `unverified` ones whose new simulation was stopped (not by the model), and
-    the wall time, `seconds`.
-    """
-
-    def __init__(self, file: CacheFile, trust: Trust) -> None:
-        self.file, self.trust = file, trust
-        self.compared, self.unverified, self.seconds = 0, 0, 0.0
-        self.found: dict[tuple, tuple[np.ndarray, Simulated]] = {}
-
-    def simulate(self, fingerprint: str, rows: list[StoredSimulation], run: VerifyingRun) -> list[Simulated]:
-        """New simulations at the parameters of rows; simulations in `found` are not run again."""
-        keys = [(fingerprint, row.theta.tobytes()) for row in rows]
-        left = {key: row.theta for key, row in zip(keys, rows, strict=True) if key not in self.found}
-        if left:
-            start, label, thetas = time.perf_counter(), self.trust.label, list(left.values())
-            new = simulate_again(run, np.array(thetas), label, partial(self.trust.complete, self.file))
-            if run.pool is None and label.observes:
-                label.has_changed_itself(label.changed(run.model))
-            self.seconds += time.perf_counter() - start
-            stopped = sum(is_transient(each.reason) for each in new)
-            self.compared, self.unverified = self.compared + len(new) - stopped, self.unverified + stopped
-            self.found |= dict(zip(left, zip(thetas, new, strict=True), strict=True))
-        return [self.found[key][1] for key in keys]
-
-    def tolerances(self, run: VerifyingRun) -> Mapping[int, float]:
-        """Tolerances by the label of a row; a row with an unknown label may come from another processor."""
-        same = response_tolerance(run.model) if run.tolerance is None else run.tolerance
-        other = max(same, DEFAULT_TOLERANCE) if run.tolerance is None else same
-        cpu = self.trust.cpu
-        found = {
-            each.id: same if each.cpu == cpu != "" else other
-            for each in labels_of(self.file, source_number(run.model.fingerprint))
-        }
-        return defaultdict(lambda: other, found | {0: same})
-
-
-def row_of_response(theta: np.ndarray, response: np.ndarray, label: int, run: VerifyingRun) -> StoredSimulation:
-    """A stored response, reduced to its statistics."""
-    batch = SimulationBatch(response[None], [""])
-    misfit, (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
-    return StoredSimulation(theta, misfit[0], reason, label)
 
 
 def is_transient(reason: str) -> bool:

@@ -25,98 +25,37 @@ try:
 except ImportError:  # without file locks, two programs must not move the same damaged file aside at the same time
     lock_file = None
 
-from .rows import transaction
-from .salvage import read_options, salvage
+from .rows import COLUMNS, LAYOUT, STORE, is_undamaged, transaction
 
 __all__ = ["APPLICATION_ID", "SCHEMA_VERSION", "CacheFile"]
 
 logger = logging.getLogger(__name__)
 
 APPLICATION_ID = 0x46454C43  # "FELC"
-SCHEMA_VERSION = 4
-LABELLED = "generation INTEGER NOT NULL DEFAULT 0, label INTEGER NOT NULL DEFAULT 0"
-LAYOUT = (
-    # the id orders rows by age
-    "CREATE TABLE simulations (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "theta BLOB NOT NULL, misfit BLOB NOT NULL, n_steps INTEGER NOT NULL, reason BLOB NOT NULL, seconds REAL NOT NULL, "
-    f"crc INTEGER NOT NULL, {LABELLED})",
-    "CREATE TABLE responses (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "theta BLOB NOT NULL, n_channels INTEGER NOT NULL, size INTEGER NOT NULL, crc INTEGER NOT NULL, "
-    f"response BLOB NOT NULL, {LABELLED})",
-    # to find the last simulation of a model, or all of them
-    "CREATE INDEX simulation_generations ON simulations (source, generation)",
-    "CREATE INDEX response_sizes ON responses (size)",  # for their sum without reading the responses
-    # simulations that failed, for any measurements; a time limit of 0 marks a failure of the model
-    "CREATE TABLE failures (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "reason BLOB NOT NULL, time_limit REAL NOT NULL, stops INTEGER NOT NULL, crc INTEGER NOT NULL)",
-    # remarks of models on their simulations
-    "CREATE TABLE remarks (id INTEGER PRIMARY KEY, key BLOB NOT NULL UNIQUE, source INTEGER NOT NULL, "
-    "text BLOB NOT NULL)",
-    # model labels, and the generation of each label
-    "CREATE TABLE labels (id INTEGER PRIMARY KEY, source INTEGER NOT NULL, label BLOB NOT NULL, cpu BLOB NOT NULL, "
-    "generation INTEGER NOT NULL, compared INTEGER NOT NULL, files BLOB NOT NULL, crc INTEGER NOT NULL, "
-    "UNIQUE (source, label, cpu))",
-)
+SCHEMA_VERSION = 5
 CHECK_SECONDS = 2.0  # limit for the integrity check on opening; each row has a checksum
 SQLITE_SIGNATURE = b"SQLite format 3\0"
 ID_START = 68  # place of the application id in SQLite's header [bytes]
 PAGE_SIZE = 4096  # SQLite's default [bytes]
 RETRY_SECONDS = 60.0  # wait after a failed access to the file
-# results of SQLite whose cause is outside of the file: locks, rights, the disk, memory
-OUTSIDE = (
-    sqlite3.SQLITE_PERM,
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_NOMEM,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_INTERRUPT,
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_PROTOCOL,
-    sqlite3.SQLITE_AUTH,
-    sqlite3.SQLITE_NOLFS,
-)
+# results of SQLite whose cause is outside of the file: locks, rights, the disk, memory, wrong use
+OUTSIDE = {
+    getattr(sqlite3, f"SQLITE_{name}")
+    for name in "OK PERM BUSY LOCKED NOMEM READONLY INTERRUPT IOERR FULL CANTOPEN PROTOCOL AUTH NOLFS".split()
+}
 
 _files: "weakref.WeakSet[CacheFile]" = weakref.WeakSet()
-_files_lock = threading.Lock()
-_held: "list[CacheFile]" = []
+_lock = threading.RLock()  # held while a file is used, and while this process forks
 
 
 def _before_fork() -> None:
-    _files_lock.acquire()
+    _lock.acquire()
     for file in list(_files):
-        file.lock.acquire()
-        _held.append(file)
         file.close()
 
 
-def _after_fork_in_parent() -> None:
-    while _held:
-        _held.pop().lock.release()
-    _files_lock.release()
-
-
-def _after_fork_in_child() -> None:
-    while _held:
-        _held.pop().lock = threading.RLock()
-    _files_lock.release()
-
-
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_before_fork, after_in_parent=_after_fork_in_parent, after_in_child=_after_fork_in_child)
-
-
-def _code(error: Exception) -> int:
-    """Primary result code of an SQLite error, 0 for other errors."""
-    return (getattr(error, "sqlite_errorcode", None) or 0) & 0xFF
-
-
-def _is_damage(error: Exception) -> bool:
-    """Whether an error means that the file itself is damaged."""
-    if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes damaged contents
-        return True
-    return _code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+    os.register_at_fork(before=_before_fork, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 class _Damaged(sqlite3.DatabaseError):
@@ -125,15 +64,11 @@ class _Damaged(sqlite3.DatabaseError):
     sqlite_errorcode = sqlite3.SQLITE_CORRUPT
 
 
-@contextlib.contextmanager
-def _reading_the_layout() -> Iterator[None]:
-    """Any error of SQLite in reading the layout of a file is damage, unless its cause is outside of the file."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        if _code(error) in OUTSIDE:
-            raise
-        raise _Damaged(str(error)) from error
+def _is_damage(error: Exception) -> bool:
+    """Whether an error means that the file itself is damaged."""
+    if isinstance(error, UnicodeDecodeError):  # SQLite's message quotes damaged contents
+        return True
+    return ((getattr(error, "sqlite_errorcode", None) or 0) & 0xFF) not in OUTSIDE
 
 
 class CacheFile:
@@ -143,17 +78,18 @@ class CacheFile:
     time [s] before which they are not tried again.
     """
 
+    lock = _lock
+
     def __init__(self, path: str | os.PathLike, timeout: float) -> None:
         self.path = Path(path).resolve()  # SQLite keeps the log next to the target of a link
         self.timeout = float(timeout)
-        self.lock = threading.RLock()
         self.writable = True
         self.retry_times: dict[str, float] = {}
         self._connection: sqlite3.Connection | None = None
         self._inode: tuple[int, int] | None = None
-        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
         self._inode_of_cache: tuple[int, int] | None = None  # of the last file that was identified as a cache
-        with _files_lock:
+        self._aside: Path | None = None  # a damaged file, whose rows are to be copied to the new file
+        with _lock:
             _files.add(self)
 
     def __del__(self) -> None:
@@ -172,118 +108,84 @@ class CacheFile:
             raise ValueError(f"{self.path} cannot be created: there is no folder {folder}; create it first")
         if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
             raise ValueError(f"{self.path} cannot be created: {folder} is not writable; give another path")
-        try:
-            open(self.path, "rb").close()
-        except PermissionError:
-            raise ValueError(
-                f"{self.path} is not readable for this user; change its permissions or give another path"
-            ) from None
-        except OSError:  # it does not exist, or SQLite will give a better message
-            pass
-        with self.lock:
+        if self.path.exists() and not os.access(self.path, os.R_OK):
+            raise ValueError(f"{self.path} is not readable for this user; change its permissions or give another path")
+        with _lock:
             try:
                 self._check_integrity(self.connection())
             except (sqlite3.Error, UnicodeDecodeError) as error:
                 self.close()
                 if not _is_damage(error):
                     raise ValueError(f"{self.path} cannot be opened as a cache: {error}; give another path") from error
-                self._replace(error)
-
-    def damage(self) -> str:
-        """Describe the damage of an existing file, which is not changed; empty for an undamaged cache.
-
-        ValueError if the file is not a cache, has another layout, or cannot be opened.
-        """
-        connection = None
-        try:
-            connection = self._connect(read_options(self.path))
-            with _reading_the_layout():
-                self._identify(connection)
-            self._check_integrity(connection, seconds=math.inf)
-        except (sqlite3.Error, UnicodeDecodeError) as error:
-            if not _is_damage(error):
-                raise ValueError(f"{self.path} cannot be opened as a cache: {error}") from error
-            self._refuse_other_files()
-            return " ".join(str(error).split())
-        finally:
-            if connection is not None:
-                connection.close()
-        return ""
-
-    def _replace(self, error: Exception) -> None:
-        """Move a damaged file aside and create a new one."""
-        try:
-            self.set_aside(str(error))
-            self.connection()
-        except (OSError, sqlite3.Error) as failure:
-            raise ValueError(
-                f"{self.path} is damaged ({error}) and cannot be moved aside ({failure}); remove it, or give another "
-                "path"
-            ) from failure
+                try:
+                    self.set_aside(str(error))
+                    self.connection()
+                except (OSError, sqlite3.Error) as failure:
+                    raise ValueError(
+                        f"{self.path} is damaged ({error}) and cannot be moved aside ({failure}); remove it, or give "
+                        "another path"
+                    ) from failure
 
     def attempt(self, what: str, action: Callable[[sqlite3.Connection], Any], otherwise: Any) -> Any:
         """Result of an action on the connection; `otherwise`, with a warning, if the action fails.
 
         All actions with the same name `what`, a participle such as "read" for the warning, then pause for a while.
         """
-        with self.lock:
+        with _lock:
             if time.monotonic() < self.retry_times.get(what, -math.inf):
                 return otherwise
-            for is_last in (False, True):
+            try:
                 try:
                     result = action(self.connection())
-                    self.retry_times.pop(what, None)
-                    return result
-                except (sqlite3.Error, OSError, ValueError, MemoryError) as error:  # a damaged size may be huge
-                    self.close()  # also ends a transaction
-                    failure = error
-                except BaseException:
+                except (sqlite3.Error, UnicodeDecodeError) as error:
                     self.close()
-                    raise
-                if is_last or not self.writable or not _is_damage(failure):
-                    break
-                try:
-                    self.set_aside(str(failure))
-                except (OSError, ValueError) as error:
-                    failure = error
-                    break
-            if what not in self.retry_times:
-                text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
-                logger.warning(text, self.path, what, failure, RETRY_SECONDS)
-            self.retry_times[what] = time.monotonic() + RETRY_SECONDS
-            return otherwise
+                    if not self.writable or not _is_damage(error):
+                        raise
+                    self.set_aside(str(error))
+                    result = action(self.connection())
+            except BaseException as failure:
+                self.close()  # also ends a transaction
+                if not isinstance(failure, sqlite3.Error | OSError | ValueError | MemoryError):
+                    raise  # a damaged size may need too much memory
+                if what not in self.retry_times:
+                    text = "%s cannot be %s (%s); the run continues without it and tries again after %g s"
+                    logger.warning(text, self.path, what, failure, RETRY_SECONDS)
+                self.retry_times[what] = time.monotonic() + RETRY_SECONDS
+                return otherwise
+            self.retry_times.pop(what, None)
+            return result
 
     def insist(self, action: Callable[[sqlite3.Connection], Any]) -> Any:
         """Result of an action that the user has called explicitly; OSError if the file cannot be used."""
-        with self.lock:
+        with _lock:
             try:
                 return action(self.connection())
-            except (sqlite3.Error, ValueError) as error:
+            except BaseException as error:
                 self.close()
-                raise OSError(f"{self.path} cannot be used: {error}") from error
-            except BaseException:
-                self.close()
+                if isinstance(error, sqlite3.Error | ValueError):
+                    raise OSError(f"{self.path} cannot be used: {error}") from error
                 raise
 
     def select(self, query: str, values: tuple = ()) -> list[tuple]:
         """Rows of a query; none if the file cannot be read."""
         return self.attempt("read", lambda connection: connection.execute(query, values).fetchall(), [])
 
-    def write(self, statement: str, rows: list[tuple], what: str = "written") -> bool:
-        """Execute a statement for some rows in one transaction; False if the file cannot be written."""
+    def write(self, *statements: tuple[str, list[tuple]], what: str = "written") -> bool:
+        """Execute statements, each for some rows, in one transaction; False if the file cannot be written."""
 
         def execute(connection: sqlite3.Connection) -> bool:
             with transaction(connection):
-                connection.executemany(statement, rows)
+                for statement, rows in statements:
+                    connection.executemany(statement, rows)
             return True
 
-        with self.lock:
+        with _lock:
             return self.writable and self.attempt(what, execute, False)
 
     def connection(self) -> sqlite3.Connection:
         """Connection of this process, opened if there is none.
 
-        ValueError if the file belongs to another program or has another layout, sqlite3.Error if it cannot be opened.
+        ValueError if the file belongs to another program or a later release, sqlite3.Error if it cannot be opened.
         """
         if self._connection is None:
             with self._exclusive():
@@ -295,14 +197,13 @@ class CacheFile:
                 self._inode = self._inode_of_cache = self._inode_now()
             if self._aside is not None and self.writable:
                 aside, self._aside = self._aside, None
-                found = salvage(aside, self._connection)
-                text = "%s: %d simulations and %d responses were salvaged; the others are lost"
-                logger.warning(text, aside.name, *found)
+                text = "%s: %d rows were salvaged; the others are lost"
+                logger.warning(text, aside.name, _salvage(aside, self._connection))
         return self._connection
 
     def close(self) -> None:
         """Close the connection of this process; the next use opens a new one."""
-        with self.lock:
+        with _lock:
             if self._connection is not None:
                 self._connection.close()
                 self._connection = None
@@ -312,7 +213,7 @@ class CacheFile:
 
         ValueError if the file is not known to be a cache (it is not changed), OSError if it cannot be renamed.
         """
-        with self.lock, self._exclusive():
+        with _lock, self._exclusive():
             self.close()
             if self._inode is None or self._inode_now() != self._inode:
                 return
@@ -344,12 +245,11 @@ class CacheFile:
         SQLite finds the log by its name: a process that opens a damaged file while it is renamed would write to the
         new file's log. The file itself cannot be locked instead, because closing it releases SQLite's locks.
         """
-        if lock_file is None:
-            yield
-            return
         try:
-            folder = os.open(self.path.parent, os.O_RDONLY)
+            folder = None if lock_file is None else os.open(self.path.parent, os.O_RDONLY)
         except OSError:  # a folder with search permission only
+            folder = None
+        if folder is None:
             yield
             return
         try:
@@ -369,12 +269,17 @@ class CacheFile:
     def _open(self) -> sqlite3.Connection:
         connection = self._connect("mode=rwc")
         try:
-            with _reading_the_layout():
-                if self._is_empty(connection):
-                    self._create(connection)
-                self._identify(connection)
-                self._execute_with_retry(connection, "PRAGMA journal_mode = WAL")
-                connection.execute("PRAGMA synchronous = NORMAL")
+            if self._is_empty(connection):
+                with transaction(connection):
+                    for statement in (
+                        LAYOUT if self._is_empty(connection) else ()
+                    ):  # another process may have been first
+                        connection.execute(statement)
+                    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            self._identify(connection)
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
         except BaseException:
             connection.close()
             raise
@@ -385,58 +290,27 @@ class CacheFile:
         for options in ("mode=ro", "mode=ro&immutable=1"):
             connection = self._connect(options)
             try:
-                with _reading_the_layout():
-                    self._identify(connection)
-                return connection
-            except sqlite3.OperationalError as error:
+                self._identify(connection)
+                break
+            except BaseException as error:
                 connection.close()
-                last = error
-            except BaseException:
-                connection.close()
-                raise
-        raise last
+                if not isinstance(error, sqlite3.OperationalError) or "immutable" in options:
+                    raise
+        return connection
 
     def _connect(self, options: str) -> sqlite3.Connection:
-        connection = sqlite3.connect(
-            f"{self.path.as_uri()}?{options}",
-            uri=True,
-            timeout=self.timeout,
-            isolation_level=None,
-            check_same_thread=False,
-        )
+        uri = f"{self.path.as_uri()}?{options}"
+        connection = sqlite3.connect(uri, uri=True, timeout=self.timeout, isolation_level=None, check_same_thread=False)
         connection.text_factory = bytes  # damaged texts cannot be decoded
         return connection
 
     @staticmethod
     def _is_empty(connection: sqlite3.Connection) -> bool:
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
-        ((tables,),) = connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
-        return identity == 0 and tables == 0
-
-    def _create(self, connection: sqlite3.Connection) -> None:
-        """Create the tables in one transaction, unless another process has created them."""
-        self._execute_with_retry(connection, "BEGIN IMMEDIATE")
-        if self._is_empty(connection):
-            for statement in LAYOUT:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        connection.execute("COMMIT")
-
-    def _execute_with_retry(self, connection: sqlite3.Connection, statement: str) -> None:
-        """Execute a statement, waiting while another process holds a lock, where SQLite itself does not wait."""
-        give_up = time.monotonic() + self.timeout
-        while True:
-            try:
-                connection.execute(statement).fetchall()
-                return
-            except sqlite3.OperationalError as error:
-                if _code(error) not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED) or time.monotonic() > give_up:
-                    raise
-            time.sleep(0.005)
+        return not identity and not connection.execute("SELECT 1 FROM sqlite_master").fetchall()
 
     def _identify(self, connection: sqlite3.Connection) -> None:
-        """ValueError for a file of another program or release; `_Damaged` for unexpected tables."""
+        """ValueError for a file of another program or a later release; `_Damaged` for unexpected tables."""
         ((identity,),) = connection.execute("PRAGMA application_id").fetchall()
         ((version,),) = connection.execute("PRAGMA user_version").fetchall()
         layout = connection.execute("SELECT sql, name FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
@@ -455,14 +329,14 @@ class CacheFile:
             raise _Damaged("its tables are not those of a cache")
 
     @staticmethod
-    def _check_integrity(connection: sqlite3.Connection, seconds: float = CHECK_SECONDS) -> None:
+    def _check_integrity(connection: sqlite3.Connection) -> None:
         """SQLite's integrity check, stopped after some seconds."""
-        stop = time.monotonic() + seconds
+        stop = time.monotonic() + CHECK_SECONDS
         connection.set_progress_handler(lambda: time.monotonic() > stop, 100_000)
         try:
             (answer,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         except sqlite3.OperationalError as error:
-            if _code(error) != sqlite3.SQLITE_INTERRUPT:
+            if error.sqlite_errorcode != sqlite3.SQLITE_INTERRUPT:
                 raise
             return
         finally:
@@ -488,3 +362,28 @@ class CacheFile:
             f"{self.path} is not a cache of simulations, and is not changed; give another path, such as "
             "'cache.sqlite'. If it is a cache with a damaged header, remove it"
         ) from None
+
+
+def _salvage(damaged: Path, connection: sqlite3.Connection) -> int:
+    """Copy the rows of a damaged file that can be read to a new one; return their number.
+
+    Rows are read from the first on and from the last on, until a damaged page. Each row has a checksum, so nothing
+    wrong is copied. Labels are not copied: rows without a label are compared with new simulations before they are used.
+    """
+    with contextlib.suppress(sqlite3.Error), transaction(connection):
+        connection.executemany(STORE, filter(is_undamaged, _readable_rows(damaged)))
+    return connection.execute("SELECT count(*) FROM rows").fetchone()[0]
+
+
+def _readable_rows(damaged: Path) -> Iterator[tuple]:
+    # a file without a log is not in use, and gets no log
+    options = "mode=ro" if damaged.with_name(f"{damaged.name}-wal").exists() else "mode=ro&immutable=1"
+    for order in ("ASC", "DESC"):
+        with contextlib.suppress(sqlite3.Error, OSError, ValueError, MemoryError):
+            with contextlib.closing(sqlite3.connect(f"{damaged.as_uri()}?{options}", uri=True)) as source:
+                source.text_factory = bytes
+                source.execute("PRAGMA writable_schema = ON")  # so that a truncated file can be read
+                # by places and `rowid`, because names in the layout may be damaged as well
+                names = f"WITH readable (number, id, {COLUMNS}, stops) AS (SELECT rowid, * FROM rows)"
+                yield from source.execute(f"{names} SELECT {COLUMNS} FROM readable ORDER BY number {order}")
+                return

@@ -4,7 +4,7 @@ For each simulation, the sum of squared residuals is stored, one number per chan
 on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
 simulation is a digest of the declared identity (fingerprints of model and measurements), the generation, and the
 structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
-model's code (`fe_likelihoods.cache.adoption`); rows of other generations stay in the file and are not used.
+model's code (`fe_likelihoods.cache.verification`); rows of other generations stay in the file and are not used.
 
 Responses, which depend on the model alone, are stored in double precision if they are requested, for example by a
 guide, or for every simulation. Failures of the model are stored under a key of the model, so that they are valid for
@@ -22,48 +22,37 @@ import logging
 import math
 import os
 import sqlite3
-import zlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ..simulation.faults import TransientReason
 from ..simulation.model import Model
 from .file import CacheFile
 from .rows import (
     COLUMNS,
-    LABEL_COLUMNS,
     MIN_STOPS,
-    RESPONSE_COLUMNS,
     STORE,
-    STORE_FAILURE,
-    STORE_RESPONSE,
     CachedRows,
-    StoredSimulation,
-    insert_rows,
+    Place,
+    Row,
     is_undamaged,
-    pack_failure,
-    pack_response,
-    pack_row,
+    pack_rows,
+    reason_of,
     select_rows,
     simulation_keys,
     source_number,
     transaction,
-    unpack_failure,
-    unpack_row,
 )
 
-__all__ = ["MAX_CANDIDATES", "CacheInfo", "SimulationCache", "rows_to_compare"]
+__all__ = ["CacheInfo", "SimulationCache", "rows_to_compare"]
 
 logger = logging.getLogger(__name__)
 
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 CONFIDENCE = 0.95
-STORE_REMARK = "INSERT OR IGNORE INTO remarks (key, source, text) VALUES (?, ?, ?)"
-TABLES = ("simulations", "responses", "failures", "remarks")
 
 _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
 
@@ -121,7 +110,8 @@ class SimulationCache:
     path : path
         The file; created if it does not exist. A read-only file is used for reading, with a warning.
     max_rows : int
-        Largest number of stored simulations, of about 160 bytes each. Every write evicts the oldest beyond this number.
+        Largest number of stored rows; a simulation without its response has one of about 160 bytes. Every write evicts
+        the oldest beyond this number.
     retry_failures : bool
         Run failed simulations again, after a change that no fingerprint contains (an external program, a licence).
     responses : bool
@@ -159,9 +149,9 @@ class SimulationCache:
 
     Notes
     -----
-    Methods for rows have the arguments `fingerprint`, the declared identity (`FELikelihood.simulation_key` for
+    Methods for rows have the arguments `fingerprint`, the declared identity (`Simulator.simulation_key` for
     statistics, the model's fingerprint for responses and failures); `thetas`, the structural parameters
-    (n, n_structural); and `generation` and `label` of a `StoredLabel`, by default the latest generation.
+    (n, n_structural); and `generation`, by default the latest.
 
     Examples
     --------
@@ -200,7 +190,7 @@ class SimulationCache:
     def _begin(self, file: CacheFile) -> None:
         self.file = file
         self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
-        self._waiting: list[tuple] = []
+        self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
         self._warned_read_only = self._said_evicted = False
 
@@ -221,158 +211,129 @@ class SimulationCache:
         """Path of the file."""
         return self.file.path
 
-    # simulations --------------------------------------------------------------------------------------------------
+    # rows ---------------------------------------------------------------------------------------------------------
 
     def look_up(
-        self, fingerprint: str, thetas: np.ndarray, n_channels: int, n_steps: int, generation: int | None = None
+        self,
+        fingerprint: str,
+        thetas: np.ndarray,
+        width: int,
+        generation: int | None = None,
+        time_limit: float | None = None,
     ) -> CachedRows:
-        """Look up simulations, with few queries for the whole batch; rows of another shape count as damaged."""
-        keys = self._keys(fingerprint, thetas, generation)
-        misfit, reasons, known = np.full((len(keys), n_channels), np.nan), [""] * len(keys), np.zeros(len(keys), bool)
+        """Look up simulations of `width` numbers each, with few queries for the whole batch.
+
+        Rows of another width count as damaged. `time_limit` is that of the model [s], if it has one.
+        """
+        keys, limit = self._keys(fingerprint, thetas, generation), time_limit or math.inf
         with self.file.lock:
-            found, bad = {}, []
-            for row in self._rows(keys):
-                key, _, _, sums, steps, reason = row[:6]
-                if not is_undamaged(*row) or len(sums) != 8 * n_channels or steps != n_steps:
-                    bad.append(key)
-                elif not (reason and self.retry_failures):
-                    found[key] = sums, reason
-            for place, key in enumerate(keys):
-                if key in found:
-                    sums, reason = found[key]
-                    misfit[place] = np.frombuffer(sums, dtype="<f8")
-                    reasons[place] = reason.decode("utf-8", "replace")
-                    known[place] = True
-            self.hits += int(known.sum())
-            self.misses += int((~known).sum())
-            self._drop("simulations", bad)
-        return CachedRows(misfit, reasons, known)
+            good, bad = {}, []
+            for row in map(Row._make, self._rows(keys)):
+                if not is_undamaged(row) or not (row.reason or len(row.value) == 8 * width):
+                    bad.append(row.key)
+                elif not row.reason or not (self.retry_failures or self._may_end(row, limit)):
+                    good[row.key] = row
+            self._drop(bad)
+        return CachedRows([good.get(key) for key in keys], width)
+
+    def _may_end(self, row: Row, limit: float) -> bool:
+        """Whether a failed simulation was stopped at a shorter time limit [s] than the present one, or only once."""
+        return bool(row.time_limit) and (limit > row.time_limit or self._rows([row.key], "stops") < [(MIN_STOPS,)])
 
     def store(
         self,
         fingerprint: str,
         thetas: np.ndarray,
-        n_steps: int,
-        misfit: np.ndarray,
+        values: np.ndarray,
         reasons: Sequence[str],
         seconds: float,
         generation: int | None = None,
-        label: int = 0,
+        of_model: bool = False,
     ) -> None:
-        """Store simulations and evict the oldest, in one transaction; a `TransientReason` is not stored.
+        """Store simulations and evict the oldest, in one transaction, see `pack_rows`."""
+        place = Place(self._given_or_latest(fingerprint, generation))
+        self.write(pack_rows(fingerprint, thetas, values, reasons, seconds, place, of_model))
 
-        Parameters
-        ----------
-        fingerprint, thetas, generation, label
-            See the notes of the class.
-        n_steps : int
-            Number of measured samples.
-        misfit : (n, n_channels) float
-            Sums of squared residuals [SI unit of the channel, squared].
-        reasons : sequence of n str
-            Reasons of failures; empty where the simulation succeeded.
-        seconds : float
-            Wall time of all simulations together [s].
-        """
-        generation = self._given_or_latest(fingerprint, generation)
-        keys, source = simulation_keys(fingerprint, thetas, generation), source_number(fingerprint)
-        rows = [
-            pack_row(key, source, theta, sums, n_steps, reason, seconds / len(keys), generation, label)
-            for key, theta, sums, reason in zip(keys, thetas, misfit, reasons, strict=True)
-            if not isinstance(reason, TransientReason)
-        ]
-        self._write(STORE, rows)
-
-    def store_responses(
-        self, model: Model, thetas: np.ndarray, responses: np.ndarray, generation: int | None = None, label: int = 0
-    ) -> None:
-        """Store finite responses (n, n_channels, n_steps) [SI] and evict the oldest, in one transaction."""
-        generation = self._given_or_latest(model.fingerprint, generation)
-        keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
-        rows = [
-            pack_response(key, source, theta, response, generation, label)
-            for key, theta, response in zip(keys, thetas, responses, strict=True)
-            if np.isfinite(response).all()
-        ]
-        self._write(STORE_RESPONSE, rows)
-
-    def look_up_responses(
-        self, model: Model, thetas: np.ndarray, generation: int | None = None
-    ) -> list[np.ndarray | None]:
-        """Responses (n_channels, n_steps) [SI] of a model; None for a response that is not stored."""
-        shape = len(model.channels), model.n_steps
-        size = 8 * shape[0] * shape[1]
-        keys = self._keys(model.fingerprint, thetas, generation)
-        found, bad = {}, []
+    def write(self, rows: list[Row]) -> None:
+        """Store rows, and those that wait, and evict the oldest, in one transaction."""
+        if not rows and not self._waiting:
+            return
         with self.file.lock:
-            for key, crc, data in self._rows(keys, "key, crc, response FROM responses"):
-                if not isinstance(data, bytes) or crc != zlib.crc32(key + data) or len(data) != size:
-                    bad.append(key)
-                else:
-                    found[key] = np.frombuffer(data, dtype="<f8").reshape(shape)
-            self._drop("responses", bad)
-        return [found.get(key) for key in keys]
+            if not self.file.writable:
+                self._warn_read_only()
+                return
+            rows = self._waiting + rows
+            written = self.file.attempt("written", lambda connection: self._insert(connection, rows) or True, False)
+            # responses can be computed again
+            self._waiting = [] if written else [row for row in rows if not row.size][-MAX_WAITING_ROWS:]
 
-    def are_stored(self, fingerprints: Sequence[str], thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
-        """Whether a simulation, a response or a failure is stored (n,), under one of several fingerprints.
+    def _insert(self, connection: sqlite3.Connection, rows: list[Row]) -> None:
+        responses, limit = 0, (self.max_response_bytes,)
+        with transaction(connection):
+            connection.executemany(STORE, rows)
+            evict = "DELETE FROM rows WHERE id <= (SELECT max(id) FROM rows) - ?"
+            self.evictions += connection.execute(evict, (self.max_rows,)).rowcount
+            too_many = "SELECT total(size) > ? FROM rows WHERE size > 0"
+            if any(row.size for row in rows) and connection.execute(too_many, limit).fetchone()[0]:
+                sums = "SELECT id, sum(size) OVER (ORDER BY id DESC) AS newest FROM rows WHERE size > 0"
+                evict = f"DELETE FROM rows WHERE id IN (SELECT id FROM ({sums}) WHERE newest > ?)"
+                responses = connection.execute(evict, limit).rowcount
+        self.evictions += responses
+        if responses and not self._said_evicted:
+            self._said_evicted = True
+            text = "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)"
+            logger.info(text, self.path, self.max_response_bytes)
 
-        Rows are not verified, not checked for damage, and not counted as hits.
+    def are_stored(self, fingerprint: str, thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
+        """Whether rows are stored (n,). They are not verified, not checked for damage, and not counted as hits."""
+        keys = self._keys(fingerprint, thetas, generation)
+        found = {key for (key,) in self._rows(keys, "key")}
+        return np.array([key in found for key in keys], dtype=bool)
+
+    # generations --------------------------------------------------------------------------------------------------
+
+    def generations_of(self, fingerprint: str) -> list[int]:
+        """Generations of one identity's rows, the latest first."""
+        query = "SELECT generation FROM rows WHERE source = ? AND generation GROUP BY generation ORDER BY max(id) DESC"
+        return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
+
+    def candidates(self, fingerprint: str, generation: int, width: int) -> list[tuple[bytes, bytes]]:
+        """Keys and parameters of rows of one identity and generation, without failures at a time limit.
+
+        Random ones if there are many. Other values of these rows are read by `rows_of`.
         """
-        stored = np.zeros(len(thetas), dtype=bool)
-        for fingerprint in fingerprints:
-            keys = self._keys(fingerprint, thetas, generation)
-            found = {key for table in TABLES[:3] for (key,) in self._rows(keys, f"key FROM {table}")}
-            stored |= [key in found for key in keys]
-        return stored
+        where = "WHERE source = ? AND generation = ? AND time_limit = 0 AND (length(value) = ? OR length(reason) > ?)"
+        query = f"SELECT key, theta FROM rows WHERE id IN (SELECT id FROM rows {where} ORDER BY random() LIMIT ?)"
+        shortest = 2**31 if self.retry_failures else 0
+        values = source_number(fingerprint), generation, 8 * width, shortest, MAX_CANDIDATES
+        return self.file.select(query, values)
 
-    # failures and remarks --------------------------------------------------------------------------------------------
+    def latest_success(self, fingerprint: str, generation: int, width: int) -> Row | None:
+        """The success that was stored last, if it is undamaged."""
+        where = "WHERE source = ? AND generation = ? AND length(reason) = 0 AND length(value) = ?"
+        query = f"SELECT {COLUMNS} FROM rows {where} ORDER BY id DESC LIMIT 1"
+        rows = self.file.select(query, (source_number(fingerprint), generation, 8 * width))
+        return Row._make(rows[0]) if rows and is_undamaged(rows[0]) else None
 
-    def store_failures(
-        self, model: Model, thetas: np.ndarray, reasons: Sequence[str], generation: int | None = None
-    ) -> None:
-        """Store failures of a model for any measurements, and simulations that were stopped at a time limit.
+    def rows_of(self, keys: list[bytes]) -> list[Row]:
+        """Undamaged rows with given keys, in their order."""
+        rows = {row[0]: Row._make(row) for row in self._rows(keys) if is_undamaged(row)}
+        return [rows[key] for key in keys if key in rows]
 
-        Reasons are empty where the simulation succeeded. Not stored are a `MisfitReason`, and a `TransientReason`
-        without a time limit.
-        """
-        generation = self._given_or_latest(model.fingerprint, generation)
-        keys, source = simulation_keys(model.fingerprint, thetas, generation), source_number(model.fingerprint)
-        rows = [pack_failure(key, source, reason) for key, reason in zip(keys, reasons, strict=True)]
-        self._write(STORE_FAILURE, [row for row in rows if row is not None])
-
-    def look_up_failures(self, model: Model, thetas: np.ndarray, generation: int | None = None) -> list[str]:
-        """Reasons of stored failures that are valid for any measurements; empty where the simulation must be run.
-
-        The model's ``time_limit`` [s], if there is one, is compared with the time limits of stored failures.
-        """
-        if self.retry_failures:
-            return [""] * len(thetas)
-        limit = getattr(model, "time_limit", None) or np.inf
-        keys = self._keys(model.fingerprint, thetas, generation)
-        found, bad = {}, []
-        with self.file.lock:
-            for *row, stops in self._rows(keys, "key, source, reason, time_limit, crc, stops FROM failures"):
-                reason = unpack_failure(*row)
-                if reason is None:
-                    bad.append(row[0])
-                elif not isinstance(reason, TransientReason) or (limit <= reason.time_limit and stops >= MIN_STOPS):
-                    found[row[0]] = reason
-            self._drop("failures", bad)
-        return [found.get(key, "") for key in keys]
+    # remarks ------------------------------------------------------------------------------------------------------
 
     def store_remark(self, model: Model) -> None:
         """Store a model's `range_remark` (a law was used beyond its range), unless it is empty or one is stored."""
         text = getattr(model, "range_remark", "")
         if text and text != self._remark:
-            source = source_number(model.fingerprint)
-            key = source.to_bytes(8, "little", signed=True)
-            if self.file.write(STORE_REMARK, [(key, source, text.encode("utf-8", "backslashreplace"))]):
-                self._remark = text
+            nothing = np.zeros((1, 0))
+            self.store(model.fingerprint, nothing, nothing, [text], 0.0, 0, of_model=True)
+            self._remark = text
 
     def look_up_remark(self, model: Model) -> str:
         """Remark of a model; empty if there is none."""
-        rows = self.file.select("SELECT text FROM remarks WHERE source = ?", (source_number(model.fingerprint),))
-        return bytes(rows[0][0]).decode("utf-8", "replace") if rows else ""
+        rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
+        return reason_of(rows[0]) if rows else ""
 
     def repeat_remark(self, model: Model) -> None:
         """Log a model's stored remark, once per process, unless the model has just made a remark itself.
@@ -380,57 +341,17 @@ class SimulationCache:
         A built-in model warns once if a simulation was beyond the range of its laws. Without the stored remark, a later
         process that uses cached simulations would give no warning.
         """
-        place = str(self.path), model.fingerprint
-        if not hasattr(model, "range_remark") or place in _repeated:
+        if not hasattr(model, "range_remark") or (str(self.path), model.fingerprint) in _repeated:
             return
-        _repeated.add(place)
+        _repeated.add((str(self.path), model.fingerprint))
         text = self.look_up_remark(model)
         if text and not model.range_remark:
             logger.warning("simulations of this model in %s: %s", self.path, text)
 
-    # generations ------------------------------------------------------------------------------------------------------
-
-    def generations_of(self, fingerprint: str, table: str = "simulations") -> list[int]:
-        """Generations of one identity's simulations or responses, the latest first."""
-        query = f"SELECT generation FROM {table} WHERE source = ? GROUP BY generation ORDER BY max(id) DESC"
-        return [generation for (generation,) in self.file.select(query, (source_number(fingerprint),))]
-
-    def stored_rows(
-        self, fingerprint: str, generation: int, n_channels: int, n_steps: int, most: int = MAX_CANDIDATES
-    ) -> list[StoredSimulation]:
-        """Undamaged simulations of one identity and generation, the latest first, evenly chosen if there are many.
-
-        `n_channels` and `n_steps` are the shape of the measurements, `most` is about the largest number of rows.
-        """
-        values = source_number(fingerprint), generation
-        where = "FROM simulations WHERE source = ? AND generation = ?"
-        latest = f"SELECT {COLUMNS} {where} ORDER BY id DESC LIMIT ?"
-        ((n,),) = self.file.select(f"SELECT count(*) {where}", values) or [(0,)]
-        n = n if most > 1 else most
-        rows = self.file.select(latest, (*values, most if n <= most else 10))
-        if n > most:
-            some = f"SELECT {COLUMNS} {where} AND id % ? = 0 ORDER BY id DESC"
-            rows += self.file.select(some, (*values, n // most + 1))
-        good = {row[0]: row for row in rows if is_undamaged(*row) and len(row[3]) == 8 * n_channels}
-        return [unpack_row(row) for row in good.values() if row[4] == n_steps]
-
-    def response_points(self, model: Model, generation: int, most: int = MAX_CANDIDATES) -> list[tuple]:
-        """Parameters (n_structural,) and label of stored responses of a model, the latest first."""
-        query = "SELECT theta, label FROM responses WHERE source = ? AND generation = ? ORDER BY id DESC LIMIT ?"
-        rows = self.file.select(query, (source_number(model.fingerprint), generation, most))
-        return [(np.frombuffer(theta, dtype="<f8"), label) for theta, label in rows if isinstance(theta, bytes)]
-
-    def label_of(self, fingerprint: str, theta: np.ndarray, generation: int) -> int:
-        """Id of the label under which a simulation or a response was stored; 0 if unknown."""
-        keys = simulation_keys(fingerprint, theta[None], generation)
-        found = [row for table in TABLES[:2] for row in self._rows(keys, f"label FROM {table}")]
-        return found[0][0] if found else 0
-
-    # the file ---------------------------------------------------------------------------------------------------------
+    # the file -----------------------------------------------------------------------------------------------------
 
     def copy(self, path: str | os.PathLike) -> int:
-        """Copy the cache with all rows to a new file, for an archive or another machine; returns the number of
-        simulations.
+        """Copy the cache to a new file, for an archive or another machine; returns the number of simulations.
 
         ValueError if the file exists, or its folder does not; OSError if either file cannot be used.
         """
@@ -450,54 +371,38 @@ class SimulationCache:
         if other.path == self.path:
             raise ValueError(f"{path} is the cache itself; give another file")
         other.close()
-        columns = {"simulations": COLUMNS, "responses": RESPONSE_COLUMNS, "labels": LABEL_COLUMNS}
+        before = self.info().simulations
+        tables = ("rows", COLUMNS), ("labels", "id, source, code, files, generation, compared, crc")
 
-        def insert(connection: sqlite3.Connection) -> int:
+        def insert(connection: sqlite3.Connection) -> None:
             connection.execute("ATTACH ? AS other", (str(other.path),))
             try:
                 with transaction(connection):
-                    statements = [
-                        f"INSERT OR IGNORE INTO {t} ({c}) SELECT {c} FROM other.{t}" for t, c in columns.items()
-                    ]
-                    return [connection.execute(statement).rowcount for statement in statements][0]
+                    for table, columns in tables:
+                        query = f"INSERT OR IGNORE INTO {table} ({columns}) SELECT {columns} FROM other.{table}"
+                        connection.execute(query)
             finally:
                 connection.execute("DETACH other")
 
-        return self.file.insist(insert)
+        self.file.insist(insert)
+        return self.info().simulations - before
 
     def info(self) -> CacheInfo:
         """State of the cache, and counts of this object."""
-
-        def ask(connection: sqlite3.Connection) -> tuple:
-            ((n, failures, seconds),) = connection.execute(
-                "SELECT count(*), total(length(reason) > 0), total(seconds) FROM simulations"
-            )
-            ((responses, response_bytes),) = connection.execute("SELECT count(*), total(size) FROM responses")
-            return n, int(failures), responses, int(response_bytes), seconds
-
+        query = (
+            "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size), "
+            "total(seconds) FROM rows"
+        )
         with self.file.lock:
-            counted = self.file.attempt("read", ask, (0, 0, 0, 0, 0.0))
+            *counted, seconds = (self.file.select(query) or [(0,) * 5])[0]
             size = self.path.stat().st_size if self.path.exists() else 0
             counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
-            return CacheInfo(self.path, *counted, size, *counts)
-
-    def check_rows(self) -> tuple[int, int]:
-        """Compare all simulations with their checksums; no row is changed. OSError if the file cannot be read.
-
-        Returns the number of simulations, and how many do not match their checksums.
-        """
-        rows = good = last = 0
-        query = f"SELECT id, {COLUMNS} FROM simulations WHERE id > ? ORDER BY id LIMIT 10000"
-        while page := self.file.insist(lambda connection, last=last: connection.execute(query, (last,)).fetchall()):
-            last = page[-1][0]
-            rows, good = rows + len(page), good + sum(is_undamaged(*row[1:]) for row in page)
-        return rows, rows - good
+            return CacheInfo(self.path, *map(int, counted), seconds, size, *counts)
 
     def clear(self) -> None:
         """Delete all rows, for all users of the file; caches in memory are not affected. OSError if that fails."""
-
         with self.file.lock:
-            self.file.insist(lambda connection: _delete_rows(connection, "?", [(True,)]))
+            self.file.insist(lambda connection: connection.execute("DELETE FROM rows"))
             self._waiting.clear()
             self._remark = ""
             # returns the space to the disk; may fail while others read
@@ -511,82 +416,48 @@ class SimulationCache:
         """
         sources = {source_number(fingerprint) for fingerprint in fingerprints}
         with self.file.lock:
-            self._waiting = [row for row in self._waiting if row[1] not in sources]
+            self._waiting = [row for row in self._waiting if row.source not in sources]
             self._remark = ""
-            rows = [(source,) for source in sources]
-            return self.file.insist(lambda connection: _delete_rows(connection, "source = ?", rows))
+            delete, rows = "DELETE FROM rows WHERE source = ?", [(source,) for source in sources]
+            return self.file.insist(lambda connection: connection.executemany(delete, rows).rowcount)
 
     def discard(self, thetas: np.ndarray, *fingerprints: str, generation: int | None = None) -> None:
         """Delete the rows of some simulations, if possible."""
         keys = {key for fingerprint in fingerprints for key in self._keys(fingerprint, thetas, generation)}
         with self.file.lock:
-            self._waiting = [row for row in self._waiting if row[0] not in keys]
-            if self.file.writable:
-                rows = [(key,) for key in keys]
-                self.file.attempt("repaired", lambda connection: _delete_rows(connection, "key = ?", rows), None)
+            self._waiting = [row for row in self._waiting if row.key not in keys]
+            self._delete(keys)
 
     def close(self) -> None:
         """Store waiting rows, if possible, and close this process's connection; the next use opens a new connection."""
         with self.file.lock:
             self.file.retry_times.clear()
-            if self._waiting:
-                self._write(STORE, [])
+            self.write([])
             self.file.close()
 
     def _given_or_latest(self, fingerprint: str, generation: int | None) -> int:
-        if generation is not None:
-            return generation
-        tables = ("simulations", "responses", "labels")
-        return next((found[0] for table in tables if (found := self.generations_of(fingerprint, table))), 1)
+        return next(iter(self.generations_of(fingerprint)), 1) if generation is None else generation
 
     def _keys(self, fingerprint: str, thetas: np.ndarray, generation: int | None) -> list[bytes]:
         return simulation_keys(fingerprint, thetas, self._given_or_latest(fingerprint, generation))
 
-    def _rows(self, keys: list[bytes], *columns: str) -> list[tuple]:
+    def _rows(self, keys: list[bytes], columns: str = COLUMNS) -> list[tuple]:
         """Stored rows with given keys."""
-        return self.file.attempt("read", lambda connection: select_rows(connection, keys, *columns), [])
+        return self.file.attempt("read", lambda connection: select_rows(connection, keys, columns), [])
 
-    def _insert(self, connection: sqlite3.Connection, statement: str, rows: list[tuple]) -> None:
-        evicted, responses = insert_rows(connection, statement, rows, self.max_rows, self.max_response_bytes)
-        self.evictions += evicted + responses
-        if responses and not self._said_evicted:
-            self._said_evicted = True
-            logger.info(
-                "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)",
-                self.path,
-                self.max_response_bytes,
-            )
-
-    def _write(self, statement: str, rows: list[tuple]) -> None:
-        if not rows and statement is not STORE:  # `STORE` also writes waiting rows
-            return
-        with self.file.lock:
-            if not self.file.writable:
-                self._warn_read_only()
-                return
-            if statement is STORE:  # only simulations wait; responses can be computed again
-                rows = self._waiting = (self._waiting + rows)[-MAX_WAITING_ROWS:]
-            written = self.file.attempt("written", lambda found: self._insert(found, statement, rows) or True, False)
-            if written and statement is STORE:
-                self._waiting = []
+    def _delete(self, keys: Collection[bytes]) -> None:
+        self.file.write(("DELETE FROM rows WHERE key = ?", [(key,) for key in keys]), what="repaired")
 
     def _warn_read_only(self) -> None:
         if not self._warned_read_only:
             logger.warning("%s is read-only: new simulations are not stored. Change its permissions or path", self.path)
         self._warned_read_only = True
 
-    def _drop(self, table: str, keys: list[bytes]) -> None:
+    def _drop(self, keys: list[bytes]) -> None:
         """Delete rows that do not match their checksum."""
         if not keys:
             return
         if not self.damaged:
             logger.warning("%s has damaged rows; they are simulated again, see SimulationCache.damaged", self.path)
         self.damaged += len(keys)
-        self.file.write(f"DELETE FROM {table} WHERE key = ?", [(key,) for key in keys], "repaired")
-
-
-def _delete_rows(connection: sqlite3.Connection, condition: str, rows: Collection[tuple]) -> int:
-    """Delete rows from all tables in one transaction; return their number."""
-    with transaction(connection):
-        statements = [f"DELETE FROM {table} WHERE {condition}" for table in TABLES]
-        return sum(connection.executemany(statement, rows).rowcount for statement in statements)
+        self._delete(keys)

@@ -19,37 +19,37 @@ Likelihoods of one model and file share their verified and stored rows (`fe_like
 """
 
 import logging
-import random
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model
+from ..simulation.model import Model, SimulationBatch, misfit_of_responses
 from ..simulation.opened import Opened
-from .adoption import LATEST, MAX_ATTEMPTS, Adoption
 from .comparison import (
-    Repetition,
+    DEFAULT_TOLERANCE,
     Simulated,
     VerifyingRun,
     difference_of,
     is_transient,
     response_tolerance,
-    row_of_response,
     simulate_again,
 )
 from .labels import Trust, labels_of, shared_trust
-from .rows import CachedRows, StoredLabel, StoredSimulation, simulation_keys, source_number
-from .simulation_cache import SimulationCache
+from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
+from .simulation_cache import SimulationCache, rows_to_compare
 
-__all__ = ["StaleCache", "VerifiedCache"]
+__all__ = ["StaleCache", "VerifiedCache", "choose_rows"]
 
 logger = logging.getLogger(__name__)
 
 FIRST_ROWS = 2  # rows verified before the first row is used, if the label is known
 ROWS_PER_VERIFICATION = 100
+FIRST_COMPARED = 3  # rows in the first batch of a search; each further batch has four times as many
+MAX_ATTEMPTS = 4  # simulations that may fail for other reasons than the model
 LARGEST_ROUNDING = 1e-4  # largest relative response difference that may come from rounding and iterations
 CHANGED = (
     "Something has changed that neither its declared identity nor its label contains. Delete its rows with "
@@ -81,12 +81,22 @@ class StaleCache(ValueError):
         return type(self), (str(self), self.theta)
 
 
+class _Comparison(NamedTuple):
+    """Result of a comparison of stored rows with new simulations."""
+
+    compared: int
+    stopped: list[str]  # reasons of the new simulations that were stopped
+    row: Row | None = None  # that differs
+    new: Simulated | None = None
+
+
 class VerifiedCache:
     """A `SimulationCache` whose rows are verified before they are used.
 
     Its settings `verify` and `tolerance` apply. `model` and `label` are those in whose state the likelihood was made;
-    simulations run in `pool`. `again` counts the simulations for verification. Another process verifies rows again,
-    once for all copies of this object there.
+    simulations run in `pool`. Counted are rows that were `compared`, `unverified` ones whose new simulation was stopped
+    (not by the model), and the wall time, `seconds`. Another process verifies rows again, once for all copies of this
+    object there.
     """
 
     def __init__(self, cache: SimulationCache, model: Model, pool: Any, label: ModelLabel) -> None:
@@ -94,10 +104,9 @@ class VerifiedCache:
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust
-        self.again = Repetition(cache.file, trust)
-        self._adoption = Adoption(cache, trust, self.again)
+        self.compared, self.unverified, self.seconds = 0, 0, 0.0
         self._model: Any = None  # model of the last look-up in this process
-        self._random = random.Random()  # separate, so that the user's random number streams do not change
+        self._random = np.random.default_rng()  # separate, so that the user's random numbers do not change
 
     def __getstate__(self) -> tuple:
         return self.cache, self._trust
@@ -116,8 +125,8 @@ class VerifiedCache:
 
     def share_trust(self, other: "VerifiedCache") -> None:
         """Trust rows that another object has verified or stored, if its model has the same code."""
-        if other._trust.label.code == self._trust.label.code:
-            self._set_up(self.cache, other._trust)
+        if other.label.code == self.label.code:
+            self._trust = other._trust
 
     # storing ----------------------------------------------------------------------------------------------------------
 
@@ -131,238 +140,268 @@ class VerifiedCache:
         seconds: float,
         run: VerifyingRun,
     ) -> None:
-        """Store simulations under the model's label: statistics, responses and failures, if given."""
-        stored = self._label_to_store(run.model)
-        if stored is None:
-            return
-        place = stored.generation, stored.id
-        if responses is not None:
-            # before the statistics, which can be computed from the responses if the program is killed in between
-            self.cache.store_responses(run.model, thetas, responses, *place)
-        if misfit is not None:
-            self.cache.store(fingerprint, thetas, run.n_steps, misfit, reasons, seconds, *place)
-        if any(reasons):
-            self.cache.store_failures(run.model, thetas, reasons, stored.generation)
-        self._trust.add_own(thetas, stored.generation, *{fingerprint, run.model.fingerprint})
-
-    def _label_to_store(self, model: Model) -> StoredLabel | None:
-        """The label under which new simulations are stored; None while the search for a generation pauses."""
+        """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust = self._trust
         with trust.lock:
-            stored = trust.find(self.cache.file, model)
-            if stored is None and (trust.generations or time.monotonic() >= trust.pause_ends):
-                trust.begin(self.cache.file, model, set())
-                stored = trust.stored
-            return stored
+            stored = trust.find(self.cache.file, run.model)
+            if stored is None:
+                if not trust.generations and time.monotonic() < trust.pause_ends:  # it is not known which rows agree
+                    return
+                trust.begin(self.cache.file, run.model, set())
+                stored = trust.find(self.cache.file, run.model)
+            place = Place(stored.generation, trust.cpu, trust.session)
+        rows = []
+        if misfit is not None:
+            rows += pack_rows(fingerprint, thetas, misfit, reasons, seconds, place)
+        if responses is not None or any(reasons):
+            finite = np.zeros(len(thetas), bool) if responses is None else np.isfinite(responses).all(axis=(1, 2))
+            values = np.zeros((len(thetas), 0)) if responses is None else responses
+            chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
+            why = ["" if finite[row] else reasons[row] for row in chosen]
+            rows += pack_rows(run.model.fingerprint, thetas[chosen], values[chosen], why, 0.0, place, True)
+        self.cache.write(rows)
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
         """Delete rows that were stored here."""
-        if self._trust.stored is not None:
-            self.cache.discard(thetas, *fingerprints, generation=self._trust.stored.generation)
+        for generation in {each.generation for each in self._trust.stored.values()}:
+            self.cache.discard(thetas, *fingerprints, generation=generation)
 
     def are_stored(self, fingerprints: tuple[str, ...], thetas: np.ndarray, model: Model) -> np.ndarray:
         """Whether rows are stored (n,), in any generation that may be used; nothing is verified."""
         with self._trust.lock:
             stored = self._trust.find(self.cache.file, model)
-        if stored is not None:
-            return self.cache.are_stored(fingerprints, thetas, stored.generation)
         found = np.zeros(len(thetas), dtype=bool)
-        for generation in {each for name in fingerprints for each in self.cache.generations_of(name)}:
-            found |= self.cache.are_stored(fingerprints, thetas, generation)
+        for name in fingerprints:
+            for generation in self.cache.generations_of(name) if stored is None else [stored.generation]:
+                found |= self.cache.are_stored(name, thetas, generation)
         return found
 
     # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
-        """Rows of `SimulationCache.look_up`, some verified; `StaleCache` if one differs although the label is known."""
-        self._notice_other_model(run)
+        """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
+        found = self._look_up(fingerprint, thetas, run, run.n_numbers, None)
+        unknown = found.rows.count(None)
+        self.cache.hits += len(thetas) - unknown
+        self.cache.misses += unknown
+        return found
+
+    def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | str | None]:
+        """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
+
+        Some are verified by their statistics, as in `look_up`, but no failures at a time limit, because each would take
+        as long as the limit.
+        """
+        shape, limit = (len(run.model.channels), run.model.n_steps), getattr(run.model, "time_limit", None)
+        rows = self._look_up(run.model.fingerprint, thetas, run, shape[0] * shape[1], limit).rows
+        return [
+            row and (reason_of(row) if row.reason else np.frombuffer(row.value, dtype="<f8").reshape(shape))
+            for row in rows
+        ]
+
+    def _look_up(
+        self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int, limit: float | None
+    ) -> CachedRows:
+        if run.model is not self._model:
+            if self._model is not None:  # another model object was set
+                with self._trust.lock:
+                    self._trust.start_again()
+                    self._trust.stale = None
+            self._model = run.model
         while True:
-            generation = self._adoption.generation(fingerprint, run)
+            generation = self._generation(fingerprint, run, width)
             if generation is None:
-                self.cache.misses += len(thetas)
-                shape = len(thetas), run.n_numbers
-                return CachedRows(np.full(shape, np.nan), [""] * len(thetas), np.zeros(len(thetas), bool))
-            rows = self.cache.look_up(fingerprint, thetas, run.n_numbers, run.n_steps, generation)
-            if self._verify_rows(fingerprint, thetas, rows, generation, run):
+                return CachedRows([None] * len(thetas), width)
+            rows = self.cache.look_up(fingerprint, thetas, width, generation, limit)
+            if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
                 return rows
 
-    def _verify_rows(
-        self, fingerprint: str, thetas: np.ndarray, rows: CachedRows, generation: int, run: VerifyingRun
-    ) -> bool:
-        """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
-        known = self._of_others(fingerprint, thetas, np.flatnonzero(rows.known).tolist(), generation)
-        if not known:
-            return True
-        failed = [row for row in known if rows.reasons[row]]
-        succeeded = [row for row in known if not rows.reasons[row]]
-        first = not self._trust.served["simulations", fingerprint]
-        latest = None
-        if first or not succeeded:
-            stored = self.cache.stored_rows(fingerprint, generation, run.n_numbers, run.n_steps, LATEST)
-            others = (row for row in stored if not row.reason)
-            latest = next(others, None)
-            if latest is not None and not self._of_others(fingerprint, latest.theta[None], [0], generation):
-                latest = None
-        # failures alone do not verify successful rows, which may be used later
-        table = "failed simulations" if first and latest is None and not succeeded else "simulations"
+    # the generation ---------------------------------------------------------------------------------------------------
 
-        def candidates() -> Iterator[StoredSimulation]:
-            if latest is not None:
-                yield latest
-            for some in (succeeded, failed):
-                for row in self._in_random_order(thetas, some):
-                    if latest is None or not np.array_equal(latest.theta, thetas[row]):
-                        yield StoredSimulation(thetas[row], rows.misfit[row], rows.reasons[row], -1)
+    def _generation(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+        """Generation whose rows are used; None if no rows of this identity can be used yet."""
+        trust = self._trust
+        if fingerprint not in trust.generations:
+            with trust.lock:
+                found = self._find(fingerprint, run, width)
+                if found is None:
+                    return None
+                trust.generations[fingerprint] = found
+        return trust.generations[fingerprint]
 
-        return self._verify_due(table, fingerprint, len(known), candidates, run)
-
-    def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | None]:
-        """Responses from `SimulationCache.look_up_responses`; some of them are verified by their statistics."""
-        self._notice_other_model(run)
-        fingerprint = run.model.fingerprint
-        while True:
-            generation = self._adoption.generation(fingerprint, run)
-            if generation is None:
-                return [None] * len(thetas)
-            responses = self.cache.look_up_responses(run.model, thetas, generation)
-            known = [place for place, response in enumerate(responses) if response is not None]
-            known = self._of_others(fingerprint, thetas, known, generation)
-
-            def candidates(known: list = known, responses: list = responses) -> Iterator[StoredSimulation]:
-                for row in self._in_random_order(thetas, known):
-                    yield row_of_response(thetas[row], responses[row], -1, run)
-
-            if not known or self._verify_due("responses", fingerprint, len(known), candidates, run):
-                return responses
-
-    def look_up_failures(self, thetas: np.ndarray, run: VerifyingRun) -> list[str]:
-        """Reasons from `SimulationCache.look_up_failures`; some of them are verified, as in `look_up`.
-
-        Failures at a time limit are not verified, because each would take as long as the limit.
-        """
-        self._notice_other_model(run)
-        with self._trust.lock:
-            stored = self._trust.find(self.cache.file, run.model)
+    def _find(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
+        """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
+        trust, cache = self._trust, self.cache
+        stored, n = trust.find(cache.file, run.model), rows_to_compare(cache.verify)
+        before, source = 0 if stored is None else stored.compared, source_number(run.model.fingerprint)
+        if before >= n > 0:
+            return stored.generation
+        present = cache.generations_of(fingerprint) if stored is None else [stored.generation]
+        if stored is None and present and not n:
+            trust.put(cache.file, {source}, present[0], 0)
+            return present[0]
+        rows = {each: cache.candidates(fingerprint, each, width) for each in present}
+        present = [each for each in present if min(n, len(rows[each])) > before]
+        if stored is not None and not present:
+            return stored.generation
+        if not present or time.monotonic() < trust.pause_ends:
+            return None
         if stored is None:
-            return [""] * len(thetas)
-        reasons = self.cache.look_up_failures(run.model, thetas, stored.generation)
-        known = [row for row, reason in enumerate(reasons) if reason and not is_transient(reason)]
-        known = self._of_others(run.model.fingerprint, thetas, known, stored.generation)
+            text = (
+                "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up "
+                "to %d of them are simulated again, to see whether they can be used"
+            )
+            most = min(n, len(rows[present[0]]))
+            logger.warning(text, cache.path, type(run.model).__name__, most)
+        start = time.monotonic()
+        for generation in present:
+            chosen = choose_rows(rows[generation], n - before, self._random)
+            result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, fingerprint, run)
+            if result.row is not None:
+                continue
+            if result.compared < len(chosen) / 2:
+                self._pause(start)
+                return None
+            trust.put(cache.file, {source}, generation, before + result.compared)
+            trust.verified[fingerprint, True] += result.compared
+            if stored is None:
+                text = "%s: %d stored simulations of this %s agree with new ones: all are used"
+                logger.warning(text, cache.path, result.compared, type(run.model).__name__)
+            return generation
+        self._begin(fingerprint, run)
+        return trust.stored[source].generation
 
-        def candidates() -> Iterator[StoredSimulation]:
-            for row in self._random.sample(known, len(known)):
-                yield StoredSimulation(thetas[row], np.full(run.n_numbers, np.nan), reasons[row], -1)
+    def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
+        used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.model.fingerprint)}
+        self._trust.begin(self.cache.file, run.model, used)
+        text = "%s: stored simulations of this %s differ from new ones; they stay in the file and are not used"
+        logger.warning(text, self.cache.path, type(run.model).__name__)
 
-        if known and not self._verify_due("failures", run.model.fingerprint, len(known), candidates, run):
-            return [""] * len(thetas)
-        return reasons
+    # comparisons ------------------------------------------------------------------------------------------------------
 
-    # the usual few ------------------------------------------------------------------------------------------------
-
-    def _of_others(self, fingerprint: str, thetas: np.ndarray, rows: list[int], generation: int) -> list[int]:
-        """The rows that this process has not stored; none if the cache is not to be verified."""
-        if not self.cache.verify or not rows:
-            return []
-        own = self._trust.own
-        if not own:
-            return rows
-        keys = simulation_keys(fingerprint, thetas[rows], generation)
-        return [row for row, key in zip(rows, keys, strict=True) if key not in own]
-
-    def _verify_due(
-        self, table: str, fingerprint: str, n: int, candidates: Callable[[], Iterator], run: VerifyingRun
-    ) -> bool:
-        """Verify the rows that are due when `n` more rows are used; False if a new generation has begun."""
+    def _verify(self, fingerprint: str, rows: list[Row | None], generation: int, run: VerifyingRun, width: int) -> bool:
+        """Verify some of the rows that were found; False if the look-up must be repeated in a new generation."""
         trust = self._trust
         with trust.lock:
+            others = [row for row in rows if row is not None and row.session != trust.session and not row.time_limit]
+            if not others:
+                return True
             if trust.stale is not None:
-                differing, error = trust.stale
-                generation = trust.generations.get(differing, 0 if trust.stored is None else trust.stored.generation)
-                if self.cache.are_stored([differing], error.theta[None], generation)[0]:
+                differing, of_error, error = trust.stale
+                if self.cache.are_stored(differing, error.theta[None], of_error)[0]:
                     raise StaleCache(str(error), error.theta)
                 trust.stale = None
             if time.monotonic() < trust.pause_ends:
                 return True
-            before = trust.served[table, fingerprint]
-            due = (before + n) // ROWS_PER_VERIFICATION - before // ROWS_PER_VERIFICATION
-            if not before:
+            succeeded, latest = [row for row in others if not row.reason], None
+            if not trust.served[fingerprint, True] or not succeeded:
+                latest = self.cache.latest_success(fingerprint, generation, width)
+                latest = None if latest is None or latest.session == trust.session else latest
+            # failures alone do not verify successful rows, which may be used later
+            kind = fingerprint, bool(latest or succeeded or trust.served[fingerprint, True])
+            if kind not in trust.verified:
                 # one row suffices for responses and shorter records if other rows of the same code were verified
-                due += 1 if trust.served else FIRST_ROWS
-            start = time.monotonic()
-            try:
-                compared = not due or self._verify(candidates(), due, fingerprint, run)
-            except StaleCache as error:
-                trust.stale = fingerprint, error
-                raise
-            finally:
-                self.again.found.clear()
-            if compared is None:
-                return False
-            if compared:
-                trust.served[table, fingerprint] = before + n
-            else:
-                now = time.monotonic()
-                trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
+                trust.verified[kind] = -1 if trust.served else -FIRST_ROWS
+            served = trust.served[kind] + len(others)
+            due = served // ROWS_PER_VERIFICATION - trust.verified[kind]
+            if due > 0:
+                start = time.monotonic()
+                result = self._compare(self._in_order(latest, others), due, due, fingerprint, run)
+                self._warn_of_stopped(result)
+                if result.row is not None:
+                    return self._use_no_rows(result, fingerprint, generation, run)
+                if not result.compared:
+                    self._pause(start)
+                    return True
+                # rows that are due and that nobody has requested are not compared later
+                trust.verified[kind] = max(trust.verified[kind] + result.compared, served // ROWS_PER_VERIFICATION)
+            trust.served[kind] = served
             return True
 
-    def _verify(self, rows: Iterable[StoredSimulation], due: int, fingerprint: str, run: VerifyingRun) -> bool | None:
-        """Simulate the first `due` rows again; for each new simulation that is stopped, a further row instead.
+    def _in_order(self, latest: Row | None, rows: list[Row]) -> Iterator[Row]:
+        """The row that was stored last, and the others in random order, failures last."""
+        if latest is not None:
+            yield latest
+        shuffled = [rows[place] for place in self._random.permutation(len(rows))]
+        yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
-        Whether rows were compared; failures alone do not count if another simulation was stopped. None if a row of
-        another label differs, and a new generation has begun.
-        """
-        rows, done, succeeded, reasons = iter(rows), 0, 0, []
-        attempts = max(due, MAX_ATTEMPTS)
-        while done < due and attempts > 0:
-            chosen = [row for row, _ in zip(rows, range(min(due - done, attempts)), strict=False)]
+    def _compare(self, rows: Iterable[Row], n: int, size: int, fingerprint: str, run: VerifyingRun) -> _Comparison:
+        """Simulate rows again, in batches of `size` and more, until n are compared, one differs, or too many stop."""
+        rows, compared, stopped = iter(rows), 0, []
+        while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
+            chosen = list(islice(rows, min(size, n - compared)))
             if not chosen:
                 break
-            attempts -= len(chosen)
-            for row, new in zip(chosen, self.again.simulate(fingerprint, chosen, run), strict=True):
+            size *= 4
+            thetas = np.array([np.frombuffer(row.theta, dtype="<f8") for row in chosen])
+            for row, new in zip(chosen, self._simulate(thetas, run), strict=True):
                 if is_transient(new.reason):
-                    reasons.append(new.reason)
-                elif self._differs(row, new, fingerprint, run):
-                    return None
+                    stopped.append(new.reason)
+                elif self._difference(row, new, fingerprint, run)[0]:
+                    return _Comparison(compared, stopped, row, new)
                 else:
-                    done += 1
-                    succeeded += not row.reason
-        self.cache.verified += done
-        if reasons:
+                    compared += 1
+        self.cache.verified += compared
+        return _Comparison(compared, stopped)
+
+    def _simulate(self, thetas: np.ndarray, run: VerifyingRun) -> list[Simulated]:
+        start, label = time.perf_counter(), self.label
+        new = simulate_again(run, thetas, label, self.complete)
+        if run.pool is None and label.observes:
+            label.has_changed_itself(label.changed(run.model))
+        self.seconds += time.perf_counter() - start
+        stopped = sum(is_transient(each.reason) for each in new)
+        self.compared, self.unverified = self.compared + len(new) - stopped, self.unverified + stopped
+        return new
+
+    def _pause(self, start: float) -> None:
+        """Compare nothing for a while, because no new simulation has ended since `start` [s]."""
+        now = time.monotonic()
+        self._trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
+
+    def _warn_of_stopped(self, result: _Comparison) -> None:
+        if result.stopped:
             logger.warning(
                 "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped (%s)%s",
                 self.cache.path,
-                len(reasons),
-                len(reasons) + done,
-                reasons[0],
-                "" if done else ". Rows are used without verification for a while",
+                len(result.stopped),
+                len(result.stopped) + result.compared,
+                result.stopped[0],
+                "" if result.compared else ". Rows are used without verification for a while",
             )
-        return bool(succeeded or (done and not reasons))
 
-    def _differs(self, row: StoredSimulation, new: Simulated, fingerprint: str, run: VerifyingRun) -> bool:
-        """Whether a row of another label differs, and a new generation has begun; `StaleCache` for other rows."""
-        label, tolerances = row.label, self.again.tolerances(run)
-        if label == -1:  # not read yet
-            generation = self._trust.generations.get(fingerprint)
-            label = 0 if generation is None else self.cache.label_of(fingerprint, row.theta, generation)
-        difference, change = _difference(row, new, run, tolerances[label])
-        if not difference:
-            return False
+    def _difference(self, row: Row, new: Simulated, fingerprint: str, run: VerifyingRun) -> tuple[str, float]:
+        """How a simulation differs from a stored one, in words and relative to the response norm; empty if it agrees.
+
+        A row of another or unknown processor may differ in the last digits.
+        """
+        misfit, reason = np.frombuffer(row.value, dtype="<f8"), reason_of(row)
+        if not reason and row.size is not None:  # a response
+            batch = SimulationBatch(misfit.reshape(1, len(run.model.channels), -1), [""])
+            (misfit,), (reason,) = misfit_of_responses(run.model, batch, run.measured, run.statistic)
+        other = run.tolerance is None and not row.cpu == self._trust.cpu != 0
+        return _difference(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
+
+    def _use_no_rows(self, result: _Comparison, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
+        """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
+        row, new, trust = result.row, result.new, self._trust
+        theta = np.frombuffer(row.theta, dtype="<f8")
+        difference, change = self._difference(row, new, fingerprint, run)
         start = time.perf_counter()
-        (once_more,) = simulate_again(run, row.theta[None])
-        self.again.seconds += time.perf_counter() - start
+        (once_more,) = simulate_again(run, theta[None])
+        self.seconds += time.perf_counter() - start
         scatter, spread = "", 0.0
         if not is_transient(once_more.reason):
-            first = StoredSimulation(row.theta, new.misfit, new.reason)
-            scatter, spread = _difference(first, once_more, run, tolerances[0], "first")
-        served = self._trust.served.total()
-        self._trust.start_again()
-        stored, labels = self._trust.stored, labels_of(self.cache.file, source_number(run.model.fingerprint))
-        if not scatter and label in {each.id for each in labels if stored and each.label != stored.label}:
+            scatter, spread = _difference(new.misfit, new.reason, once_more, run, run.accepted, "first")
+        served = trust.served.total()
+        trust.start_again()
+        labels = labels_of(self.cache.file, source_number(run.model.fingerprint))
+        if not scatter and sum(each.generation == generation for each in labels) > 1:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
-            self._adoption.begin(fingerprint, run)
+            self._begin(fingerprint, run)
             if not served:
-                return True
-        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, row.theta, strict=True))
+                return False
+        point = ", ".join(f"{n} = {value:.17g}" for n, value in zip(run.model.parameter_names, theta, strict=True))
         text = f"{self.cache.path}: a stored simulation is not that of this {type(run.model).__name__}. At {point}: "
         text += f"{difference}. {_NOT_REPEATABLE.format(scatter) if scatter else CHANGED}"
         if served:
@@ -376,39 +415,55 @@ class VerifiedCache:
                 ". If the model is not exactly repeatable, for example on another machine, accept differences of this "
                 f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
             )
-        raise StaleCache(text, row.theta)
-
-    def _notice_other_model(self, run: VerifyingRun) -> None:
-        """Verify all rows again if another model object was set."""
-        if run.model is not self._model:
-            if self._model is not None:
-                with self._trust.lock:
-                    self._trust.start_again()
-                    self._trust.stale = None
-                    self.again.found.clear()
-            self._model = run.model
-
-    def _in_random_order(self, thetas: np.ndarray, rows: list[int]) -> list[int]:
-        """Indices in random order, but rows that have just been simulated again come first."""
-        again = {key[-1] for key in self.again.found}
-        shuffled = self._random.sample(rows, len(rows))
-        return sorted(shuffled, key=lambda row: thetas[row].tobytes() not in again) if again else shuffled
+        trust.stale = fingerprint, generation, StaleCache(text, theta)
+        raise trust.stale[2]
 
 
 def _difference(
-    earlier: StoredSimulation, new: Simulated, run: VerifyingRun, tolerance: float, origin: str = "stored"
+    earlier: np.ndarray, reason: str, new: Simulated, run: VerifyingRun, tolerance: float, origin: str = "stored"
 ) -> tuple[str, float]:
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
-    if earlier.reason or new.reason:
-        if earlier.reason and new.reason:
+    if reason or new.reason:
+        if reason and new.reason:
             return "", 0.0
-        was, now = (f"failed ({text})" if text else "succeeded" for text in (earlier.reason, new.reason))
+        was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
         return f"it {was}; simulated again, it {now}", 0.0
-    found = difference_of(earlier.misfit, new, run, tolerance)
+    found = difference_of(earlier, new, run, tolerance)
     if found is None:
         return "", 0.0
     index, change = found
     names = [channel.name for channel in run.model.channels]
     what = "sum of squared residuals" if index < len(names) else f"statistic {index}"
-    values = f"{origin} {earlier.misfit[index]:.17g}, simulated again {new.misfit[index]:.17g}"
+    values = f"{origin} {earlier[index]:.17g}, simulated again {new.misfit[index]:.17g}"
     return f"channel {names[index % len(names)]!r}, {what}: {values}", change
+
+
+# coverage of the space ------------------------------------------------------------------------------------------------
+
+
+def choose_rows(rows: list[tuple[bytes, bytes]], n: int, rng: np.random.Generator) -> list[bytes]:
+    """Choose n of the rows, given by keys and parameters, that would show a change of the model in a part of the space.
+
+    The space is divided into n cells with about equal numbers of rows, and a random row of each cell is chosen. A
+    change that concerns a share p of the rows is then missed with a probability of at most (1 - p)^n, as with n random
+    rows, and less if the changed part is connected. Returns keys in random order.
+    """
+    keys = [key for key, _ in rows]
+    if len(rows) > n > 0:
+        thetas = np.frombuffer(b"".join([theta for _, theta in rows]), dtype="<f8").reshape(len(rows), -1)
+        scale = np.ptp(thetas, axis=0)
+        thetas = (thetas - thetas.min(axis=0)) / np.where(scale > 0.0, scale, 1.0)
+        keys = [keys[rng.choice(cell)] for cell in _cells(np.arange(len(rows)), thetas, n, rng)]
+    return [keys[place] for place in rng.permutation(len(keys))] if n > 0 else []
+
+
+def _cells(rows: np.ndarray, thetas: np.ndarray, n: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Divide rows into n parts, each time along the widest parameter (a random one of equally wide parameters)."""
+    if n == 1:
+        return [rows]
+    width = np.ptp(thetas[rows], axis=0)
+    axis = int(rng.choice(np.flatnonzero(width >= width.max())))
+    ordered = rows[np.argsort(thetas[rows, axis], kind="stable")]
+    left = n // 2
+    cut = min(max(round(len(rows) * left / n), left), len(rows) - (n - left))
+    return [*_cells(ordered[:cut], thetas, left, rng), *_cells(ordered[cut:], thetas, n - left, rng)]

@@ -1,20 +1,19 @@
 """The model of a simulator: whether it is still the same, and which stored simulations are its own.
 
 Results from two states of a model must not be mixed, as when a value is set between two batches or a file is edited. So
-label and fingerprint are compared before and after simulations, in about 1 % of the time. User code may change values
-itself, such as a counter. Therefore a difference alone is no error: the first and the latest simulation are repeated,
-and the model counts as unchanged if the results are the same.
+fingerprint, code, values and opened files are compared before and after simulations, in about 1 % of the time. User
+code may change values itself, such as a counter. Therefore a difference alone is no error: the first and the latest
+simulation are repeated, and the model counts as unchanged if the results are the same.
 """
 
-import copy
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
 
-from ..cache.comparison import VerifyingRun, difference_of, is_transient, response_tolerance, simulate_again
+from ..cache.comparison import VerifyingRun, difference_of, is_transient, simulate_again
 from ..cache.simulation_cache import SimulationCache
 from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
@@ -28,8 +27,9 @@ __all__ = ["CheckedModel"]
 
 _SHARE_OF_TIME = 0.01  # for comparisons
 _NO_TIME = 5e-5  # [s]; a comparison that takes less is always made, since storing a row takes longer
+_FINGERPRINT = "its fingerprint"
+_ROWS_PER_REPETITION = 100  # simulations between two repetitions if only items have changed that simulations change
 _OF_A_PROCESS = ("environment ", "library", "package ", "python")  # label items that may differ between processes
-_ROWS_PER_REPETITION = 100  # simulations between two repetitions if only `_changing` items have changed
 
 
 class CheckedModel:
@@ -47,9 +47,7 @@ class CheckedModel:
         label = ModelLabel(model, statistic)
         self.rows = None if cache is None else VerifiedCache(cache, model, pool, label)
         self._label = label
-        self._fingerprint = model.fingerprint
-        self._known = copy.copy(self.label)  # a copy, because the label of stored rows never changes
-        self._changing = self._known.changing  # label items that change without an effect on results
+        self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()
 
@@ -57,17 +55,14 @@ class CheckedModel:
         self.has_results = False
         self.unchecked: list[np.ndarray] = []
         self._points: list[tuple[np.ndarray, np.ndarray]] = []  # first and latest success: parameters, statistics
-        self._rows_since = 0  # since the last repetition
         self._not_before, self._last_seconds, self._is_due = -np.inf, np.inf, False
         self._was_sent = False  # from another process, by a pool whose workers import the code
 
     def __getstate__(self) -> tuple:
-        state = self.rows, self._label, self._fingerprint, self._known, self._changing, self._repeated
-        return *state, os.getpid()
+        return self.rows, self._label, self._known, self._repeated, os.getpid()
 
     def __setstate__(self, state: tuple) -> None:
-        *state, pid = state
-        self.rows, self._label, self._fingerprint, self._known, self._changing, self._repeated = state
+        self.rows, self._label, self._known, self._repeated, pid = state
         self._begin()
         self._was_sent = pid != os.getpid() and not is_arriving()  # by value
 
@@ -79,7 +74,7 @@ class CheckedModel:
     @property
     def compared(self) -> int:
         """Number of earlier simulations that were compared with a new one."""
-        return self._repeated + (0 if self.rows is None else self.rows.again.compared)
+        return self._repeated + (0 if self.rows is None else self.rows.compared)
 
     def complete(self, opened: Opened | None) -> None:
         """Add the files that simulations opened to the model's label."""
@@ -99,15 +94,15 @@ class CheckedModel:
         `earlier` returns a known simulation, parameters and statistics, to repeat if this process has run none. Raises
         `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
         """
-        self._know_more()
-        if not self._points:
-            if self.has_results:
-                self._points += earlier()
-            elif self._known.changed(run.model) <= self._changing:
-                self._known.renew(run.model)
-            else:  # nothing was used yet: the model is labelled as it is now
-                self._require_what_was_sent(run.model)
+        if not self._points and not self.has_results:
+            start, changed = time.monotonic(), self._changed(run.model)
+            self._renew(changed)
+            if not changed.keys() <= self.label.changing:  # nothing was used yet: the model is labelled as it is now
+                self._require_what_was_sent(run.model, changed)
                 self._set_up(run.model, run.statistic, None if self.rows is None else self.rows.cache, run.pool)
+            self._is_due, self._last_seconds = True, time.monotonic() - start
+            return
+        self._points = self._points or earlier()
         self._is_due = time.monotonic() >= self._not_before
         if self._is_due:
             self._require_same(run)
@@ -122,9 +117,7 @@ class CheckedModel:
         Not while others run (`last` is false). `seconds` is the wall time; with a pool that runs without interruption,
         the time since the last comparison. Raises `ChangedModel`, as `before`.
         """
-        self._know_more()
         self.unchecked.append(thetas)
-        self._rows_since += len(thetas)
         here = run.pool is None
         due = self._is_due and last and (here or _SHARE_OF_TIME * seconds >= self._last_seconds)
         succeeded = [row for row, reason in enumerate(reasons) if not reason]
@@ -137,10 +130,9 @@ class CheckedModel:
             self._points = [(self._points or points)[0], points[-1]]
         return due
 
-    def _require_what_was_sent(self, model: Model) -> None:
+    def _require_what_was_sent(self, model: Model, changed: Collection[str]) -> None:
         """Raise `ChangedModel` if this object was pickled in another process, where the code has other values."""
-        changed = self._known.changed(model) - self._changing
-        found = sorted(name for name in changed if not name.startswith(_OF_A_PROCESS))
+        found = sorted(name for name in set(changed) - self.label.changing if not name.startswith(_OF_A_PROCESS))
         if self._was_sent and found:
             raise ChangedModel(
                 f"the {type(model).__name__} in this process is not the one that was sent ({', '.join(found[:3])} "
@@ -149,51 +141,53 @@ class CheckedModel:
                 "make a new likelihood"
             )
 
-    def _know_more(self) -> None:
-        """Include what later simulations have opened and changed in the comparison."""
-        self._known.add(self.label.opened)
-        self._changing |= self.label.changing
+    def _changed(self, model: Model) -> dict[str, str | None]:
+        """Present digests of what has changed, None if it is gone; a file counts from when a simulation opened it."""
+        known = self.label.opened.items() | self._known
+        now = self.label.present(model) | {_FINGERPRINT: model.fingerprint}
+        return {name: now.get(name) for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
+
+    def _renew(self, changed: Mapping[str, str | None]) -> None:
+        # the same objects where nothing has changed, so that pickles stay small
+        self._known = {name: digest for name, digest in (self._known | changed).items() if digest is not None}
 
     def _require_same(self, run: VerifyingRun, simulated_here: bool = False) -> None:
         """Raise `ChangedModel` if the model has changed, except for values that it changes itself."""
-        start = time.monotonic()
-        same_fingerprint = run.model.fingerprint == self._fingerprint
-        changed = self._known.changed(run.model)
+        start, changed = time.monotonic(), self._changed(run.model)
         self._last_seconds = time.monotonic() - start
-        if same_fingerprint and not changed:
-            self.unchecked.clear()
-            return
-        why = "its fingerprint differs"
-        if same_fingerprint:
-            few = self._rows_since < _ROWS_PER_REPETITION or not self._points
-            if changed <= self._changing and few and not (simulated_here and not self._points):
+        if changed:
+            usual = changed.keys() <= self.label.changing
+            if usual and self._points and sum(map(len, self.unchecked)) < _ROWS_PER_REPETITION:
                 return
-            # the first simulation here may have changed values that it uses
-            if self._repeat(run) if self._points else simulated_here:
-                self._changing |= changed
-                self._known.has_changed_itself(changed)
-                self._known.renew(run.model)
-                self._rows_since = 0
-                self.unchecked.clear()
-                return
-            why = f"different: {', '.join(sorted(changed)[:3])}"
-            why += ", and an earlier simulation gives another result" if self._points else ""
-        raise ChangedModel(
-            f"the {type(run.model).__name__} has changed since the likelihood was made ({why}): "
-            "a value or file that it uses was changed, or another model was set. Its simulations cannot be stored with "
-            "the earlier ones. Make a new model and a new likelihood; what varies during a run has to be a parameter"
-        )
+            same = _FINGERPRINT not in changed
+            if same:  # the first simulation here may have changed values that it uses
+                same = self._repeat(run) if self._points else usual or simulated_here
+            if not same:
+                why = f"different: {', '.join(sorted(changed)[:3])}"
+                if self._points and _FINGERPRINT not in changed:
+                    why += ", and an earlier simulation gives another result"
+                raise ChangedModel(
+                    f"the {type(run.model).__name__} has changed since the likelihood was made ({why}): "
+                    "a value or file that it uses was changed, or another model was set. Its simulations cannot be "
+                    "stored with the earlier ones. Make a new model and a new likelihood; what varies during a run has "
+                    "to be a parameter"
+                )
+            self.label.has_changed_itself(changed)
+            self._renew(self._changed(run.model))
+        self.unchecked.clear()
+        self._last_seconds = time.monotonic() - start
 
     def _repeat(self, run: VerifyingRun) -> bool:
         """Whether the repeated simulations give the earlier results, or the model is not repeatable."""
         thetas = np.array([theta for theta, _ in self._points])
-        tolerance = response_tolerance(run.model) if run.tolerance is None else run.tolerance
 
         def same_as(earlier: list[np.ndarray]) -> tuple[bool, list[np.ndarray]]:
             new = simulate_again(run, thetas)
             self._repeated += len(thetas)
             pairs = zip(earlier, new, strict=True)
-            agree = (is_transient(n.reason) or not (n.reason or difference_of(e, n, run, tolerance)) for e, n in pairs)
+            agree = (
+                is_transient(n.reason) or not (n.reason or difference_of(e, n, run, run.accepted)) for e, n in pairs
+            )
             return all(agree), [each.misfit for each in new]
 
         same, repeated = same_as([misfit for _, misfit in self._points])

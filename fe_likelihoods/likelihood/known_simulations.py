@@ -1,4 +1,4 @@
-"""Results of earlier simulations: statistics in memory, on disk, then responses in memory, on disk, then failures.
+"""Results of earlier simulations: statistics in memory and on disk, then responses in memory and on disk.
 
 Statistics are computed from a cached response, which is in double precision, with the same bits as from a new
 simulation.
@@ -83,7 +83,6 @@ class KnownSimulations:
         size = most_responses(run.model)
         for start in range(0, len(left), size):
             self._fill_responses(requested, left[start : start + size], run)
-        self._fill_failures(requested, np.flatnonzero(~requested.cached & ~requested.known), run)
 
     def _fill_statistics(self, requested: Requested, run: VerifyingRun) -> None:
         """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
@@ -91,8 +90,9 @@ class KnownSimulations:
         if self._checked.rows is None or not len(new):
             return
         stored = self._verified(self._checked.rows.look_up, self._key, requested.thetas[new], run)
-        rows = new[stored.known]
-        requested.misfit[rows] = stored.misfit[stored.known]
+        known = stored.known
+        rows = new[known]
+        requested.misfit[rows] = stored.values[known]
         requested.known[rows] = requested.on_disk[rows] = True
         for row, reason in zip(new, stored.reasons, strict=True):
             requested.reasons[row] = reason
@@ -145,17 +145,6 @@ class KnownSimulations:
             if stored_rows is not None:
                 stored_rows.store(self._key, requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run)
         requested.cached[rows] = True
-
-    def _fill_failures(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
-        """Fill in rows whose simulation is known to fail for any measurements."""
-        if self._checked.rows is None or not len(rows):
-            return
-        reasons = self._verified(self._checked.rows.look_up_failures, requested.thetas[rows], run)
-        for row, reason in zip(rows, reasons, strict=True):
-            requested.reasons[row] = reason
-        rows = rows[[bool(reason) for reason in reasons]]
-        requested.known[rows] = requested.cached[rows] = requested.on_disk[rows] = True
-        self._note(requested, rows, run)
 
     def _note(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
         """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""

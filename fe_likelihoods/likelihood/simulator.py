@@ -135,7 +135,7 @@ class Simulator:
     def seconds(self) -> float:
         """Wall time of the simulations [s], including verification."""
         rows = self._checked.rows
-        return self._seconds + (0.0 if rows is None else rows.again.seconds)
+        return self._seconds + (0.0 if rows is None else rows.seconds)
 
     @property
     def verifications(self) -> int:
@@ -145,7 +145,7 @@ class Simulator:
     @property
     def unverified(self) -> int:
         """Number of rows that could not be compared, because the new simulation was stopped (`TransientReason`)."""
-        return 0 if self._checked.rows is None else self._checked.rows.again.unverified
+        return 0 if self._checked.rows is None else self._checked.rows.unverified
 
     def report(self) -> dict:
         """Summary of the simulations that were requested in this process, see `Posterior.report`."""

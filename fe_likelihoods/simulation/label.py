@@ -105,11 +105,6 @@ class ModelLabel:
         return _joined(items or {"kernels": KERNEL_HASH})
 
     @property
-    def text(self) -> str:
-        """The whole label: `code`, and a digest of the opened files."""
-        return f"{self.code} {_joined(self.opened.items())}"
-
-    @property
     def known(self) -> Opened | None:
         """What simulations of this process opened; None before the first simulation."""
         return self.opened if self._was_observed else None
@@ -123,10 +118,13 @@ class ModelLabel:
         _opened[self.code] = self.opened
         return True
 
+    def present(self, model: Any) -> dict[str, str]:
+        """The items of a model in its present state, and of the files that simulations opened."""
+        return self._present(model) | self.opened.read_again().items()
+
     def changed(self, model: Any) -> set[str]:
         """Names of the items that differ from the label."""
-        known = self.items | self.opened.items()
-        now = self._present(model) | self.opened.read_again().items()
+        known, now = self.items | self.opened.items(), self.present(model)
         return {name for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def has_changed_itself(self, names: Iterable[str]) -> None:
@@ -138,14 +136,6 @@ class ModelLabel:
     def changing(self) -> set[str]:
         """Names of items that simulations of this process have changed."""
         return self.items.keys() & _first.keys()
-
-    def renew(self, model: Any) -> None:
-        """Update the label to the present state."""
-        known, now = self.items, self._present(model)
-        # the same objects where nothing has changed, so that pickles stay small
-        same = {name: digest for name, digest in known.items() if now.get(name) == digest}
-        self.items = same | {name: digest for name, digest in now.items() if name not in same}
-        self.opened = self.opened.read_again()
 
     def _present(self, model: Any) -> dict[str, str]:
         parts: dict[str, Any] = model.code_parts() if hasattr(model, "code_parts") else {}

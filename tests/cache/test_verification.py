@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import AutoregressiveNoise, FELikelihood, LinearOscillator, Measurements, Record, SimulationCache
-from fe_likelihoods.cache import labels, rows, verification
+from fe_likelihoods.cache import labels, verification
 from fe_likelihoods.cache.comparison import largest_difference, response_tolerance
 from fe_likelihoods.cache.verification import StaleCache
 from fe_likelihoods.simulation.faults import ChangedModel, TransientReason
@@ -288,12 +288,10 @@ def test_compiled_models_are_compared_to_the_last_bit(path):
     assert response_tolerance(type("Own", (LinearOscillator,), {})(model.record)) == 1e-9
     misfit = np.nextafter(likelihood.misfit([[1.1, 0.9]]), np.inf)
     likelihood.simulator.cache.clear()
-    (stored,) = labels.labels_of(likelihood.simulator.cache.file, rows.source_number(model.fingerprint))
-    place = stored.generation, stored.id
-    likelihood.simulator.cache.store(
-        likelihood.simulator.simulation_key, np.array([[1.1, 0.9]]), 50, misfit, [""], 1.0, *place
-    )
-    labels._shared.clear()  # as in a new process
+    simulator = likelihood.simulator
+    place = np.array([[1.1, 0.9]]), misfit, [""], None, 1.0, simulator._run
+    simulator._checked.rows.store(simulator.simulation_key, *place)
+    labels._trusts.clear()  # as in a new process
     with pytest.raises(StaleCache, match="channel 'displacement'"):
         oscillator(path).misfit([[1.1, 0.9]])
 
@@ -436,7 +434,7 @@ def test_a_process_verifies_a_model_of_the_library_once(path, of_library):
         return sum(part.simulator.verifications for part in parts)
 
     misfit()
-    labels._shared.clear()  # as in a new process
+    labels._trusts.clear()  # as in a new process
     assert [misfit() for _ in range(3)] == ([3, 0, 0] if of_library else [2, 2, 2])
 
 
@@ -460,7 +458,7 @@ def test_a_file_that_replaces_another_one_is_verified(path):
 
 def test_a_process_verifies_once_for_all_copies_of_a_likelihood(filled, thetas, monkeypatch):
     data = pickle.dumps(likelihood_of(Scaled(), filled))
-    monkeypatch.setattr(labels, "_by_token", OrderedDict())  # as in a new process
+    monkeypatch.setattr(labels, "_trusts", OrderedDict())  # as in a new process
     copies = [pickle.loads(data) for _ in range(3)]  # as for the tasks of a pool
     for copy in copies:
         copy.misfit(thetas[:20])

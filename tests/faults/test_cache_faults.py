@@ -105,7 +105,7 @@ def write_until_killed(path, kill, max_rows, pipe):
     cache = SimulationCache(path, max_rows=max_rows)
     for number in range(10_000):
         thetas = batch_of(kill, number)
-        cache.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+        cache.store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
         pipe.send_bytes(number.to_bytes(4, "little"))
 
 
@@ -120,7 +120,9 @@ def test_killed_while_writing(path, rng, kills, max_rows):
         process = FORK.Process(target=write_until_killed, args=(path, kill, max_rows, sender))
         process.start()
         sender.close()
-        assert receiver.poll(30)
+        for _ in range(6):  # also on a busy machine
+            assert receiver.poll(30)
+            acknowledged.append((kill, int.from_bytes(receiver.recv_bytes(), "little")))
         time.sleep(rng.uniform(0.0, 0.02))
         process.kill()
         process.join(60)
@@ -135,14 +137,14 @@ def test_killed_while_writing(path, rng, kills, max_rows):
     known, expected = [], 0
     for kill, number in acknowledged:
         thetas = batch_of(kill, number)
-        found = cache.look_up(FINGERPRINT, thetas, 2, 8)
-        np.testing.assert_array_equal(found.misfit[found.known], sums_of(thetas)[found.known])
+        found = cache.look_up(FINGERPRINT, thetas, 2)
+        np.testing.assert_array_equal(found.values[found.known], sums_of(thetas)[found.known])
         known += found.known.tolist()
         expected += len(thetas)
     # the batch that a killed process may have stored without acknowledging it
     for kill in range(kills):
         thetas = batch_of(kill, 1 + max((n for k, n in acknowledged if k == kill), default=-1))
-        share = cache.look_up(FINGERPRINT, thetas, 2, 8).known.mean()
+        share = cache.look_up(FINGERPRINT, thetas, 2).known.mean()
         assert share in (0.0, 1.0) or max_rows == 1_000
     assert cache.damaged == 0
     if max_rows == 1_000:
@@ -169,8 +171,8 @@ def test_a_killed_writer_does_not_block_others(path):
     process.kill()
     process.join()
     thetas = batch_of(0, 0)
-    cache.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
-    assert cache.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+    cache.store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
+    assert cache.look_up(FINGERPRINT, thetas, 2).known.all()
 
 
 @pytest.mark.slow
@@ -218,14 +220,14 @@ def test_programs_that_create_a_cache_at_the_same_moment(tmp_path):
 
         def begin(number, path=path):
             thetas = batch_of(1, number)
-            SimulationCache(path).store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+            SimulationCache(path).store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
 
         assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
         assert integrity(path) == [("ok",)]
         cache = SimulationCache(path)
         for number in range(6):
             thetas = batch_of(1, number)
-            np.testing.assert_array_equal(cache.look_up(FINGERPRINT, thetas, 2, 8).misfit, sums_of(thetas))
+            np.testing.assert_array_equal(cache.look_up(FINGERPRINT, thetas, 2).values, sums_of(thetas))
 
 
 def test_two_programs_on_one_cache(path, thetas, expected):
@@ -285,12 +287,12 @@ def overwritten_in_the_middle(path):
 
 
 def another_column(path):
-    path.write_bytes(path.read_bytes().replace(b"misfit BLOB", b"misfet BLOB"))
+    path.write_bytes(path.read_bytes().replace(b"theta BLOB", b"thete BLOB"))
 
 
 def without_a_table(path):
     with sqlite3.connect(path) as connection:
-        connection.execute("DROP TABLE simulations")
+        connection.execute("DROP TABLE rows")
     connection.close()
 
 
@@ -323,6 +325,9 @@ def test_a_damaged_file_is_set_aside(filled, thetas, expected, caplog, damage, b
 @pytest.mark.parametrize("page", ["leaf", "index"])
 def test_a_bad_page_loses_its_own_rows_only(filled, thetas, expected, caplog, page):
     """The others are copied to the new cache, and counted."""
+    with sqlite3.connect(filled) as connection:
+        ((rows,),) = connection.execute("SELECT count(*) FROM rows").fetchall()
+    connection.close()
     data = bytearray(filled.read_bytes())
     kind = {"leaf": 0x0D, "index": 0x0A}[page]
     pages = [start for start in range(4096, len(data), 4096) if data[start] == kind]
@@ -332,9 +337,9 @@ def test_a_bad_page_loses_its_own_rows_only(filled, thetas, expected, caplog, pa
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     (message,) = (r.getMessage() for r in caplog.records if "were salvaged" in r.getMessage())
-    kept, responses = (int(word) for word in message.split() if word.isdigit())
-    assert kept == likelihood.simulator.disk_hits and responses == 0
-    assert kept == len(thetas) if page == "index" else 0 < kept < len(thetas)
+    (kept,) = (int(word) for word in message.split() if word.isdigit())
+    assert kept >= likelihood.simulator.disk_hits
+    assert likelihood.simulator.disk_hits == len(thetas) if page == "index" else 0 < kept < rows
 
 
 def test_a_file_that_was_cut_off_keeps_its_first_rows(filled, thetas, expected, caplog):
@@ -343,7 +348,7 @@ def test_a_file_that_was_cut_off_keeps_its_first_rows(filled, thetas, expected, 
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     assert 0 < likelihood.simulator.disk_hits < len(thetas)
-    assert f"{likelihood.simulator.disk_hits} simulations and 0 responses were salvaged" in caplog.text
+    assert "rows were salvaged" in caplog.text
 
 
 @pytest.mark.parametrize("damage", [no_database, *DAMAGES], ids=lambda damage: damage.__name__)
@@ -404,7 +409,7 @@ def test_damage_anywhere_is_never_a_wrong_value(filled, thetas, expected, rng, h
     assert how != "bytes" or served > 0
 
 
-TEXTS = [b"PRIMARY KEY", b"n_channels", b"time_limit", b"simulation_generations"]
+TEXTS = [b"PRIMARY KEY", b"generation INTEGER", b"time_limit", b"row_generations"]
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.decode())
@@ -438,15 +443,15 @@ def test_a_wrong_byte_in_the_header_is_damage_or_another_file(filled, thetas, ex
 @pytest.mark.parametrize(
     "change",
     [
-        "misfit = (SELECT misfit FROM simulations WHERE id = 9)",
-        "misfit = zeroblob(16)",
-        "misfit = zeroblob(8)",
-        "misfit = 'text'",
-        "misfit = 17",
+        "value = (SELECT value FROM rows WHERE id = 9)",
+        "value = zeroblob(16)",
+        "value = zeroblob(8)",
+        "value = 'text'",
+        "value = 17",
         "reason = CAST('it failed' AS BLOB)",
         "reason = 'text'",
-        "n_steps = 21",
-        "n_steps = 1.5",
+        "generation = generation + 1",
+        "time_limit = 1.5",
         "seconds = 'soon'",
         "seconds = seconds + 1",
         "crc = crc + 1",
@@ -455,7 +460,7 @@ def test_a_wrong_byte_in_the_header_is_damage_or_another_file(filled, thetas, ex
 )
 def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):
     with sqlite3.connect(filled) as connection:
-        connection.execute(f"UPDATE simulations SET {change} WHERE id = 5")
+        connection.execute(f"UPDATE rows SET {change} WHERE id = 5")
     connection.close()
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
@@ -469,9 +474,9 @@ def test_a_damaged_row_is_missing(filled, thetas, expected, caplog, change):
 
 def test_rows_under_each_others_key_are_missing(filled, thetas, expected):
     with sqlite3.connect(filled) as connection:
-        keys = dict(connection.execute("SELECT id, key FROM simulations WHERE id IN (5, 9)").fetchall())
+        keys = dict(connection.execute("SELECT id, key FROM rows WHERE id IN (5, 9)").fetchall())
         for row, key in ((5, b"aside"), (9, keys[5]), (5, keys[9])):
-            connection.execute("UPDATE simulations SET key = ? WHERE id = ?", (key, row))
+            connection.execute("UPDATE rows SET key = ? WHERE id = ?", (key, row))
     connection.close()
     likelihood = likelihood_of(filled)
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
@@ -485,13 +490,13 @@ def test_programs_that_find_a_damaged_file_at_once(filled):
 
     def begin(number):
         thetas = batch_of(2, number)
-        SimulationCache(filled).store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
+        SimulationCache(filled).store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
 
     assert at_once(begin, [(number,) for number in range(6)]) == [0] * 6
     (aside,) = filled.parent.glob("*.damaged-*")
     assert aside.read_bytes() == data
     cache = SimulationCache(filled)
-    assert all(cache.look_up(FINGERPRINT, batch_of(2, n), 2, 8).known.all() for n in range(6))
+    assert all(cache.look_up(FINGERPRINT, batch_of(2, n), 2).known.all() for n in range(6))
 
 
 def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, monkeypatch):
@@ -512,9 +517,9 @@ def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, m
 def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
     """The log is renamed together with the damaged file."""
     keep = sqlite3.connect(filled)  # an open connection keeps the log
-    keep.execute("SELECT count(*) FROM simulations").fetchall()
+    keep.execute("SELECT count(*) FROM rows").fetchall()
     cache = SimulationCache(filled)
-    cache.store(FINGERPRINT, thetas, 20, sums_of(thetas), [""] * len(thetas), 1.0)
+    cache.store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
     log = filled.with_name(filled.name + "-wal")
     assert log.stat().st_size > 0
     cache.file.set_aside("for a test")
@@ -526,16 +531,16 @@ def test_a_log_left_behind_is_not_taken_for_that_of_a_new_file(filled, thetas):
 def test_a_connection_to_the_damaged_file_does_not_affect_the_new_one(filled, thetas):
     """SQLite removes the log by its name when the last connection closes; it must not remove that of the new file."""
     first, second = SimulationCache(filled), SimulationCache(filled)
-    second.look_up(FINGERPRINT, thetas, 2, 8)
+    second.look_up(FINGERPRINT, thetas, 2)
     first.file.set_aside("for a test")
     for number, cache in enumerate((first, second)):
         batch = batch_of(3, number)
-        cache.store(FINGERPRINT, batch, 8, sums_of(batch), [""] * len(batch), 1.0)
+        cache.store(FINGERPRINT, batch, sums_of(batch), [""] * len(batch), 1.0)
     second.close()
     third = SimulationCache(filled)
-    assert third.look_up(FINGERPRINT, batch_of(3, 0), 2, 8).known.all()
-    first.store(FINGERPRINT, thetas, 8, sums_of(thetas), [""] * len(thetas), 1.0)
-    assert third.look_up(FINGERPRINT, thetas, 2, 8).known.all()
+    assert third.look_up(FINGERPRINT, batch_of(3, 0), 2).known.all()
+    first.store(FINGERPRINT, thetas, sums_of(thetas), [""] * len(thetas), 1.0)
+    assert third.look_up(FINGERPRINT, thetas, 2).known.all()
     for cache in (first, third):
         cache.close()
     assert integrity(filled) == [("ok",)]

@@ -310,7 +310,7 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         stored, key = posterior.likelihood.simulator.cache, posterior.likelihood.simulator.simulation_key
         (tmp_path / "go").touch()  # the queue is closed: what runs is cached, what waits is cancelled
         stop = time.monotonic() + 60.0
-        while not stored.are_stored([key], np.array([[0.95, 0.1]]))[0]:
+        while not stored.are_stored(key, np.array([[0.95, 0.1]]))[0]:
             assert time.monotonic() < stop
             time.sleep(0.05)
         assert posterior.likelihood.simulations < len(many) + 3 + 1 + len(waiting)

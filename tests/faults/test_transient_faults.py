@@ -29,6 +29,7 @@ from fe_likelihoods.simulation.faults import TransientReason
 from fe_likelihoods.simulation.local_pool import LocalPool
 from fe_likelihoods.simulation.model import misfit_batch, misfit_of_responses, simulate_batch
 from samplers import SMCSampler
+from tests.cache.stored import store_outcomes, stored_outcomes
 from tests.faults import treacherous as bad
 from tests.faults.treacherous import CHANNELS, DT, N_STEPS, Treacherous, line
 
@@ -140,12 +141,12 @@ def test_a_failure_that_depends_on_the_measurements_is_not_used_for_others(tmp_p
     other = likelihood_of(Faulty(), cache)
     assert np.isfinite(other.misfit(THETAS)).all()
     far = misfit_batch(Faulty(), THETAS, np.full((1, N_STEPS), 100.0), statistic=_undefined)
-    cache.store_failures(Faulty(), THETAS, far.reasons)
+    store_outcomes(cache, Faulty(), THETAS, far.reasons)
     assert far.reasons == ["ZeroDivisionError: the statistic is not defined"] * 3
     responses = simulate_batch(Faulty(), THETAS)
     known = misfit_of_responses(Faulty(), responses, np.full((1, N_STEPS), 100.0), _undefined)
     assert known.reasons == far.reasons and np.isnan(known.misfit).all()
-    assert cache.look_up_failures(Faulty(), THETAS) == [""] * 3
+    assert stored_outcomes(cache, Faulty(), THETAS) == [None] * 3
 
 
 # time limits ---------------------------------------------------------------------------------------------------------
@@ -180,15 +181,15 @@ def test_a_damaged_or_evicted_time_limit_is_simulated_again(tmp_path):
     for _ in range(2):
         likelihood_of(stopped(5.0), path).misfit(THETAS)
     cache = SimulationCache(path)
-    assert cache.look_up_failures(stopped(5.0), THETAS)[1] == "stopped at the time limit of 5 s"
-    cache.file.connection().execute("UPDATE failures SET time_limit = 500.0")
-    assert cache.look_up_failures(stopped(5.0), THETAS) == [""] * 3
+    assert stored_outcomes(cache, stopped(5.0), THETAS)[1] == "stopped at the time limit of 5 s"
+    cache.file.connection().execute("UPDATE rows SET time_limit = 500.0")
+    assert stored_outcomes(cache, stopped(5.0), THETAS) == [None] * 3
     assert cache.damaged == 1
     small = SimulationCache(path, max_rows=2)
-    small.store_failures(Faulty(), THETAS, ["a", "b", "c"])
-    assert small.look_up_failures(Faulty(), THETAS) == ["", "b", "c"]
+    store_outcomes(small, Faulty(), THETAS, ["a", "b", "c"])
+    assert stored_outcomes(small, Faulty(), THETAS) == [None, "b", "c"]
     small.clear()
-    assert small.look_up_failures(Faulty(), THETAS) == [""] * 3
+    assert stored_outcomes(small, Faulty(), THETAS) == [None] * 3
 
 
 def sleeps(theta):

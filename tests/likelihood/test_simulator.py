@@ -270,7 +270,7 @@ def test_statistics_from_stored_responses(path, thetas):
     assert second.simulator.disk_hits == second.simulator.cache_hits == 40
     assert second.simulator.failures.records == first.simulator.failures.records and first.simulator.failures.count > 0
     third = likelihood_of(Line(), AutoregressiveNoise(Line.channels), cache=path)
-    first.simulator.cache.file.connection().execute("DELETE FROM responses")
+    first.simulator.cache.file.connection().execute("DELETE FROM rows WHERE size > 0")
     assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
 
 
@@ -295,8 +295,9 @@ def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
 def test_a_damaged_response_is_simulated_again(path, thetas):
     expected = likelihood_of(Line(), cache=SimulationCache(path, responses=True)).simulate(thetas).response
     cache = SimulationCache(path, responses=True)
-    cache.file.connection().execute("UPDATE responses SET response = x'00' WHERE id <= 5")
-    cache.file.connection().execute("UPDATE responses SET response = 'text' WHERE id = 6")
+    places = [place for (place,) in cache.file.select("SELECT id FROM rows WHERE size > 0 ORDER BY id LIMIT 6")]
+    for value, some in (("x'00'", places[:5]), ("'text'", places[5:])):
+        cache.file.write((f"UPDATE rows SET value = {value} WHERE id = ?", [(place,) for place in some]))
     likelihood = likelihood_of(Line(), cache=cache)
     np.testing.assert_array_equal(likelihood.simulate(thetas).response, expected)
     assert likelihood.simulations == cache.damaged == 6
