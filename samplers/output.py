@@ -29,7 +29,8 @@ __all__ = ["DAMAGED", "Output", "make_group", "run_of_file"]
 
 logger = logging.getLogger(__name__)
 
-DAMAGED, CHECKSUM = "damaged", "checksum"
+DAMAGED = "damaged"
+CHECKSUM = "checksum"
 STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 

@@ -9,7 +9,7 @@ from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
-from .evaluation.target import Target
+from .evaluation.user_target import Target
 from .judgement.failures import NearFailures
 from .judgement.verdict import RunParts, Verdict
 from .record import Record

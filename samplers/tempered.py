@@ -29,7 +29,7 @@ from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
 from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, check_asynchronous
 from .evaluation.evaluator import Evaluator, FailureLimit, most_common_reasons, unpack
-from .evaluation.target import Target
+from .evaluation.user_target import Target
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood
 from .judgement.failures import judged_failures

@@ -10,8 +10,7 @@ import hashlib
 import logging
 import threading
 from asyncio import CancelledError
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..interrupts import Ended, SentFunction, deferred_interrupts, interrupts_en
 from ..record import Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .evaluator import Evaluator
-from .target import Target
+from .user_target import Target
 from .values import Failed
 
 __all__ = ["AsynchronousEvaluator", "EvaluationQueue", "advise_on_pool", "check_asynchronous"]
@@ -103,7 +102,7 @@ class AsynchronousEvaluator(Evaluator):
                 raise ValueError(
                     "this sampler was begun with a pool, which is not stored with it: set its attribute pool"
                 )
-            self._queue = PoolQueue(self.target, self.pool)
+            self._queue = PoolQueue(self.target.caught, self.pool, self.target.as_points)
         return self._queue
 
     @property
@@ -201,12 +200,14 @@ class AsynchronousEvaluator(Evaluator):
 
 
 class PoolQueue:
-    """A function of one point in a pool: a `concurrent.futures.Executor`, as mpi4py and loky have, or a dask client."""
+    """A function of one point in a pool: a `concurrent.futures.Executor`, as mpi4py and loky have, or a dask client.
 
-    def __init__(self, target: Target, pool: Any):
-        self._target, self._function, self._pool = target, SentFunction(target.caught), pool
-        self._futures: dict[int, Any] = {}  # of points that were not collected
-        self._ended: dict[int, None] = {}  # tickets in the order of completion
+    The function can be sent to the workers; `as_items` converts points (n, ndim) to its arguments.
+    """
+
+    def __init__(self, function: Callable, pool: Any, as_items: Callable[[Any], Sequence]):
+        self._function, self._pool, self._as_items = SentFunction(function), pool, as_items
+        self._futures: dict[int, Any] = {}  # of points that were not collected, by ticket
         self._handed: list[int] = []  # what the last `collect` returned: the caller may not have received it
         self._arrived = threading.Event()
         self._submitted = 0
@@ -222,7 +223,7 @@ class PoolQueue:
 
     def submit(self, coords: Any) -> list[int]:
         """Begin to evaluate points (n, ndim) without waiting; returns a number for each."""
-        items = self._target.as_points(coords)
+        items = self._as_items(coords)
         tickets = list(range(self._submitted, self._submitted + len(items)))
         self._submitted += len(items)
         if hasattr(self._pool, "gather"):  # dask sends the function once with all points
@@ -231,25 +232,19 @@ class PoolQueue:
             futures = (self._pool.submit(self._function, item) for item in items)
         for ticket, future in zip(tickets, futures, strict=True):
             self._futures[ticket] = future
-            future.add_done_callback(partial(self._enter, ticket))
+            future.add_done_callback(lambda _: self._arrived.set())
         return tickets
-
-    def _enter(self, ticket: int, _: Any) -> None:
-        self._ended[ticket] = None
-        self._arrived.set()
 
     @interrupts_end_the_run()
     def collect(self) -> list[tuple[int, Any]]:
-        """Wait for a finished point; returns numbers and values of all finished points, in the order of completion.
+        """Wait for a finished point; returns numbers and values of all finished points.
 
-        Raises KeyboardInterrupt or SystemExit if the function has raised it, and RuntimeError if no point is running or
-        the pool cannot continue. Points that finished before are returned first.
+        Raises KeyboardInterrupt or SystemExit if the function has raised it, and RuntimeError if the pool cannot
+        continue. Points that finished before are returned first.
         """
-        for ticket in self._handed:
-            self._ended.pop(ticket, None)  # first: `ended` may be called if Ctrl-C comes between the two
-            self._futures.pop(ticket, None)
-        self._handed = []
-        while not self._ended:
+        while self._handed:
+            self._futures.pop(self._handed.pop(), None)
+        while not any(future.done() for future in self._futures.values()):
             self._arrived.wait()
             self._arrived.clear()
         collected, error = self._fetch()
@@ -270,8 +265,10 @@ class PoolQueue:
     def _fetch(self, seconds: float | None = None) -> tuple[list[tuple[int, Any]], BaseException | None]:
         """Numbers and values of the points that have ended, and an error that no point has caused, if any."""
         fetched, fault = [], None
-        for ticket in list(self._ended):
-            future, value = self._futures[ticket], None
+        for ticket, future in list(self._futures.items()):
+            if not future.done():
+                continue
+            value = None
             try:  # `exception` does not raise what the function raised, which may be KeyboardInterrupt
                 error = future.exception(seconds)
                 value = future.result(seconds) if error is None else None

@@ -15,7 +15,7 @@ from ..blobs import converted
 from ..budget import Budget, BudgetExhausted
 from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
-from .target import Target, map_in
+from .user_target import Target, map_in
 
 __all__ = ["Evaluator", "FailureLimit", "most_common_reasons", "unpack"]
 

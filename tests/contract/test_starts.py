@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.evaluation.target import Target
+from samplers.evaluation.user_target import Target
 from tests.contract.targets import Gaussian
 
 N = 60

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.evaluation.target import Target
+from samplers.evaluation.user_target import Target
 from samplers.judgement import failures
 from samplers.judgement.failures import NearFailures, failures_near, judged_failures
 from tests.contract.targets import Box, Gaussian
