@@ -55,7 +55,7 @@ class Output:
     def begin(self, run: str) -> None:
         """A new annealing begins, without results."""
         self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
-        self._write(run)
+        self._write(run, keep=False)
 
     def step_stored(self) -> None:
         """A step has been stored completely."""
@@ -122,7 +122,12 @@ class Output:
         except (OSError, FileHeld) as error:
             logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
 
-    def _write(self, run: str | None = None) -> None:
+    def keep_state(self, state: State | None) -> None:
+        """Store the state from which a chain without steps continues, also in another process."""
+        self._write(keep=False, state=state)
+
+    def _write(self, run: str | None = None, keep: bool = True, state: State | None = None) -> None:
+        """Write the results, the name of a `run`, and a state in place of the stored one, unless that is to `keep`."""
         result, backend = self.result, self._backend
         self._counts = int(backend.iteration), np.array(backend.accepted)
         contents = {
@@ -141,7 +146,15 @@ class Output:
             group = file[backend.name]
             if run is not None:
                 group.attrs["run"] = run
+            if not keep:
                 group.pop("restart", None)
+            if state is not None and state.log_prob is not None:
+                kept = group.create_group("restart")
+                for name in ("coords", "log_prob", "blobs"):
+                    if (values := getattr(state, name)) is not None:
+                        kept.create_dataset(name, data=values)
+                for i, value in enumerate(state.random_state or ()):
+                    kept.attrs[f"random_state_{i}"] = value
             group.pop("tempering", None)
             group.create_dataset("tempering", data=data)
             self._seal(group)
@@ -160,7 +173,8 @@ class Output:
             if group is None:
                 return None
             values = {name: dataset[...] for name, dataset in group.items()}
-        return State(values.pop("coords"), **values, random_state=backend.random_state)
+            random_state = tuple(value for _, value in sorted(group.attrs.items())) or backend.random_state
+        return State(values.pop("coords"), **values, random_state=random_state)
 
     def mark_again(self, run: str) -> bool:
         """Mark a file whose chain emcee has reset as the file of a run; returns whether this was needed."""
@@ -172,27 +186,10 @@ class Output:
         self._write(run)
         return True
 
-    def keep_state(self, state: State | None) -> None:
-        """Store the state from which a chain without steps continues, also in another process."""
-        if not isinstance(self._backend, HDFBackend):
-            return
-        with self._backend.open("a") as file:
-            group = file[self._backend.name]
-            group.pop("restart", None)
-            if state is not None and state.log_prob is not None:
-                kept = group.create_group("restart")
-                for name in ("coords", "log_prob", "blobs"):
-                    if (values := getattr(state, name)) is not None:
-                        kept.create_dataset(name, data=values)
-                for i, value in enumerate(state.random_state or ()):
-                    group.attrs[f"random_state_{i}"] = value
-            self._seal(group)
-
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
         cut_chain(self._backend, 0)
         self.first_step, self.provisional = 0, False
-        self._write()
         self.keep_state(state)
 
     def store_provisional_step(self, state: State) -> None:
@@ -244,12 +241,16 @@ def _checksum_of_steps(group: h5py.Group, known: int = 0, checksum: int = 0) -> 
 
 
 def _checksum(group: h5py.Group, of_steps: int) -> int:
-    """CRC-32 of a chain: of its steps, counts, results, restart state and random state."""
-    parts = [group.attrs[name] for name in sorted(group.attrs) if name.startswith(("iteration", "random_state_"))]
-    parts += [group[name][...] for name in ("accepted", "tempering") if name in group]
-    parts += [dataset[...] for _, dataset in sorted(group.get("restart", {}).items())]
-    for part in parts:
-        of_steps = zlib.crc32(part.tobytes() if hasattr(part, "tobytes") else repr(part).encode(), of_steps)
+    """CRC-32 of a chain: of its steps, counts, results, restart state and random states."""
+    parts = [(name, group.attrs[name]) for name in group.attrs if name.startswith(("iteration", "random_state_"))]
+    parts += [(name, group[name][...]) for name in ("accepted", "tempering") if name in group]
+    if "restart" in group:
+        parts += [("restart", b"")]
+        parts += [(name, value[...]) for name, value in group["restart"].items()]
+        parts += [(f"restart {name}", value) for name, value in group["restart"].attrs.items()]
+    for name, part in sorted(parts, key=lambda each: each[0]):
+        data = part.tobytes() if hasattr(part, "tobytes") else repr(part).encode()
+        of_steps = zlib.crc32(name.encode() + data, of_steps)
     return of_steps
 
 

@@ -4,6 +4,12 @@ Points are submitted as soon as they are proposed, to a pool or to the queue of 
 contains the finished points and, for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had
 arrived before it, so that an interrupted run, when repeated, makes the same decisions and continues with the same bits.
 Points that were running when the process ended are submitted again.
+
+A queue, ``posterior.evaluation_queue()`` or `PoolQueue`, has the methods ``submit(coords)``, which returns a ticket for
+each point without waiting, ``collect()``, which waits for a finished point and returns tickets and values of all
+finished points, and ``close()``, which cancels the points that have not been started. ``workers`` is the number of
+points that are evaluated at once, None if it is not known. The method ``ended()``, if there is one, returns tickets and
+values of all points that have ended, including those that the last `collect` has returned, without waiting.
 """
 
 import hashlib
@@ -11,7 +17,7 @@ import logging
 import threading
 from asyncio import CancelledError
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,31 +28,12 @@ from .evaluator import Evaluator
 from .user_target import Target
 from .values import Failed
 
-__all__ = ["AsynchronousEvaluator", "EvaluationQueue", "advise_on_pool", "check_asynchronous"]
+__all__ = ["AsynchronousEvaluator", "PoolQueue", "advise_on_pool", "check_asynchronous"]
 
 logger = logging.getLogger(__name__)
 
 SIZES = ("n_workers", "_max_workers", "_processes", "size")  # attributes of pools with the number of workers
 SECONDS_TO_FETCH = 10.0  # longest wait for the value of a point that has ended, when the run ends
-
-
-class EvaluationQueue(Protocol):
-    """Where points are evaluated: ``posterior.evaluation_queue()``, or `PoolQueue`.
-
-    A queue may also have a method ``ended()``, which returns numbers and values of all points that have ended, without
-    waiting, including the points that the last `collect` has returned. It is called before `close`.
-    """
-
-    workers: int | None  # number of points that are evaluated at once, if it is known
-
-    def submit(self, coords: np.ndarray) -> list[int]:
-        """Begin to evaluate points (n, ndim) without waiting; returns a number for each, which is never used again."""
-
-    def collect(self) -> list[tuple[int, Any]]:
-        """Wait for a finished point; returns numbers and values of all finished points, in the order of completion."""
-
-    def close(self) -> None:
-        """Cancel the points that have not been started."""
 
 
 def _has_queue(target: Target, pool: Any) -> bool:
@@ -80,7 +67,7 @@ class AsynchronousEvaluator(Evaluator):
 
     asynchronous = True
 
-    def __init__(self, *args: Any, queue: Callable[[], EvaluationQueue] | None = None):
+    def __init__(self, *args: Any, queue: Callable[[], Any] | None = None):
         self._open_queue, self._remember = queue, None
         super().__init__(*args)
         self._forget_running()
@@ -89,12 +76,12 @@ class AsynchronousEvaluator(Evaluator):
         return super().__getstate__() | {"_queue": None, "_running": {}, "_tickets": {}, "_remember": None}
 
     def _forget_running(self) -> None:
-        self._queue: EvaluationQueue | None = None
+        self._queue: Any = None
         self._submitted = 0
         self._running: dict[int, tuple[PendingPoints, int]] = {}  # points not yet arrived at a decision, by number
         self._tickets: dict[int, int] = {}  # number of the point by ticket of the queue
 
-    def _opened(self) -> EvaluationQueue:
+    def _opened(self) -> Any:
         if self._queue is None and _has_queue(self.target, self.pool):
             self._queue = (self._open_queue or self.target.function.evaluation_queue)()
         elif self._queue is None:
