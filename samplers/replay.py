@@ -5,6 +5,7 @@ of a run, the annealing is repeated from the record without an evaluation, and t
 step, as in emcee. A damaged or missing chain is repeated as well.
 """
 
+import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
@@ -96,25 +97,24 @@ def describe_run(
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """The start of a run as plain data, with the entries `described`.
+    """The start of a run as plain data, with the entries `described`, in the form that JSON returns.
 
     The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
     function without one not at all.
     """
-    plain = {name: _plain(value) for name, value in asdict(settings).items()}
-    return {
+
+    def plain(value: Any) -> str:
+        return f"{value.__module__}.{value.__qualname__}"  # a setting that is a function
+
+    header = {
         "log_prob_fn": getattr(function, "fingerprint", None),
         **described,
-        **plain,
+        **asdict(settings),
         "moves": [describe(move) for move in moves],
         "probabilities": [float(probability) for probability in probabilities],
         "guide": None if guide is None else guide_fingerprint(guide),
     }
-
-
-def _plain(value: Any) -> Any:
-    """A setting in a form that JSON accepts: a function by its name."""
-    return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
+    return json.loads(json.dumps(header, default=plain))
 
 
 def differences(stored: dict, ours: dict) -> list[str]:

@@ -13,7 +13,6 @@ chain.
 """
 
 import copy
-import json
 import logging
 import time
 import uuid
@@ -445,7 +444,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if start is not None and self._must_repeat:
             known = [each.coords for each in (start, previous) if each is not None]
             if given is None or any(np.array_equal(given.coords, coords) for coords in known):
-                return self._repeated(start)
+                if self._record.path is not None:  # a user who waits sees that the time spent is not lost
+                    said = "Going on with %s: %d evaluations and %d steps are stored"
+                    logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
+                self._drawn = start.coords  # tested when the run began
+                return start
             if self._reopened:
                 raise ValueError(
                     f"{self._place} contains a run from other draws of the prior: pass None as initial_state to go on "
@@ -529,22 +532,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _header(self) -> dict:
         """The start of this run, in the form that JSON returns."""
-        described = {"sampler": type(self).__name__}
-        described["log_likelihood_fn"] = "used" if self._target.is_likelihood else None
-        header = describe_run(self._target.function, described, self.settings, *self._first_moves, self._given_guide)
-        return json.loads(json.dumps(header))
-
-    def _repeated(self, start: RunStart) -> RunStart:
-        """The start in the record, from which the annealing is repeated."""
-        if self._record.path is not None:
-            logger.warning(  # a user who waits sees that the time spent is not lost
-                "Going on with %s: %d evaluations and %d steps are stored",
-                self.backend.filename,
-                self.evaluations,
-                self.iteration,
-            )
-        self._drawn = start.coords  # tested when the run began
-        return start
+        described = {
+            "sampler": type(self).__name__,
+            "log_likelihood_fn": "used" if self._target.is_likelihood else None,
+        }
+        return describe_run(self._target.function, described, self.settings, *self._first_moves, self._given_guide)
 
     def _new_start(self, state: State, skip_check: bool, anew: bool = False) -> RunStart:
         """Draws of the prior, checked and entered in the record, or in a new record."""

@@ -152,9 +152,9 @@ class AsynchronousEvaluator(Evaluator):
         new = {self._tickets[ticket]: (ticket, value) for ticket, value in collected if ticket in self._tickets}
         if not new:
             return
-        batch = self._as_batch(self._points(new), [value for _, value in new.values()])
+        batch = self.as_batch(self._points(new), [value for _, value in new.values()])
         with deferred_interrupts():
-            self._enter(batch)
+            self.enter(batch)
             for ticket, _ in new.values():
                 del self._tickets[ticket]
         if self.observer is not None:
@@ -167,7 +167,7 @@ class AsynchronousEvaluator(Evaluator):
         rows = np.array([self._running.pop(number)[1] for number in numbers])
         failed, whole = sum(len(batch.reasons) for batch in batches), len(numbers) == len(pending.coords)
         counts = self.record.count - len(numbers), len(self.record.failed) - failed
-        self._limit.check(merge_batches(batches), *counts, len(self._running), whole)
+        self.limit.check(merge_batches(batches), *counts, len(self._running), whole)
         log_prior = pending.base["log_prior"][rows]
         pending.arrive(rows, self._pack(log_prior, np.arange(len(rows)), batches))
 

@@ -5,6 +5,7 @@ batch is entered in the record of the run (`samplers.record`) when it is finishe
 time, finished points are entered every 0.05 s, so that a killed process loses only these.
 """
 
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,11 +14,14 @@ import numpy as np
 
 from ..blobs import converted
 from ..budget import Budget, BudgetExhausted
+from ..interrupts import Ended, interrupts_end_the_run
 from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .user_target import Target, map_in
 
 __all__ = ["Evaluator", "FailureLimit", "most_common_reasons", "unpack"]
+
+SECONDS_BETWEEN_NOTES = 0.05
 
 
 def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 3) -> str:
@@ -73,7 +77,7 @@ class Evaluator:
     workers = 0  # `submit` waits for its points
 
     def __init__(self, target: Target, record: Record, limit: FailureLimit, budget: Budget):
-        self.target, self.record, self._limit, self.budget = target, record, limit, budget
+        self.target, self.record, self.limit, self.budget = target, record, limit, budget
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.evaluates_parts = True
@@ -126,7 +130,10 @@ class Evaluator:
             if observe is not None and len(rows) > 0:
                 observe(coords[rows])
         if len(new) > 0:
-            batches.append(self._evaluate_new(coords[new], whole=len(new) == sum(inside)))
+            with interrupts_end_the_run(), _Arriving(self, coords[new]) as arriving:
+                for answer in self.target.answers(coords[new], self.pool):
+                    arriving.add(answer)
+            batches.append(arriving.finish(whole=len(new) == sum(inside)))
         self.evaluations += len(asked)
         records = self._pack(log_prior, np.concatenate([old, new]), batches)
         if len(asked) < sum(inside):
@@ -156,40 +163,12 @@ class Evaluator:
             self.observer.repeated(int(sum(known)))
         return asked, known, batches
 
-    def _evaluate_new(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
-        """Evaluate points that are not in the record: the `whole` of a batch, or a part of it."""
-        stored, failed = 0, []
-
-        def store_first(results: list) -> None:
-            """Store the first results of a long batch except failures, which may yet end the run."""
-            nonlocal stored
-            if len(results) > stored:
-                part = self._as_batch(coords[stored : len(results)], results[stored:])
-                failed.extend(stored + row for row in part.reasons)
-                self._enter(_successes(part))
-                stored = len(results)
-
-        if self.observer is not None:
-            self.observer.submitted(len(coords))
-        results = self.target.results(coords, self.pool, store_first, self.observer)
-        if self.observer is not None:
-            self.observer.settled()
-        batch = self._as_batch(coords, results)
-        new = batch.rows([*failed, *range(stored, len(coords))])
-        try:
-            self._limit.check(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
-        except RuntimeError:
-            self._enter(_successes(new))
-            raise
-        self._enter(new)
-        return batch
-
-    def _enter(self, batch: EvaluatedBatch) -> None:
+    def enter(self, batch: EvaluatedBatch) -> None:
         if len(batch.coords) > 0:
             self.record.evaluated(batch)
             self.new_evaluations += len(batch.coords)
 
-    def _as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
+    def as_batch(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         batch = self.target.evaluated(coords, results)
         self._check_blobs(batch)
         return batch
@@ -233,7 +212,68 @@ class Evaluator:
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
-        return self._as_batch(coords, self.target.results(coords, self.pool))
+        arriving = _Arriving(self, coords)
+        for answer in self.target.answers(coords, self.pool):
+            arriving.add(answer, store=False)
+        return self.as_batch(coords, arriving.results)
+
+
+class _Arriving:
+    """The values of new points (n, ndim) as they arrive, which are entered in the record every 0.05 s.
+
+    Failures are entered when all values have arrived, since they may yet end the run.
+    """
+
+    def __init__(self, evaluator: Evaluator, coords: np.ndarray):
+        self._evaluator, self._coords, self._noted = evaluator, coords, time.perf_counter()
+        self.results: Any = []
+        self._stored, self._failed = 0, []
+
+    def __enter__(self) -> "_Arriving":
+        if self._evaluator.observer is not None:
+            self._evaluator.observer.submitted(len(self._coords))
+        return self
+
+    def __exit__(self, kind: type | None, *error: object) -> None:
+        if kind is not None:  # Ctrl-C, or a pool that cannot go on
+            self._store()
+        elif self._evaluator.observer is not None:
+            self._evaluator.observer.settled()
+
+    def add(self, answer: Any, store: bool = True) -> None:
+        """Enter the value of a point, or all values of a function of a batch."""
+        if isinstance(answer, Ended):
+            raise answer.error
+        if self._evaluator.target.vectorize:
+            self.results = answer
+            return
+        self.results.append(answer)
+        if store and self._evaluator.observer is not None:
+            self._evaluator.observer.finished(1)
+        if store and time.perf_counter() - self._noted > SECONDS_BETWEEN_NOTES:
+            self._store()
+
+    def _store(self) -> None:
+        if len(self.results) > self._stored:
+            part = self._evaluator.as_batch(
+                self._coords[self._stored : len(self.results)], self.results[self._stored :]
+            )
+            self._failed += [self._stored + row for row in part.reasons]
+            self._evaluator.enter(_successes(part))
+            self._stored = len(self.results)
+        self._noted = time.perf_counter()
+
+    def finish(self, whole: bool) -> EvaluatedBatch:
+        """All values; RuntimeError if too many of the `whole` batch, or of a part of it, have failed."""
+        batch, record = self._evaluator.as_batch(self._coords, self.results), self._evaluator.record
+        new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
+        try:
+            self._evaluator.limit.check(new, record.count, len(record.failed), whole=whole and self._stored == 0)
+        except RuntimeError:
+            self._evaluator.enter(_successes(new))
+            raise
+        self._evaluator.enter(new)
+        return batch
 
 
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -2,15 +2,14 @@
 
 import logging
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
 import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
-from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
+from ..interrupts import SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
 from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
 from .values import Caught, log_densities, outcomes
@@ -18,8 +17,6 @@ from .values import Caught, log_densities, outcomes
 __all__ = ["Target", "map_in"]
 
 logger = logging.getLogger(__name__)
-
-SECONDS_BETWEEN_NOTES = 0.05
 
 
 def map_in(pool: Any) -> Callable:
@@ -138,41 +135,15 @@ class Target:
             results = self.log_prior_fn(points) if self.vectorize else [self.log_prior_fn(point) for point in points]
         return log_densities(results, len(coords), "log_prior_fn")
 
-    def results(
-        self,
-        coords: np.ndarray,
-        pool: Any = None,
-        note: Callable[[list], None] | None = None,
-        observer: Any = None,
-    ) -> Any:
-        """What the function returns for points (n, ndim), in the form that `evaluated` takes.
-
-        `note` is called with the first results every 0.05 s, and the observer is told of every result. There are no
-        first results for a function of a batch, or for a pool whose ``map`` returns a list.
-        """
+    def answers(self, coords: np.ndarray, pool: Any = None) -> Iterable:
+        """What the function returns for each of the points (n, ndim) in turn; with `vectorize`, for all at once."""
         points = self.as_points(coords)
-        with interrupts_end_the_run():
-            if self.vectorize:
-                return self.caught(points)
-            results, noted = [], time.perf_counter()
-            try:
-                for result in map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points):
-                    if isinstance(result, Ended):
-                        raise result.error
-                    results.append(result)
-                    if observer is not None:
-                        observer.finished(1)
-                    if note is not None and time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
-                        note(results)
-                        noted = time.perf_counter()
-            except BaseException:  # Ctrl-C, or a pool that cannot go on
-                if note is not None:
-                    note(results)
-                raise
-            return results
+        if self.vectorize:
+            return map(self.caught, [points])
+        return map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points)
 
     def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
-        """Log-posterior and blobs of points (n, ndim) from `results`; ValueError if these are no log-densities."""
+        """Log-posterior and blobs of points (n, ndim) from `answers`; ValueError if these are no log-densities."""
         log_prob, blobs, reasons = outcomes(results, len(coords), self.blobs_dtype, self.name)
         if self.is_likelihood:
             log_prob = log_prob + self.log_prior(coords)

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import h5py
 
-import samplers.evaluation.user_target
+import samplers.evaluation.evaluator
 import samplers.record
 from tests.faults.resumable_run import BURN_IN, SAMPLERS, STEPS, WAYS, N, calls, go_on, make, outcome
 
@@ -128,7 +128,7 @@ def end(pid, read, after=None):
 
 def script(kind, path, events=None, limit=None):
     """The script that is killed; returns its outcome."""
-    samplers.evaluation.user_target.SECONDS_BETWEEN_NOTES = 0.0  # so that no time of the machine decides
+    samplers.evaluation.evaluator.SECONDS_BETWEEN_NOTES = 0.0  # so that no time of the machine decides
     log = path.with_name("log")
     changes = {} if kind != "limit" else {"max_simulations": limit}
     if kind == "threads":

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, output_file
-from samplers.evaluation import user_target
+from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
 from tests.covering import covering
@@ -582,12 +582,12 @@ def test_parts_of_a_batch_that_fail_do_not_end_a_run_that_goes_on(tmp_path):
 
     posterior = Fails(1)
     posterior.stop = N // 2
-    user_target.SECONDS_BETWEEN_NOTES, before = 1e9, user_target.SECONDS_BETWEEN_NOTES  # successes are stored at Ctrl-C
+    evaluator.SECONDS_BETWEEN_NOTES, before = 1e9, evaluator.SECONDS_BETWEEN_NOTES  # successes are stored at Ctrl-C
     try:
         with pytest.raises(KeyboardInterrupt):
             sampler(posterior).run_mcmc(None, 1)
     finally:
-        user_target.SECONDS_BETWEEN_NOTES = before
+        evaluator.SECONDS_BETWEEN_NOTES = before
     posterior.stop = None
     again = sampler(posterior)
     again.run_mcmc(None, 1)
