@@ -88,11 +88,11 @@ def _declared(blobs: list, dtype: np.dtype, name: str) -> np.ndarray:
     """Blobs in a declared type; ValueError if it cannot hold one of them."""
     if dtype.kind == "O":
         return _as_objects(blobs)
+    if dtype.names is None and (found := _inferred(blobs)).dtype == dtype:
+        return found
     try:
         with np.errstate(all="ignore"):
             found = np.array(blobs, dtype=dtype)
-            if dtype.names is None and np.array(blobs).dtype == dtype:
-                return found
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must return blobs of the declared type, blobs_dtype={dtype}: {error}") from error
     if value := _lost(blobs, found, declared=True):

@@ -25,6 +25,7 @@ __all__ = ["FileHeld", "PatientOpen", "change_file", "open_file", "patient_open"
 logger = logging.getLogger(__name__)
 
 SECONDS, PAUSE = 5.0, 0.05  # longest wait for a file, and between two trials
+TRIALS = 3  # of a file that seems to be truncated
 
 
 class FileHeld(ValueError):
@@ -97,7 +98,7 @@ class PatientOpen:
 
 def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True) -> h5py.File:
     """The file that a function opens; `FileHeld` if another program holds it open, now or after a wait."""
-    end = time.monotonic() + (SECONDS if wait else 0.0)
+    end, truncated = time.monotonic() + (SECONDS if wait else 0.0), 0
     while True:
         try:
             before = _identity(backend)
@@ -106,9 +107,12 @@ def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True
                 return file
             file.close()  # another sampler has replaced the file while it was opened
         except OSError as error:
-            if not isinstance(error, BlockingIOError) and "already open" not in str(error):
+            # HDF5 asks for the size of a file before it locks it, and another sampler may just have written to it
+            truncated += (seems_truncated := "truncated file" in str(error))
+            is_held = isinstance(error, BlockingIOError) or "already open" in str(error)
+            if not is_held and not (seems_truncated and truncated < TRIALS):
                 raise
-            if time.monotonic() >= end:
+            if is_held and time.monotonic() >= end:
                 held = f"{backend.filename} is held open by another program ({error})"
                 raise FileHeld(f"{held}: close the file there, and try again") from error
         time.sleep(PAUSE)

@@ -640,6 +640,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             "with its stored results, and the moves are fitted to it anew"
         )
         self._result, self._verdict = self._output.result, self._output.verdict
+        self._budget.take_from_record()
+        self._reopened = False
         self.random_state = stored.random_state
         set_moves(self, *copy.deepcopy(self._first_moves))
         return stored
