@@ -88,13 +88,6 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
     return EvaluatedBatch(coords, log_prob, blobs, reasons)
 
 
-class _Place(NamedTuple):
-    """Where the content of a block is in a file."""
-
-    start: int
-    length: int
-
-
 class RunStart(NamedTuple):
     """Start of an annealing."""
 
@@ -125,7 +118,7 @@ class Record:
         self._batches: list[EvaluatedBatch] = []
         self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
         self._simulated: set[bytes] = set()  # slow parameters
-        self._arrays: dict[str, list[list[np.ndarray] | _Place]] = {}
+        self._arrays: dict[str, list[list[np.ndarray] | tuple[int, int]]] = {}  # or where large ones are in the file
         self._large: Any = None  # temporary file of the large arrays of a record in memory
         self._whole = 0  # bytes of the file that were read
         self._seen = 0  # size of the file when it was read or closed
@@ -236,23 +229,23 @@ class Record:
         """The last array that was noted under a key since the annealing began; None without any."""
         return self._stored(self._arrays[key][-1])[0] if key in self._arrays else None
 
-    def _kept(self, arrays: list[np.ndarray], place: "_Place | None") -> "list[np.ndarray] | _Place":
-        """Arrays of a block, or where they are in the file of the record, or in a temporary one, if they are large."""
+    def _kept(self, arrays: list[np.ndarray], place: tuple[int, int] | None) -> list[np.ndarray] | tuple[int, int]:
+        """Arrays; or, if they are large, first byte and length of their block in the file, or in a temporary one."""
         if sum(array.nbytes for array in arrays) < _LARGE:
             return arrays
         if place is None:
             self._large = self._large or tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
             start = self._large.seek(0, os.SEEK_END)
-            place = _Place(start, self._large.write(_content([_text(""), *arrays])))
+            place = start, self._large.write(_content([_text(""), *arrays]))
         return place
 
-    def _stored(self, kept: "list[np.ndarray] | _Place") -> list[np.ndarray]:
+    def _stored(self, kept: list[np.ndarray] | tuple[int, int]) -> list[np.ndarray]:
         """The arrays that `_kept` was given."""
         if isinstance(kept, list):
             return kept
         with nullcontext(self._large) if self.path is None else open(self.path, "rb") as file:
-            file.seek(kept.start)
-            return _arrays_of(file.read(kept.length))[1:]
+            file.seek(kept[0])
+            return _arrays_of(file.read(kept[1]))[1:]
 
     # ------------------------------------------------------------------ the file
 
@@ -321,21 +314,16 @@ class Record:
 
     def renew(self) -> Path | None:
         """Begin with an empty record; returns the new name of its file, if it has one."""
-        if self.path is None or not self.path.exists():
-            self._clear()
-            return None
-        self.open()  # another process that writes to the file owns it
-        return self.set_aside("before_reset")
-
-    def set_aside(self, ending: str) -> Path:
-        """Rename the file, and begin with an empty record; returns the new name."""
-        self.close()
-        aside = free_name(self.path, ending)
-        os.replace(self.path, aside)
+        aside = None
+        if self.path is not None and self.path.exists():
+            self.open()  # another process that writes to the file owns it
+            self.close()
+            aside = free_name(self.path, "before_reset")
+            os.replace(self.path, aside)
         self._clear()
         return aside
 
-    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> "_Place | None":
+    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> tuple[int, int] | None:
         if self.path is None:
             return None
         self.open()
@@ -354,7 +342,7 @@ class Record:
                 str(self.path),
             ) from error
         self._whole = start + len(data)
-        return _Place(start + BLOCK.size, len(data) - BLOCK.size)
+        return start + BLOCK.size, len(data) - BLOCK.size
 
     def _read(self) -> None:
         data, place = self.path.read_bytes(), len(MAGIC)
@@ -394,7 +382,7 @@ class Record:
                 header, name, *rest = json.loads(first.tobytes())
                 self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))
             else:
-                kept = self._kept(arrays, _Place(start, len(content)))
+                kept = self._kept(arrays, (start, len(content)))
                 self._arrays.setdefault(json.loads(first.tobytes()), []).append(kept)
         except ValueError:
             return False

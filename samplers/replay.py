@@ -80,7 +80,7 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
         make_group(backend, *record.start.coords.shape, run, damaged=stored == DAMAGED)
         return record
-    aside = record.set_aside("before_reset")
+    aside = record.renew()
     logger.warning(
         "%s was reset, or replaced by the chain of another run: a new record begins, the earlier one is kept as %s",
         backend.filename,

@@ -27,7 +27,7 @@ from emcee import EnsembleSampler, State
 from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
 from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, check_asynchronous
-from .evaluation.evaluator import Evaluator, FailureLimit, most_common_reasons, unpack
+from .evaluation.evaluator import Evaluator, most_common_reasons, unpack
 from .evaluation.user_target import Target
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood
@@ -195,12 +195,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _make_evaluator(self) -> Evaluator:
         """The evaluator of the target."""
-        limit = FailureLimit(self.settings.max_failure_share, self.nwalkers, self.ndim)
+        common = self._target, self._record, self._budget, self.nwalkers, self.settings.max_failure_share
         if not self.settings.asynchronous:
-            return Evaluator(self._target, self._record, limit, self._budget)
+            return Evaluator(*common)
         check_asynchronous(self._target, self.pool)
-        queue = getattr(self._given_guide, "evaluation_queue", None)
-        return AsynchronousEvaluator(self._target, self._record, limit, self._budget, queue=queue)
+        return AsynchronousEvaluator(*common, queue=getattr(self._given_guide, "evaluation_queue", None))
 
     @classmethod
     def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:
@@ -422,6 +421,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
             self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)
+        elif self._record.start is not None:  # an annealing that could not be made again
+            self._verdict = self._verdict._replace(simulations=self.simulations)
         self._output.write(self._result, self._verdict)
 
     def compute_log_prob(self, coords):

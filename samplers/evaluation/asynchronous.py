@@ -167,7 +167,7 @@ class AsynchronousEvaluator(Evaluator):
         rows = np.array([self._running.pop(number)[1] for number in numbers])
         failed, whole = sum(len(batch.reasons) for batch in batches), len(numbers) == len(pending.coords)
         counts = self.record.count - len(numbers), len(self.record.failed) - failed
-        self.limit.check(merge_batches(batches), *counts, len(self._running), whole)
+        self.check_failures(merge_batches(batches), *counts, len(self._running), whole)
         log_prior = pending.base["log_prior"][rows]
         pending.arrive(rows, self._pack(log_prior, np.arange(len(rows)), batches))
 

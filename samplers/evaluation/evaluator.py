@@ -8,7 +8,7 @@ time, finished points are entered every 0.05 s, so that a killed process loses o
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .user_target import Target, map_in
 
-__all__ = ["Evaluator", "FailureLimit", "most_common_reasons", "unpack"]
+__all__ = ["Evaluator", "most_common_reasons", "unpack"]
 
 SECONDS_BETWEEN_NOTES = 0.05
 
@@ -28,37 +28,6 @@ def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 
     """The most frequent reasons of failed evaluations (point, reason) as text."""
     reasons = Counter(reason for _, reason in failed)
     return "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(number))
-
-
-class FailureLimit(NamedTuple):
-    """The share of the evaluations that may fail before a run stops.
-
-    It applies after `nwalkers` evaluations; a batch of ndim + 2 points or more may not fail as a whole.
-    """
-
-    share: float
-    nwalkers: int
-    ndim: int
-
-    def check(
-        self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
-    ) -> None:
-        """Raise RuntimeError if the limit is exceeded by a batch that comes after the given numbers.
-
-        Failures may be quicker or slower than successes. So running points count as successes, and a batch that is not
-        `whole` may fail completely.
-        """
-        n, count = len(batch.coords), failures + len(batch.reasons)
-        total = evaluations + n + running
-        all_failed = whole and len(batch.reasons) == n >= self.ndim + 2
-        if all_failed or (total >= self.nwalkers and count > self.share * total):
-            what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
-            first = min(batch.reasons)
-            raise RuntimeError(
-                f"{what} failed, where max_failure_share={self.share:g} of the run is allowed: {batch.reasons[first]} "
-                f"at {batch.coords[first]}. Earlier evaluations are kept (see failures), and a run with a backend in a "
-                "file goes on from there after the cause is fixed"
-            )
 
 
 class Evaluator:
@@ -70,14 +39,16 @@ class Evaluator:
     `evaluations` counts the points that were asked for, `new_evaluations` those that this object has evaluated instead
     of finding them in the record. `evaluates_parts` says whether the first points of a batch that does not fit into the
     limit of simulations are evaluated. The sampler sets `pool`, where functions of one point are called. An `observer`
-    is told of points, as `samplers.reporting.progress.Progress` is.
+    is told of points, as `samplers.reporting.progress.Progress` is. After `nwalkers` evaluations, at most the share
+    `failure_share` of them may fail; a batch of ndim + 2 points or more may not fail as a whole.
     """
 
     asynchronous = False
     workers = 0  # `submit` waits for its points
 
-    def __init__(self, target: Target, record: Record, limit: FailureLimit, budget: Budget):
-        self.target, self.record, self.limit, self.budget = target, record, limit, budget
+    def __init__(self, target: Target, record: Record, budget: Budget, nwalkers: int, failure_share: float):
+        self.target, self.record, self.budget = target, record, budget
+        self._nwalkers, self._failure_share = nwalkers, failure_share
         self._fields: list[tuple] = [("log_prob", np.float64), ("log_prior", np.float64)]
         self._has_blobs: bool | None = None  # whether the function returns blobs; None while this is not known
         self.evaluates_parts = True
@@ -119,16 +90,18 @@ class Evaluator:
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
 
-        `observe` is called with the known points, and with the others directly before they are evaluated. Raises
+        `observe` is called with known points, in the parts in which they were evaluated, and with the others directly
+        before they are evaluated. Raises
         ValueError if a coordinate is not finite, and BudgetExhausted if the points do not fit into the limit of
         simulations. With `evaluates_parts`, the first points that fit are evaluated.
         """
         log_prior, inside = self._prior_of(coords)
         asked, known, batches = self._look_up(coords, inside)
         old, new = asked[known], asked[~known]
-        for rows in (old, new):
-            if observe is not None and len(rows) > 0:
-                observe(coords[rows])
+        if observe is not None:
+            for part in (*(batch.coords for batch in batches), coords[new]):
+                if len(part) > 0:
+                    observe(part)
         if len(new) > 0:
             with interrupts_end_the_run(), _Arriving(self, coords[new]) as arriving:
                 for answer in self.target.answers(coords[new], self.pool):
@@ -162,6 +135,26 @@ class Evaluator:
         if self.observer is not None and known.any():
             self.observer.repeated(int(sum(known)))
         return asked, known, batches
+
+    def check_failures(
+        self, batch: EvaluatedBatch, evaluations: int, failures: int, running: int = 0, whole: bool = True
+    ) -> None:
+        """Raise RuntimeError if too many evaluations have failed with a batch that comes after the given numbers.
+
+        Failures may be quicker or slower than successes. So running points count as successes, and a batch that is not
+        `whole` may fail completely.
+        """
+        n, count = len(batch.coords), failures + len(batch.reasons)
+        total = evaluations + n + running
+        all_failed = whole and len(batch.reasons) == n >= self.target.ndim + 2
+        if all_failed or (total >= self._nwalkers and count > self._failure_share * total):
+            what = f"all {n} evaluations of a batch" if all_failed else f"{count} of {total} evaluations"
+            first = min(batch.reasons)
+            raise RuntimeError(
+                f"{what} failed, where max_failure_share={self._failure_share:g} of the run is allowed: "
+                f"{batch.reasons[first]} at {batch.coords[first]}. Earlier evaluations are kept (see failures), and a "
+                "run with a backend in a file goes on from there after the cause is fixed"
+            )
 
     def enter(self, batch: EvaluatedBatch) -> None:
         if len(batch.coords) > 0:
@@ -268,7 +261,7 @@ class _Arriving:
         batch, record = self._evaluator.as_batch(self._coords, self.results), self._evaluator.record
         new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
         try:
-            self._evaluator.limit.check(new, record.count, len(record.failed), whole=whole and self._stored == 0)
+            self._evaluator.check_failures(new, record.count, len(record.failed), whole=whole and self._stored == 0)
         except RuntimeError:
             self._evaluator.enter(_successes(new))
             raise
