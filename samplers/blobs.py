@@ -5,7 +5,7 @@ of a given type cannot hold is refused: text is never cut, and a number never cu
 that the user declares with fewer digits, such as ``blobs_dtype=numpy.float32``.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,11 +29,9 @@ def joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Arrays of blobs (n_i, ...) of several batches as one; of objects if no other type holds all values."""
     if len({(array.dtype, array.shape[1:]) for array in arrays}) == 1:
         return np.concatenate(arrays)
-    numbers = all(array.dtype.kind in NUMBERS for array in arrays)
-    if numbers and len({array.shape[1:] for array in arrays}) == 1:
+    if all(array.dtype.kind in NUMBERS for array in arrays) and len({array.shape[1:] for array in arrays}) == 1:
         whole = np.concatenate(arrays)
-        parts = np.split(whole, np.cumsum([len(array) for array in arrays])[:-1])
-        if not any(_lost(array, part).any() for array, part in zip(arrays, parts, strict=True)):
+        if not _lost(arrays, whole):
             return whole
     return _objects(row for array in arrays for row in _rows(array))
 
@@ -51,14 +49,11 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
             f"the blobs of each point must have the shape {shape} of the first evaluations; got {found}. "
             "Return arrays of one length; or, without a file, pass blobs_dtype=object and return a dictionary"
         )
-    try:
-        with np.errstate(all="ignore"):
-            found = blobs.astype(dtype)
-        lost = _lost(blobs, found, declared)
-        value = blobs[lost].ravel()[:1].tolist()
-    except (TypeError, ValueError, OverflowError):
-        lost, value = np.ones(1, dtype=bool), [_first_that_does_not_fit(blobs, dtype)]
-    if lost.any():
+    found = _as_type(blobs, dtype)
+    value = _lost(blobs, found, declared) if found is not None else []
+    if found is None:  # the first value that cannot become the type alone, or else the first of all
+        value = [each for each in _leaves(blobs) if _as_type(np.array(each), dtype) is None] or list(_leaves(blobs))
+    if value:
         numbers = {blobs.dtype.kind, dtype.kind} <= set(NUMBERS)
         wider = np.result_type(blobs.dtype, dtype) if numbers else "object, or for text in a file blobs_dtype='S50'"
         raise ValueError(
@@ -68,15 +63,13 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
     return found
 
 
-def _first_that_does_not_fit(blobs: np.ndarray, dtype: np.dtype) -> Any:
-    """The first of the values that cannot become the type; the first one if each can alone."""
-    values = blobs.ravel().tolist()
-    for value in values:
-        try:
-            np.array(value).astype(dtype)
-        except (TypeError, ValueError, OverflowError):
-            return value
-    return values[0]
+def _as_type(blobs: np.ndarray, dtype: np.dtype) -> np.ndarray | None:
+    """Blobs in another type, exactly or not; None if a value cannot become this type."""
+    try:
+        with np.errstate(all="ignore"):
+            return blobs.astype(dtype)
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def _inferred(blobs: list) -> np.ndarray:
@@ -85,7 +78,7 @@ def _inferred(blobs: list) -> np.ndarray:
         found = np.array(blobs)
         exact = found.dtype.kind not in "US"  # a number beside text would become text
         if found.dtype.kind in "fc" and np.any(np.abs(found) >= LARGEST_EXACT):
-            exact = not _lost(np.array(blobs, dtype=object), found).any()
+            exact = not _lost(blobs, found)
         return found if exact else np.array(blobs, dtype=object)
     except (TypeError, ValueError):  # rows of different lengths, or types that have nothing in common
         return _as_objects(blobs)
@@ -95,13 +88,14 @@ def _declared(blobs: list, dtype: np.dtype, name: str) -> np.ndarray:
     """Blobs in a declared type; ValueError if it cannot hold one of them."""
     if dtype.kind == "O":
         return _as_objects(blobs)
+    if dtype.names is None and (found := _inferred(blobs)).dtype == dtype:
+        return found
     try:
         with np.errstate(all="ignore"):
             found = np.array(blobs, dtype=dtype)
-        value = _first_lost(blobs, found)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must return blobs of the declared type, blobs_dtype={dtype}: {error}") from error
-    if value:
+    if value := _lost(blobs, found, declared=True):
         raise ValueError(
             f"{name} must return blobs of the declared type, blobs_dtype={dtype}; got {value[0]!r}, which this type "
             "cannot hold. Declare a wider one"
@@ -109,45 +103,27 @@ def _declared(blobs: list, dtype: np.dtype, name: str) -> np.ndarray:
     return found
 
 
-def _first_lost(blobs: list, found: np.ndarray) -> list:
-    """The first of the blobs that an array of them has not kept, in a list; empty if there is none."""
-    if found.dtype.names is not None:
-        if any(not hasattr(row, "__len__") or len(row) != len(found.dtype.names) for row in blobs):
-            return []
-        columns = ([row[place] for row in blobs] for place in range(len(found.dtype.names)))
-        values = (_first_lost(column, found[name]) for name, column in zip(found.dtype.names, columns, strict=True))
-        return next(filter(None, values), [])
-    given = _inferred(blobs)
-    return given[_lost(given, found, declared=True)].ravel()[:1].tolist() if given.shape == found.shape else []
+def _leaves(values: Iterable) -> Iterator:
+    """The single values of nested sequences and arrays in order, as values of Python, whose comparisons are exact."""
+    for value in values.reshape(-1) if isinstance(values, np.ndarray) else values:
+        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        if isinstance(plain, list | tuple):
+            yield from _leaves(plain)
+        else:
+            yield plain
 
 
-def _lost(given: np.ndarray, found: np.ndarray, declared: bool = False) -> np.ndarray:
-    """Which values of an array another array of the same shape, of another type, `declared` or not, has not kept."""
-    old, new = given.dtype.kind, found.dtype.kind
-    if new == "O" or given.dtype == found.dtype:
-        return np.zeros(given.shape, dtype=bool)
-    if new in "SU":
-        text = np.array([isinstance(value, str | bytes) for value in given.ravel().tolist()], dtype=bool)
-        cut = given.astype(new) != found
-        return cut | ~text.reshape(given.shape)
-    if old == "O":
-        pairs = zip(given.ravel().tolist(), found.ravel().tolist(), strict=True)
-        same = [
-            bool(_plain(value) == kept or (kept != kept and (value != value or (declared and value is None))))
-            for value, kept in pairs
-        ]
-        return ~np.array(same, dtype=bool).reshape(given.shape)
-    if declared and old + new in ("ff", "cc", "fc"):  # the user may want fewer digits
-        return np.isfinite(given) & ~np.isfinite(found)
-    with np.errstate(all="ignore"):
-        back = found.astype(given.dtype)
-    lost = (back != given) & ~((back != back) & (given != given))
-    return lost | ((found < 0) != (given < 0)) if {old, new} <= set("iu") else lost
-
-
-def _plain(value: Any) -> Any:
-    """A scalar of NumPy as a number of Python, whose comparisons are exact."""
-    return value.item() if isinstance(value, np.generic) else value
+def _lost(given: Iterable, found: np.ndarray, declared: bool = False) -> list:
+    """The first of the values that an array of them, of a type `declared` or not, has not kept, in a list."""
+    for value, kept in zip(_leaves(given), _leaves(found), strict=False):
+        both = value.encode() if isinstance(value, str) and isinstance(kept, bytes) else value
+        if declared and isinstance(value, float | complex) and isinstance(kept, float | complex):
+            same = np.isfinite(kept) or not np.isfinite(value)  # the user may want fewer digits
+        else:
+            same = both is kept or both == kept or (kept != kept and (value != value or (declared and value is None)))
+        if not same:
+            return [value]
+    return []
 
 
 def _as_objects(blobs: list) -> np.ndarray:

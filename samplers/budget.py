@@ -70,6 +70,10 @@ class Budget:
         self._allowed = 0.0
         self.restart(0.0)
 
+    def take_from_record(self) -> None:
+        """Guides have made the simulations that the record says: the annealing is not made again."""
+        self._of_earlier_guides, self._guide = max(self._of_record, self._of_earlier_guides), None
+
     def note(self) -> None:
         """Note in the record how many simulations guides have made, including the last allowed batch."""
         self._record.note(OF_GUIDES, np.array([max(self.of_guides, self._allowed)]))

@@ -1,11 +1,11 @@
 """Data stored with a chain: the run that it belongs to, the ladder, the check of the evidence, the verdict.
 
 emcee's backend writes the chain. In an HDF5 file, the group of the chain has the attribute ``run``, the dataset
-``tempering`` (JSON), and the group ``restart``, the state from which a reset chain continues. In memory, these are
-attributes of the backend.
+``tempering`` (JSON), and the group ``restart``: the population at beta = 1, or the state from which a reset chain
+continues. The attribute ``checksum`` of all of this is written last, so that half of a step is found, as a process
+leaves it that was killed while HDF5 wrote. In memory, results are attributes of the backend.
 """
 
-import contextlib
 import json
 import logging
 import os
@@ -22,32 +22,30 @@ from .blobs import converted
 from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
 from .judgement.verdict import Verdict
-from .output_file import FileHeld, open_file, patient_open, read_object, replace_file
-from .record import Record
+from .output_file import FileHeld, change_file, open_file, patient_open, read_object
 from .reports import AnnealingResult, Stage, warn
 
-__all__ = ["DAMAGED", "Output", "is_whole", "make_group", "run_of_file"]
+__all__ = ["DAMAGED", "Output", "make_group", "run_of_file"]
 
 logger = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
-STORED = "stored step"  # key of the checksums of completely stored steps
+CHECKSUM = "checksum"
 STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
 class Output:
-    """Data stored with the chain of an initialised backend; a checksum of each stored step is noted in the record.
+    """Data stored with the chain of an initialised backend.
 
     `result` and `verdict` are what is stored (empty, None: nothing). `first_step` steps were stored before the last
     annealing. `provisional` says whether the last step is the estimate of a run that the limit of simulations ended,
     and is replaced when the run continues.
     """
 
-    def __init__(self, backend: Backend, record: Record):
-        self._backend, self._record, self._file = backend, record, patient_open(backend)
+    def __init__(self, backend: Backend):
+        self._backend, self._file = backend, patient_open(backend)
         self._counts = int(backend.iteration), np.array(backend.accepted)
         self._summed = 0, 0  # steps, and their checksum
-        self._is_unnoted = False  # whether the last step was in memory only
         stored = _read(backend)
         self.result, self.verdict = _parsed(stored)
         self.first_step = stored.get("first_step", 0)
@@ -57,17 +55,19 @@ class Output:
     def begin(self, run: str) -> None:
         """A new annealing begins, without results."""
         self.result, self.verdict, self.first_step = AnnealingResult(), None, int(self._backend.iteration)
-        self._write(run)
-        self.step_stored()
+        self._write(run, keep=False)
 
     def step_stored(self) -> None:
-        """Note in the record how the chain ends, since a killed process may have stored half a step."""
+        """A step has been stored completely."""
         self._counts = int(self._backend.iteration), np.array(self._backend.accepted)
-        # a step in memory is not noted: a new process goes on from the last step in the file
-        self._is_unnoted = self._file is not None and self._file.is_behind
-        if self._file is not None and not self._is_unnoted:
-            *self._summed, rest = _checksums(self._backend, *self._summed)
-            self._record.note(STORED, np.array([self._summed[1], rest]))
+        if self._file is not None:
+            with self._backend.open("a") as file:
+                self._seal(file[self._backend.name])
+
+    def _seal(self, group: h5py.Group) -> None:
+        """Write the checksum of a chain that is complete, from the checksum of its known steps."""
+        self._summed = _checksum_of_steps(group, *self._summed)
+        group.attrs[CHECKSUM] = _checksum(group, self._summed[1])
 
     def check_file(self) -> None:
         """Raise ValueError if another program holds the file, which must be written before a run begins."""
@@ -89,10 +89,8 @@ class Output:
             warn(
                 f"{self._backend.filename} is still held open by another program, and its last steps are in this "
                 "sampler only. Close the file in the other program and call run_mcmc(None, 0), which writes the steps. "
-                f"A new process makes them again from {self._record.path}, without a simulation"
+                "A new process makes them again from the record beside the file, without a simulation"
             )
-        elif self._is_unnoted:
-            self.step_stored()
 
     def change_blobs(self, blobs: np.ndarray | None) -> None:
         """Store the blobs of the chain in the type of the blobs (n, ...) that are stored next."""
@@ -124,8 +122,14 @@ class Output:
         except (OSError, FileHeld) as error:
             logger.warning("ladder and verdict are not stored (%s): the next call of run_mcmc stores them", error)
 
-    def _write(self, run: str | None = None) -> None:
+    def keep_state(self, state: State | None) -> None:
+        """Store the state from which a chain without steps continues, also in another process."""
+        self._write(keep=False, state=state)
+
+    def _write(self, run: str | None = None, keep: bool = True, state: State | None = None) -> None:
+        """Write the results, the name of a `run`, and a state in place of the stored one, unless that is to `keep`."""
         result, backend = self.result, self._backend
+        self._counts = int(backend.iteration), np.array(backend.accepted)
         contents = {
             "ladder": result.ladder,
             "check": result.check,
@@ -142,9 +146,18 @@ class Output:
             group = file[backend.name]
             if run is not None:
                 group.attrs["run"] = run
+            if not keep:
                 group.pop("restart", None)
+            if state is not None and state.log_prob is not None:
+                kept = group.create_group("restart")
+                for name in ("coords", "log_prob", "blobs"):
+                    if (values := getattr(state, name)) is not None:
+                        kept.create_dataset(name, data=values)
+                for i, value in enumerate(state.random_state or ()):
+                    kept.attrs[f"random_state_{i}"] = value
             group.pop("tempering", None)
             group.create_dataset("tempering", data=data)
+            self._seal(group)
 
     # ------------------------------------------------------------------ the state that a chain goes on from
 
@@ -160,7 +173,8 @@ class Output:
             if group is None:
                 return None
             values = {name: dataset[...] for name, dataset in group.items()}
-        return State(values.pop("coords"), **values, random_state=backend.random_state)
+            random_state = tuple(value for _, value in sorted(group.attrs.items())) or backend.random_state
+        return State(values.pop("coords"), **values, random_state=random_state)
 
     def mark_again(self, run: str) -> bool:
         """Mark a file whose chain emcee has reset as the file of a run; returns whether this was needed."""
@@ -174,22 +188,9 @@ class Output:
 
     def clear_chain(self, state: State | None) -> None:
         """Remove all steps; the chain continues from `state`."""
-        backend = self._backend
-        cut_chain(backend, 0)
+        cut_chain(self._backend, 0)
         self.first_step, self.provisional = 0, False
-        self._write()
-        if isinstance(backend, HDFBackend):
-            with backend.open("a") as file:
-                file[backend.name].pop("restart", None)
-        if isinstance(backend, HDFBackend) and state is not None and state.log_prob is not None:
-            with backend.open("a") as file:
-                group = file[backend.name].create_group("restart")
-                for name in ("coords", "log_prob", "blobs"):
-                    if (values := getattr(state, name)) is not None:
-                        group.create_dataset(name, data=values)
-                for i, value in enumerate(state.random_state or ()):
-                    file[backend.name].attrs[f"random_state_{i}"] = value
-        self.step_stored()
+        self.keep_state(state)
 
     def store_provisional_step(self, state: State) -> None:
         """Store the estimate of a run that the limit of simulations ended, as a step that is replaced later."""
@@ -198,7 +199,6 @@ class Output:
         self._backend.save_step(state, np.zeros(len(state.coords), dtype=bool))
         self.provisional = True
         self._write()
-        self.step_stored()
 
     def drop_provisional_step(self) -> None:
         """Remove the last step if it is provisional."""
@@ -206,7 +206,6 @@ class Output:
             cut_chain(self._backend, int(self._backend.iteration) - 1)
             self.provisional = False
             self._write()
-            self.step_stored()
 
 
 def _read(backend: Backend) -> dict[str, Any]:
@@ -214,11 +213,7 @@ def _read(backend: Backend) -> dict[str, Any]:
         return getattr(backend, "tempering", {})
     with backend.open() as file:
         group = file[backend.name]
-        return _tempering(group)
-
-
-def _tempering(group: h5py.Group) -> dict[str, Any]:
-    return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
+        return json.loads(group["tempering"][...].tobytes()) if "tempering" in group else {}
 
 
 def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
@@ -231,76 +226,64 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
     return result, None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
 
 
-def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:
-    """Number of steps in a chain, CRC-32 of all steps, and CRC-32 of counts, restart state and random state.
-
-    The checksum of all steps is computed from the `checksum` of the first `known` steps.
-    """
-    with backend.open() as file:
-        group = file[backend.name]
-        steps = int(group.attrs["iteration"])
-        if steps < known:
-            known, checksum = 0, 0
-        for first in range(known, steps, STEPS_AT_ONCE):
-            rows = slice(first, min(first + STEPS_AT_ONCE, steps))
-            parts = [group[name][rows] for name in ("chain", "log_prob", "blobs") if name in group]
-            for step in zip(*parts, strict=True):
-                for part in step:
-                    checksum = zlib.crc32(part.tobytes(), checksum)
-        stored = _tempering(group)
-        parts, rest = [steps, stored.get("first_step"), stored.get("provisional")], 0
-        parts += [group["accepted"][...]]
-        parts += [group.attrs[name] for name in sorted(group.attrs) if name.startswith("random_state_")]
-        parts += [dataset[...] for _, dataset in sorted(group.get("restart", {}).items())]
-        for part in parts:
-            data = part.tobytes() if isinstance(part, np.ndarray | np.generic) else repr(part).encode()
-            rest = zlib.crc32(data, rest)
-    return steps, checksum, rest
+def _checksum_of_steps(group: h5py.Group, known: int = 0, checksum: int = 0) -> tuple[int, int]:
+    """Number of steps in a chain, and their CRC-32, from the `checksum` of the first `known` steps."""
+    steps = int(group.attrs["iteration"])
+    if steps < known:
+        known, checksum = 0, 0
+    for first in range(known, steps, STEPS_AT_ONCE):
+        rows = slice(first, min(first + STEPS_AT_ONCE, steps))
+        parts = [group[name][rows] for name in ("chain", "log_prob", "blobs") if name in group]
+        for step in zip(*parts, strict=True):
+            for part in step:
+                checksum = zlib.crc32(part.tobytes(), checksum)
+    return steps, checksum
 
 
-def is_whole(backend: HDFBackend, record: Record) -> bool:
-    """Whether a chain has all stored steps, each complete, or is empty and has never had a step."""
-    try:
-        with backend.open() as file:
-            group = file[backend.name]
-            if group.attrs["iteration"] == 0 and "restart" not in group and not np.any(group["accepted"]):
-                return True
-        noted = record.noted(STORED)
-        return noted is not None and tuple(noted.tolist()) == _checksums(backend)[1:]
-    except FileHeld:
-        raise
-    except Exception:  # HDF5 raises nearly anything
-        return False
+def _checksum(group: h5py.Group, of_steps: int) -> int:
+    """CRC-32 of a chain: of its steps, counts, results, restart state and random states."""
+    parts = [(name, group.attrs[name]) for name in group.attrs if name.startswith(("iteration", "random_state_"))]
+    parts += [(name, group[name][...]) for name in ("accepted", "tempering") if name in group]
+    if "restart" in group:
+        parts += [("restart", b"")]
+        parts += [(name, value[...]) for name, value in group["restart"].items()]
+        parts += [(f"restart {name}", value) for name, value in group["restart"].attrs.items()]
+    for name, part in sorted(parts, key=lambda each: each[0]):
+        data = part.tobytes() if hasattr(part, "tobytes") else repr(part).encode()
+        of_steps = zlib.crc32(name.encode() + data, of_steps)
+    return of_steps
 
 
 def run_of_file(backend: HDFBackend) -> str | None:
     """The run that the file of a backend belongs to; the empty string for a chain without a run.
 
-    It is "damaged" for a chain that cannot be read completely, and None if there is no file, the file is empty, or it
-    has no chain with this name, or an incomplete one that never had a step.
+    It is "damaged" for a chain that cannot be read completely, or is not as it was stored. It is None if there is no
+    file, the file is empty, or it has no chain with this name, or an incomplete one that never had a step.
     """
     if not os.path.exists(backend.filename) or os.path.getsize(backend.filename) == 0:
         return None
     try:
         with open_file(backend, "r") as file:
-            group = file.get(backend.name)
-            if group is None:
+            if backend.name not in file:
                 return None
+            group = file[backend.name]
             group.visititems(read_object)
-            if "tempering" in group:
-                json.loads(group["tempering"][...].tobytes())
             if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
                 return None  # emcee was killed while it made the group
-            complete = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
-            return group.attrs.get("run", "") if complete else DAMAGED
+            whole = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
+            if whole and CHECKSUM in group.attrs:
+                whole = group.attrs[CHECKSUM] == _checksum(group, _checksum_of_steps(group)[1])
+            elif whole and "tempering" in group:  # of an earlier version
+                json.loads(group["tempering"][...].tobytes())
+            return group.attrs.get("run", "") if whole else DAMAGED
     except FileHeld:
         raise
     except Exception:  # HDF5 raises nearly anything
         return DAMAGED
 
 
-def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
-    """Make the file of a backend, with an empty chain, in one step; other readable groups are kept."""
+def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str, damaged: bool = False) -> None:
+    """Make the file of a backend, with an empty chain, in one step; other groups of a readable file are kept."""
 
     def make(path: Path) -> None:
         options = {"compression": backend.compression, "compression_opts": backend.compression_opts}
@@ -309,12 +292,4 @@ def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str) -> None:
         with made.open("a") as file:
             file[made.name].attrs["run"] = run
 
-    while True:
-        is_new = not os.path.exists(backend.filename)
-        try:
-            present = None if is_new else open_file(backend, "r+")
-        except OSError as error:
-            logger.debug("no group is copied from %s: %s", backend.filename, error)
-            present = None
-        with contextlib.nullcontext() if present is None else present, contextlib.suppress(FileExistsError):
-            return replace_file(backend, make, present, is_new)
+    change_file(backend, make, damaged)

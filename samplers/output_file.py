@@ -9,6 +9,7 @@ import contextlib
 import io
 import logging
 import os
+import shutil
 import time
 import uuid
 from collections.abc import Callable
@@ -19,11 +20,12 @@ from emcee.backends import Backend, HDFBackend
 
 from .reports import warn
 
-__all__ = ["FileHeld", "PatientOpen", "open_file", "patient_open", "read_object", "replace_file"]
+__all__ = ["FileHeld", "PatientOpen", "change_file", "open_file", "patient_open", "read_object"]
 
 logger = logging.getLogger(__name__)
 
 SECONDS, PAUSE = 5.0, 0.05  # longest wait for a file, and between two trials
+TRIALS = 3  # of a file that seems to be truncated
 
 
 class FileHeld(ValueError):
@@ -77,15 +79,16 @@ class PatientOpen:
         """Write a chain in memory to the file if it is free, now or after a wait; returns whether the file has it."""
         if self._copy is None:
             return True
-        backend = self._backend
+        name = self._backend.name
+
+        def change(path: Path) -> None:
+            with h5py.File(path, "a") as file, h5py.File(self._copy, "r") as ours:
+                file.pop(name, None)
+                ours.copy(ours[name], file, name)
+
         try:
-            with open_file(backend, "r+", wait) as present, h5py.File(self._copy, "r") as ours:
-
-                def make(path: Path) -> None:
-                    with h5py.File(path, "w") as new:
-                        ours.copy(ours[backend.name], new, backend.name)
-
-                replace_file(backend, make, present)
+            open_file(self._backend, "r+", wait).close()
+            change_file(self._backend, change)
         except (FileHeld, OSError) as error:  # also a full disk: the chain is still in memory
             logger.info("the chain is kept in memory: %s", error)
             return False
@@ -95,7 +98,7 @@ class PatientOpen:
 
 def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True) -> h5py.File:
     """The file that a function opens; `FileHeld` if another program holds it open, now or after a wait."""
-    end = time.monotonic() + (SECONDS if wait else 0.0)
+    end, truncated = time.monotonic() + (SECONDS if wait else 0.0), 0
     while True:
         try:
             before = _identity(backend)
@@ -104,9 +107,12 @@ def _wait(backend: HDFBackend, opens: Callable[[], h5py.File], wait: bool = True
                 return file
             file.close()  # another sampler has replaced the file while it was opened
         except OSError as error:
-            if not isinstance(error, BlockingIOError) and "already open" not in str(error):
+            # HDF5 asks for the size of a file before it locks it, and another sampler may just have written to it
+            truncated += (seems_truncated := "truncated file" in str(error))
+            is_held = isinstance(error, BlockingIOError) or "already open" in str(error)
+            if not is_held and not (seems_truncated and truncated < TRIALS):
                 raise
-            if time.monotonic() >= end:
+            if is_held and time.monotonic() >= end:
                 held = f"{backend.filename} is held open by another program ({error})"
                 raise FileHeld(f"{held}: close the file there, and try again") from error
         time.sleep(PAUSE)
@@ -135,46 +141,33 @@ def patient_open(backend: Backend) -> PatientOpen | None:
     return backend.open
 
 
-def replace_file(
-    backend: HDFBackend, make: Callable[[Path], None], present: h5py.File | None, is_new: bool = False
-) -> None:
-    """Replace the file of a backend in one step by a file that `make` writes; other readable groups are kept.
+def change_file(backend: HDFBackend, change: Callable[[Path], None], damaged: bool = False) -> None:
+    """Change a copy of the file of a backend, and put it in its place in one step; other groups are kept.
 
-    `present` is the file, open for writing, so that no other sampler writes to it meanwhile, or None if it cannot be
-    read. FileExistsError if the file `is_new`, and another sampler has made it meanwhile.
+    No other sampler writes to the file meanwhile. A file that is missing, empty or unreadable is made anew, and so is
+    one that is `damaged` so that it cannot be changed.
     """
     path = Path(backend.filename).resolve()
-    new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
-    try:
-        make(new)
-        if present is not None:
-            with h5py.File(new, "a") as file:
-                try:
-                    _copy_missing(present, file, backend.name)
-                except OSError as error:
-                    logger.debug("not all groups of %s can be kept: %s", path, error)
-            if os.name == "nt":  # Windows replaces no open file
-                present.close()
-        if is_new:
-            os.link(new, path)
-        else:
-            os.replace(new, path)
-    finally:
-        new.unlink(missing_ok=True)
-
-
-def _copy_missing(present: h5py.Group, new: h5py.Group, ours: str) -> None:
-    """Copy the readable objects of a group that a new group lacks, except the group `ours`."""
-    if present.name.strip("/") == ours.strip("/"):
-        return
-    for name, value in present.attrs.items():
-        new.attrs[name] = value
-    for name in present:
-        with contextlib.suppress(OSError, RuntimeError, KeyError):  # it cannot be read
-            if name not in new:
-                present.copy(name, new)
-            elif isinstance(present[name], h5py.Group):
-                _copy_missing(present[name], new[name], ours)
+    new, is_new = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new"), not path.exists()
+    with contextlib.ExitStack() as stack:
+        stack.callback(new.unlink, missing_ok=True)
+        with contextlib.suppress(OSError):  # it is missing or cannot be read
+            if path.stat().st_size > 0:
+                stack.enter_context(open_file(backend, "r+"))
+                shutil.copyfile(path, new)
+        try:
+            change(new)
+        except Exception:  # HDF5 raises nearly anything
+            if not damaged:
+                raise
+            new.unlink()
+            change(new)
+        if os.name == "nt":  # Windows replaces no open file
+            stack.pop_all().close()
+        try:
+            (os.link if is_new else os.replace)(new, path)
+        except FileExistsError:  # another sampler has made the file meanwhile
+            change_file(backend, change)
 
 
 def read_object(_: str, node: h5py.Group | h5py.Dataset) -> None:

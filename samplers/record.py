@@ -11,7 +11,7 @@ The file is a sequence of blocks: kind, length, two CRC-32, arrays in NumPy's fo
 ``EVAL``
     Points that were evaluated, with their log-probabilities, blobs and reasons of failure.
 ``MEMO``
-    Arrays under a key: results of a guide, or the order in which points of an asynchronous run arrived.
+    Arrays under a key: simulations of a guide, or the order in which points of an asynchronous run arrived.
 
 A kill can leave only the last block incomplete, and an incomplete block is dropped. Without a path, the record is kept
 in memory only.
@@ -27,7 +27,6 @@ import struct
 import tempfile
 import weakref
 import zlib
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -46,7 +45,7 @@ try:
 except ImportError:  # Windows has no such locks: two runs on one file are not detected there
     flock = None
 
-__all__ = ["EvaluatedBatch", "Record", "RunStart", "free_name", "merge_batches"]
+__all__ = ["EvaluatedBatch", "Incomplete", "Record", "Remember", "RunStart", "free_name", "merge_batches"]
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +53,12 @@ MAGIC, BLOCK = b"samplers record 1\n", struct.Struct("<4sQII")  # kind, length, 
 # a record in memory keeps only the latest points of a long chain, which a repeated step or the verdict needs
 KEPT_IN_MEMORY = 20_000
 _LARGE = 2**20  # bytes of arrays under a key from which they are in a file only
+Remember = Callable[[str, Callable[[], Sequence[np.ndarray]]], list[np.ndarray]]
 _open_records: "weakref.WeakValueDictionary[Path, Record]" = weakref.WeakValueDictionary()
+
+
+class Incomplete(Exception):
+    """A finished run that is made again asks for what its record does not contain: other bits, or a lost record."""
 
 
 class EvaluatedBatch(NamedTuple):
@@ -84,13 +88,6 @@ def merge_batches(batches: Sequence[EvaluatedBatch]) -> EvaluatedBatch:
     return EvaluatedBatch(coords, log_prob, blobs, reasons)
 
 
-class _Place(NamedTuple):
-    """Where the content of a block is in a file."""
-
-    start: int
-    length: int
-
-
 class RunStart(NamedTuple):
     """Start of an annealing."""
 
@@ -104,7 +101,7 @@ class Record:
 
     `slow` are indices of the parameters that a simulation depends on, all by default. `start` belongs to the last
     annealing, None before it. `count` is the number of evaluated points; `failed` are points that failed, with reasons,
-    in the order of evaluation.
+    in the order of evaluation. `is_complete`: the run reached beta = 1 before, so nothing new may be asked for.
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):
@@ -116,15 +113,12 @@ class Record:
 
     def _clear(self) -> None:
         self.start: RunStart | None = None
-        self.count = 0
+        self.count, self.is_complete = 0, False
         self.failed: list[tuple[np.ndarray, str]] = []
-        self.used: Counter[str] = Counter()  # how many arrays of each key the run has asked for
         self._batches: list[EvaluatedBatch] = []
-        self._first: list[int] = []  # number of the first point of each batch
-        self._dropped = 0
-        self._place: dict[bytes, int] = {}
-        self._simulated: set[bytes] = set()
-        self._arrays: dict[str, list[list[np.ndarray] | _Place]] = {}
+        self._known: dict[bytes, tuple[EvaluatedBatch, int]] = {}  # batch and row of each point
+        self._simulated: set[bytes] = set()  # slow parameters
+        self._arrays: dict[str, list[list[np.ndarray] | tuple[int, int]]] = {}  # or where large ones are in the file
         self._large: Any = None  # temporary file of the large arrays of a record in memory
         self._whole = 0  # bytes of the file that were read
         self._seen = 0  # size of the file when it was read or closed
@@ -136,18 +130,13 @@ class Record:
 
     # ------------------------------------------------------------------ evaluations
 
-    def find(self, coords: np.ndarray) -> list[tuple[slice, EvaluatedBatch | None]]:
-        """Consecutive parts of points (n, ndim), each with its evaluations, or None if they are not known."""
-        found = [self._place.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
-        batch = [None if number is None else bisect_right(self._first, number) - 1 for number in found]
-        parts = []
-        for number, group in groupby(range(len(found)), batch.__getitem__):
-            rows = list(group)
-            known = None
-            if number is not None:
-                known = self._batches[number].rows([found[row] - self._first[number] for row in rows])
-            parts.append((slice(rows[0], rows[-1] + 1), known))
-        return parts
+    def find(self, coords: np.ndarray) -> tuple[np.ndarray, list[EvaluatedBatch]]:
+        """Which of points (n, ndim) are known, (n,) bool, and their values in order, in one or more batches."""
+        found = [self._known.get(row.tobytes()) for row in np.ascontiguousarray(coords)]
+        groups = groupby(filter(None, found), lambda each: id(each[0]))
+        parts = [list(group) for _, group in groups]
+        known = np.array([each is not None for each in found], dtype=bool)
+        return known, [part[0][0].rows([row for _, row in part]) for part in parts]
 
     def evaluated(self, batch: EvaluatedBatch) -> None:
         """Enter evaluated points; they are in the file on return. ValueError for blobs that a file cannot hold."""
@@ -164,11 +153,10 @@ class Record:
             _check_blobs(dtype)
 
     def _enter(self, batch: EvaluatedBatch) -> None:
-        self._first.append(self.count)
         self._batches.append(batch)
         coords = np.ascontiguousarray(batch.coords)
-        for number, point in enumerate(coords, self.count):
-            self._place.setdefault(point.tobytes(), number)
+        for row, point in enumerate(coords):
+            self._known.setdefault(point.tobytes(), (batch, row))
         self._simulated.update(self.keys(coords))
         self.count += len(coords)
         self.failed += [(coords[row].copy(), reason) for row, reason in batch.reasons.items()]
@@ -189,7 +177,10 @@ class Record:
 
     def latest(self, most: int = KEPT_IN_MEMORY) -> EvaluatedBatch | None:
         """At least the latest `most` evaluated points, in the order of their evaluation; None without any."""
-        first = max(bisect_right(self._first, self.count - most) - 1, 0)
+        first = len(self._batches)
+        while first > 0 and most > 0:
+            first -= 1
+            most -= len(self._batches[first].coords)
         return merge_batches(self._batches[first:]) if self._batches else None
 
     def first(self, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -197,42 +188,39 @@ class Record:
         coords, log_prob = (np.concatenate([batch[column][:n] for batch in self._batches])[:n] for column in (0, 1))
         return coords, log_prob
 
-    def best_and_first(self) -> EvaluatedBatch | None:
-        """One or two evaluated points that did not fail, to compare the function at; None without any."""
-        points = merge_batches(self._batches) if self._batches else None
-        finite = np.flatnonzero(np.isfinite(points.log_prob)) if points is not None else ()
-        if len(finite) == 0:
-            return None
-        best = int(finite[np.argmax(points.log_prob[finite])])
-        return points.rows(sorted({int(finite[0]), best}))
-
     def drop_old_points(self) -> None:
         """Forget old points of a record in memory that no repeated step can need."""
-        while self._file is None and self.count - self._dropped > 2 * KEPT_IN_MEMORY and len(self._batches) > 1:
-            batch = self._batches.pop(0)
-            self._dropped = self._first.pop(0) + len(batch.coords)
-            for point in np.ascontiguousarray(batch.coords):
-                self._place.pop(point.tobytes(), None)
+        while self._file is None and len(self._known) > 2 * KEPT_IN_MEMORY and len(self._batches) > 1:
+            for point in np.ascontiguousarray(self._batches.pop(0).coords):
+                self._known.pop(point.tobytes(), None)
 
     # ------------------------------------------------------------------ arrays under a key
 
-    def remember(self, key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
-        """Arrays that ``compute()`` returns, or the arrays that it returned when the run was made before.
+    def remembering(self) -> Remember:
+        """A function ``remember(key, compute)`` for a run that is made from its start, now or again.
 
-        For equal keys, the arrays that were stored first are returned first.
+        It returns the arrays that ``compute()`` returns, or those that it returned when the run was made before. For
+        equal keys, the arrays that were stored first are returned first.
         """
-        known = self._arrays.setdefault(key, [])
-        if self.used[key] == len(known):
-            arrays = [np.asarray(array) for array in compute()]
-            with deferred_interrupts():
-                known.append(self._kept(arrays, self._write(b"MEMO", [_text(key), *arrays])))
-            self.used[key] += 1
-            return arrays
-        self.used[key] += 1
-        return self._stored(known[self.used[key] - 1])
+        used: Counter[str] = Counter()
+
+        def remember(key: str, compute: Callable[[], Sequence[np.ndarray]]) -> list[np.ndarray]:
+            known = self._arrays.setdefault(key, [])
+            if used[key] == len(known):
+                if self.is_complete:
+                    raise Incomplete
+                arrays = [np.asarray(array) for array in compute()]
+                with deferred_interrupts():
+                    known.append(self._kept(arrays, self._write(b"MEMO", [_text(key), *arrays])))
+                used[key] += 1
+                return arrays
+            used[key] += 1
+            return self._stored(known[used[key] - 1])
+
+        return remember
 
     def note(self, key: str, array: np.ndarray) -> None:
-        """Store an array under a key; only the last array counts (`noted`)."""
+        """Store an array under a key; only the last one counts (`noted`)."""
         with deferred_interrupts():
             self._write(b"MEMO", [_text(key), array])
             self._arrays[key] = [[array]]
@@ -241,27 +229,23 @@ class Record:
         """The last array that was noted under a key since the annealing began; None without any."""
         return self._stored(self._arrays[key][-1])[0] if key in self._arrays else None
 
-    def _kept(self, arrays: list[np.ndarray], place: "_Place | None") -> "list[np.ndarray] | _Place":
-        """Arrays of a block, or where they are in the file of the record, or in a temporary one, if they are large."""
+    def _kept(self, arrays: list[np.ndarray], place: tuple[int, int] | None) -> list[np.ndarray] | tuple[int, int]:
+        """Arrays; or, if they are large, first byte and length of their block in the file, or in a temporary one."""
         if sum(array.nbytes for array in arrays) < _LARGE:
             return arrays
         if place is None:
             self._large = self._large or tempfile.TemporaryFile()  # noqa: SIM115  as long as the record
             start = self._large.seek(0, os.SEEK_END)
-            place = _Place(start, self._large.write(_content([_text(""), *arrays])))
+            place = start, self._large.write(_content([_text(""), *arrays]))
         return place
 
-    def _stored(self, kept: "list[np.ndarray] | _Place") -> list[np.ndarray]:
+    def _stored(self, kept: list[np.ndarray] | tuple[int, int]) -> list[np.ndarray]:
         """The arrays that `_kept` was given."""
         if isinstance(kept, list):
             return kept
         with nullcontext(self._large) if self.path is None else open(self.path, "rb") as file:
-            file.seek(kept.start)
-            return _arrays_of(file.read(kept.length))[1:]
-
-    def rewind(self) -> None:
-        """The run is repeated from its start: `remember` returns the stored arrays, beginning with the first."""
-        self.used.clear()
+            file.seek(kept[0])
+            return _arrays_of(file.read(kept[1]))[1:]
 
     # ------------------------------------------------------------------ the file
 
@@ -276,7 +260,6 @@ class Record:
 
     def _begin(self, start: RunStart) -> None:
         self.start, self._arrays = start, {}
-        self.used.clear()
 
     def open(self) -> None:
         """Open the file for writing, and lock it. ValueError if another process writes to it."""
@@ -331,21 +314,16 @@ class Record:
 
     def renew(self) -> Path | None:
         """Begin with an empty record; returns the new name of its file, if it has one."""
-        if self.path is None or not self.path.exists():
-            self._clear()
-            return None
-        self.open()  # another process that writes to the file owns it
-        return self.set_aside("before_reset")
-
-    def set_aside(self, ending: str) -> Path:
-        """Rename the file, and begin with an empty record; returns the new name."""
-        self.close()
-        aside = free_name(self.path, ending)
-        os.replace(self.path, aside)
+        aside = None
+        if self.path is not None and self.path.exists():
+            self.open()  # another process that writes to the file owns it
+            self.close()
+            aside = free_name(self.path, "before_reset")
+            os.replace(self.path, aside)
         self._clear()
         return aside
 
-    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> "_Place | None":
+    def _write(self, kind: bytes, arrays: Sequence[np.ndarray]) -> tuple[int, int] | None:
         if self.path is None:
             return None
         self.open()
@@ -364,7 +342,7 @@ class Record:
                 str(self.path),
             ) from error
         self._whole = start + len(data)
-        return _Place(start + BLOCK.size, len(data) - BLOCK.size)
+        return start + BLOCK.size, len(data) - BLOCK.size
 
     def _read(self) -> None:
         data, place = self.path.read_bytes(), len(MAGIC)
@@ -404,7 +382,7 @@ class Record:
                 header, name, *rest = json.loads(first.tobytes())
                 self._begin(RunStart(header, arrays[0], (name, arrays[1], *rest)))
             else:
-                kept = self._kept(arrays, _Place(start, len(content)))
+                kept = self._kept(arrays, (start, len(content)))
                 self._arrays.setdefault(json.loads(first.tobytes()), []).append(kept)
         except ValueError:
             return False

@@ -5,6 +5,7 @@ of a run, the annealing is repeated from the record without an evaluation, and t
 step, as in emcee. A damaged or missing chain is repeated as well.
 """
 
+import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
@@ -19,13 +20,13 @@ from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
 from .moves.population_moves import describe
-from .output import DAMAGED, is_whole, make_group, run_of_file
+from .output import DAMAGED, make_group, run_of_file
 from .output_file import open_file, patient_open
 from .record import EvaluatedBatch, Record, free_name
 from .settings import Settings
 from .tempering.guide import Guide, guide_fingerprint
 
-__all__ = ["compare", "describe_run", "differences", "open_record", "points_to_compare"]
+__all__ = ["changes", "describe_run", "differences", "open_record"]
 
 logger = logging.getLogger(__name__)
 
@@ -60,13 +61,13 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
             f"{backend.filename} contains a run of {shape[0]} walkers in {shape[1]} dimensions; got "
             f"nwalkers={nwalkers}, ndim={ndim}. Use another file, or backend.reset(nwalkers, ndim)"
         )
-    if stored == run and is_whole(backend, record):
+    if stored == run:
         return record
     record.open()  # another process that writes to the files owns them, and is between two writes
     stored = run_of_file(backend)
-    if stored == run and is_whole(backend, record):
+    if stored == run:
         return record
-    if stored in (run, None, DAMAGED):
+    if stored in (None, DAMAGED):
         if stored is not None:
             aside = free_name(path, "damaged")
             shutil.copyfile(path, aside)
@@ -77,9 +78,9 @@ def open_record(backend: Backend | None, nwalkers: int, ndim: int, slow: Sequenc
                 aside,
             )
         logger.warning("the chain of %s is made again from %s", backend.filename, record.path)
-        make_group(backend, *record.start.coords.shape, run)
+        make_group(backend, *record.start.coords.shape, run, damaged=stored == DAMAGED)
         return record
-    aside = record.set_aside("before_reset")
+    aside = record.renew()
     logger.warning(
         "%s was reset, or replaced by the chain of another run: a new record begins, the earlier one is kept as %s",
         backend.filename,
@@ -96,25 +97,24 @@ def describe_run(
     probabilities: Sequence[float],
     guide: Guide | None,
 ) -> dict:
-    """The start of a run as plain data, with the entries `described`.
+    """The start of a run as plain data, with the entries `described`, in the form that JSON returns.
 
     The function and the guide are identified by their attributes ``fingerprint``; a guide without one by its class, a
     function without one not at all.
     """
-    plain = {name: _plain(value) for name, value in asdict(settings).items()}
-    return {
+
+    def plain(value: Any) -> str:
+        return f"{value.__module__}.{value.__qualname__}"  # a setting that is a function
+
+    header = {
         "log_prob_fn": getattr(function, "fingerprint", None),
         **described,
-        **plain,
+        **asdict(settings),
         "moves": [describe(move) for move in moves],
         "probabilities": [float(probability) for probability in probabilities],
         "guide": None if guide is None else guide_fingerprint(guide),
     }
-
-
-def _plain(value: Any) -> Any:
-    """A setting in a form that JSON accepts: a function by its name."""
-    return f"{value.__module__}.{value.__qualname__}" if callable(value) else value
+    return json.loads(json.dumps(header, default=plain))
 
 
 def differences(stored: dict, ours: dict) -> list[str]:
@@ -125,29 +125,26 @@ def differences(stored: dict, ours: dict) -> list[str]:
     return [f"{name} was {stored.get(name)}, is {ours[name]}" for name in names]
 
 
-def points_to_compare(record: Record, last: State | None) -> EvaluatedBatch | None:
-    """One or two points at which a log-density without a fingerprint is compared with a stored run; None without any.
+def changes(
+    record: Record, last: State | None, compute: Callable[[np.ndarray], EvaluatedBatch], name: str = "log_prob_fn"
+) -> list[str]:
+    """How a log-density differs from its stored value at the best known point, as text; empty if it does not.
 
-    A chain without a record has the `last` stored step only.
+    The known points are those of the `record`, or of the `last` step of a chain without a record.
     """
-    if record.count > 0 or last is None:
-        return record.best_and_first()
-    few = np.argsort(last.log_prob)[[0, -1]]
-    return EvaluatedBatch(last.coords[few], last.log_prob[few], None if last.blobs is None else last.blobs[few], {})
-
-
-def compare(known: EvaluatedBatch, compute: Callable[[np.ndarray], EvaluatedBatch]) -> list[str]:
-    """Difference between a log-density and its earlier values at known points, as text; empty if there is none."""
-    found = compute(known.coords)
+    known = record.latest(max(record.count, 1))
+    if known is None and last is not None:
+        known = EvaluatedBatch(last.coords, last.log_prob, last.blobs, {})
+    if known is None or not np.isfinite(known.log_prob).any():
+        return []
+    known = known.rows([int(np.argmax(np.where(np.isfinite(known.log_prob), known.log_prob, -np.inf)))])
+    found, (coords,) = compute(known.coords), known.coords
     if (known.blobs is None) != (found.blobs is None):
-        return [
-            "log_prob_fn returned blobs, and returns none" if found.blobs is None else "log_prob_fn returns blobs now"
-        ]
-    for row, (coords, before, after) in enumerate(zip(known.coords, known.log_prob, found.log_prob, strict=True)):
-        if not np.isclose(before, after, **CLOSE, equal_nan=True):
-            return [f"log_prob_fn was {before:.10g} at {coords}, is {after:.10g}"]
-        if known.blobs is not None and not _same_blobs(known.blobs[row], found.blobs[row]):
-            return [f"blobs of log_prob_fn were {known.blobs[row]} at {coords}, are {found.blobs[row]}"]
+        return [f"{name} returned blobs, and returns none" if found.blobs is None else f"{name} returns blobs now"]
+    if not np.isclose(known.log_prob, found.log_prob, **CLOSE).all():
+        return [f"{name} was {known.log_prob[0]:.10g} at {coords}, is {found.log_prob[0]:.10g}"]
+    if known.blobs is not None and not _same_blobs(known.blobs[0], found.blobs[0]):
+        return [f"blobs of {name} were {known.blobs[0]} at {coords}, are {found.blobs[0]}"]
     return []
 
 

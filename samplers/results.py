@@ -9,7 +9,7 @@ from .estimates.control_variates import SignedSample
 from .estimates.genealogy import standard_error_of_mean, student_factor
 from .estimates.importance import EvidenceCheck
 from .evaluation.evaluator import Evaluator
-from .evaluation.user_functions import OptionalAttributes
+from .evaluation.user_target import Target
 from .judgement.failures import NearFailures
 from .judgement.verdict import RunParts, Verdict
 from .record import Record
@@ -33,7 +33,7 @@ class RunResults:
     _guide: AdaptedGuide | None
     _result: AnnealingResult
     _verdict: Verdict | None
-    _optional: OptionalAttributes
+    _target: Target
     _seed: list[int] | None
     _near: NearFailures | None = None
     _prior_draws: np.ndarray | None = None
@@ -238,6 +238,6 @@ class RunResults:
             raise ValueError("there is no verdict before a run: call run_mcmc first")
         near = None if self._result.independent_points is None else self._near
         get_chain = self.get_chain if self.iteration > 0 else lambda: np.empty((0, self.nwalkers, 0))
-        failed = self._optional.failure_count
+        failed = self._target.failure_count
         run = self._result, get_chain, self.nwalkers, self.evaluations, self.failure_count, near, failed
         return self._verdict.of(RunParts(*run))

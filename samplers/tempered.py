@@ -7,20 +7,18 @@ posterior only, and everything that emcee does with a chain works unchanged.
 Each walker carries (log_prob, log_prior, blobs) as the blobs of an emcee State, whose log_prob is the tempered density.
 Therefore any emcee move works below beta = 1, and a change of beta needs no evaluation.
 
-Three collaborators do the rest: `samplers.evaluation.evaluator.Evaluator` calls the user's function,
+Three collaborators do the rest: `samplers.evaluation.evaluator.Evaluator` evaluates the user's function,
 `samplers.record.Record` keeps its values, and `samplers.output.Output` stores the ladder and the verdict with the
 chain.
 """
 
 import copy
-import json
 import logging
 import time
 import uuid
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from dataclasses import fields, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,11 +26,9 @@ from emcee import EnsembleSampler, State
 
 from .budget import Budget, BudgetExhausted, as_limit
 from .emcee_internals import get_moves, get_previous_state, get_random, set_moves, set_previous_state, trim_chain
-from .evaluation.asynchronous import AsynchronousEvaluator
-from .evaluation.evaluator import CallingConvention, Evaluator, FailureLimit, most_common_reasons
-from .evaluation.pool_queue import advise_on_pool, check_asynchronous, open_queue
-from .evaluation.returned_values import ErrorCapturing
-from .evaluation.user_functions import UserFunctions
+from .evaluation.asynchronous import AsynchronousEvaluator, advise_on_pool, check_asynchronous
+from .evaluation.evaluator import Evaluator, most_common_reasons, unpack
+from .evaluation.user_target import Target
 from .interrupts import deferred_interrupts, interrupts_end_the_run
 from .judgement.checks import check_likelihood
 from .judgement.failures import judged_failures
@@ -40,15 +36,15 @@ from .judgement.verdict import CONVERGED, describe_early_stop, independent_point
 from .moves.fast_parameters import with_fast_sweeps
 from .moves.population_moves import GuideMove, RandomWalkMove, calibrate_move
 from .output import Output
-from .record import EvaluatedBatch, RunStart
-from .replay import compare, describe_run, differences, open_record, points_to_compare
+from .record import EvaluatedBatch, Incomplete, RunStart
+from .replay import changes, describe_run, differences, open_record
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reports import AnnealingResult, warn
 from .results import RunResults
 from .settings import Settings, as_whole_number, check_arguments, check_names, refuse_unused
 from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide
-from .tempering.guided import lend
+from .tempering.guided import Guidance, lend
 from .tempering.mutation import MoveSchedule, check_moves
 from .tempering.population import Population, check_size, check_start
 from .tempering.recording import Recording
@@ -138,10 +134,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
     ):
         check_names(type(self).__name__, self.setting_names, settings, ARGUMENTS)
         check_arguments(pool, backend, seed)
-        functions = UserFunctions.of(log_prob_fn, log_likelihood_fn, log_prior_fn)
-        self._functions, self._optional, self.log_prior_fn = functions, functions.optional, functions.log_prior
         nwalkers, ndim = as_whole_number("nwalkers", nwalkers), as_whole_number("ndim", ndim)
-        self._optional.check_ndim(ndim, functions.name)
+        functions = log_prob_fn, log_likelihood_fn, log_prior_fn
+        self._target = target = Target(*functions, ndim, args, kwargs, vectorize, blobs_dtype)
+        self.log_prior_fn = target.log_prior_fn
         check_size(nwalkers, ndim)
         settings = self._with_defaults(settings, moves)
         given = Settings(**settings)
@@ -149,10 +145,9 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self.settings = replace(given, recycle=recycle)
         self._given_guide, self._guide = guide, None
         if guide is not None:
-            check_guide(guide, functions.function, vectorize)
+            check_guide(guide, target.function, vectorize)
 
-        slow = self._optional.slow_parameters(ndim)
-        self._record = open_record(backend, nwalkers, ndim, slow)
+        self._record = open_record(backend, nwalkers, ndim, target.slow_parameters)
         self._budget = Budget(self._record, as_limit(max_simulations))
         # whether the annealing of the record must be repeated, and whether another sampler wrote the record
         self._must_repeat = self._reopened = self._record.start is not None
@@ -162,7 +157,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         super().__init__(
             nwalkers,
             ndim,
-            functions.function,
+            target.function,
             pool=pool,
             moves=copy.deepcopy(moves),
             args=args,
@@ -172,11 +167,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
             blobs_dtype=blobs_dtype,
             parameter_names=parameter_names,
         )
-        self._output = Output(self.backend, self._record)
+        self._output = Output(self.backend)
         self._result, self._verdict = self._output.result, self._output.verdict
         self._is_compared = not self._reopened and self.backend.iteration == 0
         check_moves(get_moves(self)[0], given.chains)
-        self._fast = self._optional.fast_parameters if pool is None or vectorize else ()
+        self._fast = target.fast_parameters if pool is None or vectorize else ()
         followed = with_fast_sweeps(get_moves(self)[0], self._fast, ndim, self.settings.fast_sweeps)
         # each annealing begins with copies of these
         self._first_moves = copy.deepcopy(followed), get_moves(self)[1]
@@ -185,7 +180,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         advise_on_pool(pool)
         if given.ess_floor >= nwalkers:
             raise ValueError(f"ess_floor={given.ess_floor} must be below nwalkers={nwalkers}")
-        self._evaluator = self._make_evaluator(blobs_dtype)
+        target.parameter_names = self.parameter_names if self.params_are_named else None
+        self._evaluator = self._make_evaluator()
         self._drawn: np.ndarray | None = None  # a start that need not be tested
         self._seed = None if seed is None else np.ravel(seed).tolist()
         # also drawn where it is not used, so that a script draws the same numbers after a restart
@@ -197,20 +193,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         elif self.backend.random_state is None:
             get_random(self).seed(self._stream)
 
-    def _make_evaluator(self, blobs_dtype: Any) -> Evaluator:
-        """The evaluator of the user's function."""
-        functions, args, kwargs = self._functions, self.log_prob_fn.args, self.log_prob_fn.kwargs
-        names = self.parameter_names if self.params_are_named else None
-        convention = CallingConvention(self.vectorize, names, blobs_dtype)
-        captured = ErrorCapturing(functions.function, args, kwargs, self.vectorize)
-        limit = FailureLimit(self.settings.max_failure_share, self.nwalkers, self.ndim)
-        common = captured, functions.log_prior, convention, self._record, limit, self._budget, functions.name
+    def _make_evaluator(self) -> Evaluator:
+        """The evaluator of the target."""
+        common = self._target, self._record, self._budget, self.nwalkers, self.settings.max_failure_share
         if not self.settings.asynchronous:
             return Evaluator(*common)
-        check_asynchronous(functions.function, self.pool, self.vectorize)
-        queue = getattr(self._given_guide, "evaluation_queue", None)
-        opened = partial(open_queue, functions.function, captured, convention.as_points, queue)
-        return AsynchronousEvaluator(*common, open_queue=opened)
+        check_asynchronous(self._target, self.pool)
+        return AsynchronousEvaluator(*common, queue=getattr(self._given_guide, "evaluation_queue", None))
 
     @classmethod
     def _with_defaults(cls, settings: dict[str, Any], moves: Any) -> dict[str, Any]:
@@ -357,7 +346,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
             steps = () if ended else super().sample(state, skip_initial_state_check=skip, **arguments, progress=False)
             per_step = 1 if thin else int(thin_by)
             sweeps = None if iterations is None else iterations * per_step
-            shown = self._evaluator, self._functions.function
+            shown = self._evaluator, self._target.function
             start = time.perf_counter()
             try:
                 for advanced in show_sweeps(steps, bar, sweeps, per_step, *shown):
@@ -422,22 +411,24 @@ class TemperedSampler(RunResults, EnsembleSampler):
         """Store the verdict on an annealing by this object, or keep the verdict of the backend."""
         if self._result.independent_points is not None or self._verdict is None:
             failed = f"{self.failure_count} of {self.evaluations} evaluations" if self.failure_count else ""
-            optional, latest, self._near = self._optional, self._record.latest(), None
+            target, latest, self._near = self._target, self._record.latest(), None
             if latest is not None:
                 has_failed = np.isin(np.arange(len(latest.coords)), list(latest.reasons))
                 points = latest.coords, latest.log_prob, has_failed
-                slow = np.array(optional.slow_parameters(self.ndim))
-                options = slow, optional.counts_failures, optional.may_be_positive
+                slow = np.array(target.slow_parameters)
+                options = slow, target.failure_count is not None, target.may_be_positive
                 self._near = judged_failures(*points, coords, *options)
             numbers = self.nwalkers, self.ndim, self.simulations
             searched = self._budget.of_guides
             self._verdict = judge(self._result, *numbers, missing, failed, searched, self._near)
+        elif self._record.start is not None:  # an annealing that could not be made again
+            self._verdict = self._verdict._replace(simulations=self.simulations)
         self._output.write(self._result, self._verdict)
 
     def compute_log_prob(self, coords):
         """Log-probability and blobs of points (n, ndim), as in emcee; -inf for NaN and outside the prior's support."""
         self._evaluator.pool = self.pool
-        return self._evaluator.unpack(self._evaluator.evaluate(coords))
+        return unpack(self._evaluator.evaluate(coords))
 
     # ------------------------------------------------------------------ where a call begins
 
@@ -454,7 +445,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if start is not None and self._must_repeat:
             known = [each.coords for each in (start, previous) if each is not None]
             if given is None or any(np.array_equal(given.coords, coords) for coords in known):
-                return self._repeated(start)
+                if self._record.path is not None:  # a user who waits sees that the time spent is not lost
+                    said = "Going on with %s: %d evaluations and %d steps are stored"
+                    logger.warning(said, self.backend.filename, self.evaluations, self.iteration)
+                self._drawn = start.coords  # tested when the run began
+                return start
             if self._reopened:
                 raise ValueError(
                     f"{self._place} contains a run from other draws of the prior: pass None as initial_state to go on "
@@ -463,7 +458,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         if given is None and previous is not None:
             given = previous
         elif given is None:
-            self._drawn = self._functions.draw_prior(self.nwalkers, get_random(self))
+            self._drawn = self._target.sample_prior(self.nwalkers, get_random(self))
             given = State(self._drawn)
         elif previous is not None and given.log_prob is None:
             if np.array_equal(given.coords, previous.coords):
@@ -528,49 +523,30 @@ class TemperedSampler(RunResults, EnsembleSampler):
         stored = self._record.start
         found = [] if stored is None else differences(stored.header, self._header())
         if stored is not None and not found:
-            log_prior = float(np.sum(self._evaluator.log_prior(stored.coords)))
+            log_prior = float(np.sum(self._target.log_prior(stored.coords)))
             if not np.isclose(log_prior, stored.header["log_prior"], rtol=1e-9, atol=1e-9):
                 found = ["the log-prior of the draws that it started from differs"]
-        known = points_to_compare(self._record, get_previous_state(self))
-        if not found and known is not None and getattr(self._functions.function, "fingerprint", None) is None:
-            found = compare(known, self._evaluator.compute)
+        if not found and getattr(self._target.function, "fingerprint", None) is None:
+            found = changes(self._record, get_previous_state(self), self._evaluator.compute)
         self._is_compared = not found
         return found
 
     def _header(self) -> dict:
         """The start of this run, in the form that JSON returns."""
-        described = {"sampler": type(self).__name__, **self._functions.described()}
-        header = describe_run(self._functions.function, described, self.settings, *self._first_moves, self._given_guide)
-        return json.loads(json.dumps(header))
-
-    def _say_that_bits_differ(self) -> None:
-        warn(
-            f"the annealing in {self.backend.filename} is made again, and needs points that its record does not have: "
-            "another processor, or another version of NumPy or SciPy, computes other bits. The chain goes on from its "
-            "last step, but points are evaluated anew; continue on the first processor and environment to avoid this"
-        )
-
-    def _repeated(self, start: RunStart) -> RunStart:
-        """The start in the record, from which the annealing is repeated."""
-        if self._record.path is not None:
-            logger.warning(  # a user who waits sees that the time spent is not lost
-                "Going on with %s: %d evaluations and %d steps are stored",
-                self.backend.filename,
-                self.evaluations,
-                self.iteration,
-            )
-        self._record.rewind()
-        self._drawn = start.coords  # tested when the run began
-        return start
+        described = {
+            "sampler": type(self).__name__,
+            "log_likelihood_fn": "used" if self._target.is_likelihood else None,
+        }
+        return describe_run(self._target.function, described, self.settings, *self._first_moves, self._given_guide)
 
     def _new_start(self, state: State, skip_check: bool, anew: bool = False) -> RunStart:
         """Draws of the prior, checked and entered in the record, or in a new record."""
         check_start(state.coords, self.nwalkers, self.ndim, skip_check)
         self.random_state = state.random_state
         coords = np.asarray(state.coords, dtype=float)
-        log_prior = self._evaluator.log_prior_of_start(coords)
+        log_prior = self._target.log_prior_of_start(coords)
         if not np.array_equal(coords, self._drawn):
-            self._functions.check_start(coords, self._evaluator.log_prior)
+            self._target.check_start(coords)
         self._output.check_file()
         if anew:
             self._forget_run()
@@ -594,40 +570,32 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._prior_draws = start.coords
         schedule, guidance = MoveSchedule(*copy.deepcopy(self._first_moves)), None
         set_moves(self, *schedule)
+        remember = self._evaluator.begin()
         if self._given_guide is not None:
             self._guide = AdaptedGuide(self._given_guide, self.ndim)
-            lent = get_random(self), self._record.remember, self._budget, self.settings.asynchronous
-            guidance = lend(self._guide, *lent)
-        # an annealing that had reached beta = 1 finds all its points in the record
-        self._evaluator.on_unknown = self._say_that_bits_differ if self._output.last_state() is not None else None
+            guidance = lend(self._guide, get_random(self), remember, self._budget, self.settings.asynchronous)
+        stored = self._output.last_state()
+        self._record.is_complete = stored is not None
         population = Population(0.0, start.coords, None, float(self.nwalkers))
         recording = Recording(self._evaluator)
         steps = anneal(population, self._evaluator, get_random(self), schedule, self.settings, guidance)
         labels = {"desc": ANNEALING, "unit": " evaluations", **(bar["progress_kwargs"] or {})}
-        with (
-            get_progress_bar(bar["progress"], None, **labels) as shown,
-            closing(self._evaluator),
-            Progress(shown, self._evaluator, labels["desc"], self._functions.function) as progress,
-        ):
-            for population, report in steps:
-                recording.add(population, report)
-                self._result = recording.result
-                progress.show(recording.result, population, report)
+        try:
+            with (
+                get_progress_bar(bar["progress"], None, **labels) as shown,
+                closing(self._evaluator),
+                Progress(shown, self._evaluator, labels["desc"], self._target.function) as progress,
+            ):
+                for population, report in steps:
+                    recording.add(population, report)
+                    self._result = recording.result
+                    progress.show(recording.result, population, report)
+        except Incomplete:
+            return self._go_on_without_annealing(stored)
+        finally:
+            self._record.is_complete = False
         recording.check_evidence(population.coords)
-        stored, made = self._output.result.ladder, recording.result.ladder
-        if [stage._replace(seconds=0.0) for stage in stored] == [stage._replace(seconds=0.0) for stage in made]:
-            recording.result = recording.result._replace(ladder=stored)  # with the wall times of the evaluations
-        coords, log_prob = self._record.first(self.nwalkers)
-        said = check_likelihood(log_prob, self._evaluator.log_prior(coords))
-        for concern in said:
-            warn(concern.message)
-        self._result = recording.result._replace(
-            findings=(*recording.result.findings, *said),
-            concerns=() if guidance is None else guidance.guide.concerns,
-            refusals=() if guidance is None else guidance.guide.refusals,
-            basis="" if guidance is None else guidance.guide.basis,
-            independent_points=independent_points(recording.result, population.coords),
-        )
+        self._result = self._finished(recording.result, population, guidance)
         for concern in (*self._result.concerns, *self._result.refusals):
             warn(f"the result may miss a part of the posterior: {concern}")
         if self._result.start is not None and self._result.start.used:
@@ -636,9 +604,45 @@ class TemperedSampler(RunResults, EnsembleSampler):
             set_moves(self, moves, np.ones(1))
         self._judge(0, population.coords)
         self._reopened = False
-        last = None if self._result.early_stop is not None else self._output.last_state()
-        if last is not None:
-            self.random_state = last.random_state
-            return last
-        log_prob, blobs = self._evaluator.unpack(population.records)
-        return State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
+        ended = self._result.early_stop is not None
+        if stored is not None and not ended:
+            self.random_state = stored.random_state
+            return stored
+        log_prob, blobs = unpack(population.records)
+        state = State(population.coords, log_prob=log_prob, blobs=blobs, random_state=self.random_state)
+        if not ended:
+            self._output.keep_state(state)
+        return state
+
+    def _finished(self, result: AnnealingResult, population: Population, guidance: Guidance | None) -> AnnealingResult:
+        """The result of an annealing, with what is known of it as a whole."""
+        stored = self._output.result.ladder
+        if [stage._replace(seconds=0.0) for stage in stored] == [
+            stage._replace(seconds=0.0) for stage in result.ladder
+        ]:
+            result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
+        coords, log_prob = self._record.first(self.nwalkers)
+        said = check_likelihood(log_prob, self._target.log_prior(coords))
+        for concern in said:
+            warn(concern.message)
+        return result._replace(
+            findings=(*result.findings, *said),
+            concerns=() if guidance is None else guidance.guide.concerns,
+            refusals=() if guidance is None else guidance.guide.refusals,
+            basis="" if guidance is None else guidance.guide.basis,
+            independent_points=independent_points(result, population.coords),
+        )
+
+    def _go_on_without_annealing(self, stored: State) -> State:
+        """The last stored state of a run whose annealing cannot be made again, with the results that are stored."""
+        warn(
+            f"the annealing in {self._place} cannot be made again: another processor, or another version of NumPy or "
+            "SciPy, computes other bits, or its record has lost points. The chain goes on from its last stored state, "
+            "with its stored results, and the moves are fitted to it anew"
+        )
+        self._result, self._verdict = self._output.result, self._output.verdict
+        self._budget.take_from_record()
+        self._reopened = False
+        self.random_state = stored.random_state
+        set_moves(self, *copy.deepcopy(self._first_moves))
+        return stored

@@ -32,17 +32,9 @@ TARGET_ACCEPTANCE = 0.35
 
 
 class FastWalk(RandomWalkMove):
-    """Random walk in some coordinates, with their covariance conditional on the others, which stay fixed.
+    """Random walk in the coordinates with some indices, whose covariance is conditional on the others.
 
-    Parameters
-    ----------
-    indices : sequence of int
-        Indices of the coordinates that change.
-
-    Raises
-    ------
-    ValueError
-        If `indices` is empty or contains an invalid index.
+    ValueError for no index or an invalid one.
     """
 
     def __init__(self, indices: Sequence[int]):
@@ -66,23 +58,11 @@ class FastWalk(RandomWalkMove):
 
 
 class WithFastSweeps(Move):
-    """A move, followed by sweeps over the fast parameters.
+    """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`).
 
-    Parameters
-    ----------
-    move : emcee.moves.Move
-        The expensive move. The reported acceptance is the acceptance of this move alone.
-    indices : sequence of int
-        Indices of the fast parameters.
-    sweeps : int
-        Number of random-walk steps that the whole ensemble makes in the fast parameters after each move. The initial
-        scale of the walk is 2.38 / sqrt(number of fast parameters) times a root of the conditional covariance; ``tune``
-        adapts it.
-
-    Raises
-    ------
-    ValueError
-        If `indices` is empty or contains an invalid index, or if `sweeps` is less than 1.
+    The reported acceptance is that of the move alone. The initial scale of the walk is 2.38 / sqrt(number of fast
+    parameters) times a root of the conditional covariance; ``tune`` adapts it. ValueError for invalid indices, and for
+    less than one sweep.
     """
 
     takes_mixture = True
@@ -93,12 +73,8 @@ class WithFastSweeps(Move):
         self.move = move
         self.sweeps = sweeps
         self._walk = FastWalk(indices)
+        self.indices = self._walk.indices  # in ascending order
         self._accepted = np.empty(0)
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Indices of the fast parameters, in ascending order."""
-        return self._walk.indices
 
     @property
     def walk(self) -> FastWalk:
@@ -131,15 +107,7 @@ class WithFastSweeps(Move):
             self.move.expect_independence()
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        """Make the move, then the fast sweeps.
-
-        Returns
-        -------
-        state : emcee.State
-            State of the ensemble after all steps.
-        accepted : ndarray of bool, shape (nwalkers,)
-            Which proposals of the expensive move were accepted.
-        """
+        """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) are those of the move."""
         state, accepted = self.move.propose(model, state)
         acceptances = []
         for _ in range(self.sweeps):
@@ -155,28 +123,9 @@ class WithFastSweeps(Move):
 
 
 def with_fast_sweeps(moves: Sequence[Move], indices: Sequence[int], ndim: int, sweeps: int) -> list[Move]:
-    """Follow each move by sweeps over the fast parameters.
+    """The moves, each followed by sweeps over the fast parameters with these indices, if there are any of both.
 
-    Parameters
-    ----------
-    moves : sequence of emcee.moves.Move
-        The moves to wrap.
-    indices : sequence of int
-        Indices of the fast parameters.
-    ndim : int
-        Number of parameters.
-    sweeps : int
-        Number of fast sweeps after each move.
-
-    Returns
-    -------
-    list of emcee.moves.Move
-        The wrapped moves; the moves themselves if `sweeps` is 0, or if none or all of the parameters are fast.
-
-    Raises
-    ------
-    ValueError
-        If an index does not lie between 0 and ``ndim - 1``.
+    The moves themselves if all `ndim` parameters are fast. ValueError for an invalid index.
     """
     if sweeps == 0 or len(indices) == 0:
         return list(moves)

@@ -25,7 +25,7 @@ class PendingPoints:
         self.base = np.zeros(len(coords), BASE_FIELDS)
         self.base["log_prob"], self.base["log_prior"] = -np.inf, log_prior
         self.arrived = np.zeros(len(coords), dtype=bool)
-        self._records: np.ndarray | None = None
+        self._records = self.base.copy()
 
     @classmethod
     def known(cls, coords: np.ndarray, records: np.ndarray, refused: bool = False) -> "PendingPoints":
@@ -36,14 +36,11 @@ class PendingPoints:
 
     def arrive(self, rows: np.ndarray, records: np.ndarray) -> None:
         """Enter the records (m,) of points that have arrived, by their rows (m,)."""
-        if len(rows) == len(self.coords):
-            self._records = records
-        else:
-            if self._records is None or self._records.dtype != records.dtype:  # the first blobs change the type
-                earlier, self._records = self._records, np.zeros(len(self.coords), records.dtype)
-                for name in () if earlier is None else earlier.dtype.names:
-                    self._records[name] = earlier[name]
-            self._records[rows] = records
+        if self._records.dtype != records.dtype:  # the first blobs change the type
+            earlier, self._records = self._records, np.zeros(len(self.coords), records.dtype)
+            for name in earlier.dtype.names:
+                self._records[name] = earlier[name]
+        self._records[rows] = records
         self.arrived[rows] = True
 
     @property
@@ -58,8 +55,6 @@ class PendingPoints:
 
     def arrived_part(self) -> tuple[np.ndarray, np.ndarray]:
         """Points (m, ndim) that have arrived, and their records (m,), in the order of submission."""
-        if self._records is None:
-            return self.coords[:0], self.base[:0]
         if self.complete:
             return self.coords, self._records
         return self.coords[self.arrived], self._records[self.arrived]

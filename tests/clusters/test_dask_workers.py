@@ -8,7 +8,7 @@ import pytest
 
 from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import DaskExecutor
-from samplers.evaluation.pool_queue import PoolQueue
+from samplers.evaluation.asynchronous import PoolQueue
 from tests.clusters.noted import Gate
 from tests.faults.treacherous import Gated, Treacherous, posterior_of
 

@@ -428,15 +428,22 @@ def test_other_blobs_are_noticed(tmp_path):
         make("SMCSampler", tmp_path / "run.h5", Doubled(None)).run_mcmc(None, 1)
 
 
-def test_an_annealing_with_other_bits_says_so(tmp_path):
-    """Another processor computes other bits; here, a proposal is changed in its last one."""
-    begin(make("SMCSampler by moves", tmp_path / "run.h5", Counted()), 2)
-    again = make("SMCSampler by moves", tmp_path / "run.h5", Counted())
-    start = again._record.start
-    again._record.start = start._replace(coords=np.nextafter(start.coords, 9.0))
+@pytest.mark.parametrize(("kind", "steps"), covering(OURS, [0, 2], strength=1))
+def test_a_run_with_other_bits_goes_on_from_its_population(kind, steps, tmp_path):
+    """Another processor computes other bits; here, a proposal is changed in its last one. Nothing is evaluated anew."""
+    first = begin(make(kind, tmp_path / "run.h5", Counted()), steps)
+    last, posterior = first.run_mcmc(None, 0), Counted()
+    again = make(kind, tmp_path / "run.h5", posterior)
+    again._record.start = again._record.start._replace(coords=np.nextafter(again._record.start.coords, 9.0))
     with pytest.warns(SamplingWarning, match="computes other bits"):
-        again.run_mcmc(None, 1)
-    assert again.iteration == 3
+        again.run_mcmc(None, 0)
+    assert not posterior.evaluated and again.iteration == steps
+    assert np.array_equal(again.run_mcmc(None, 0).coords, last.coords)
+    assert [s._replace(seconds=0) for s in again.ladder] == [s._replace(seconds=0) for s in first.ladder]
+    assert again.log_evidence == first.log_evidence and again.verdict == first.verdict
+    assert np.array_equal(again.random_state[1], first.random_state[1])
+    again.run_mcmc(None, 2)
+    assert again.iteration == steps + 2 and len(posterior.evaluated) <= 2 * N
 
 
 @pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])

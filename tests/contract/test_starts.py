@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler, TemperedSampler, TMCMCSampler
-from samplers.evaluation.user_functions import UserFunctions
+from samplers.evaluation.user_target import Target
 from tests.contract.targets import Gaussian
 
 N = 60
@@ -61,7 +61,7 @@ def test_draws_pass_and_the_test_changes_no_run(Sampler, monkeypatch):
         return sampler.get_chain(), np.random.uniform()  # noqa: NPY002
 
     tested = chain()
-    monkeypatch.setattr(UserFunctions, "check_start", lambda *args: None)
+    monkeypatch.setattr(Target, "check_start", lambda *args: None)
     for a, b in zip(tested, chain(), strict=True):
         assert np.array_equal(a, b)
 
@@ -97,7 +97,7 @@ def test_a_start_that_was_drawn_by_the_sampler_is_not_tested(monkeypatch, tmp_pa
     def fail(*args):
         raise AssertionError("tested")
 
-    monkeypatch.setattr(UserFunctions, "check_start", fail)
+    monkeypatch.setattr(Target, "check_start", fail)
     posterior, calls = Gaussian(), []
 
     def interrupted(x):
@@ -125,7 +125,7 @@ def test_a_start_that_was_drawn_by_the_sampler_is_not_tested(monkeypatch, tmp_pa
 
 def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     """Negative control: why starts are tested."""
-    monkeypatch.setattr(UserFunctions, "check_start", lambda *args: None)
+    monkeypatch.setattr(Target, "check_start", lambda *args: None)
     posterior = Gaussian(3, sd=0.1)
     sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from samplers import SMCSampler
-from samplers.evaluation import asynchronous, pool_queue
+from samplers.evaluation import asynchronous
 from tests.contract.targets import Gaussian
 from tests.faults.records import points_of
 from tests.faults.test_ctrl_c import is_deferred
@@ -102,7 +102,7 @@ class Interrupt:
     Lines of ``submit`` do not count: points that begin have not ended.
     """
 
-    files = {asynchronous.__file__, pool_queue.__file__}
+    files = {asynchronous.__file__}
     left_out = {"submit", "__init__", "reset", "close"}  # with what they call
 
     def __init__(self, line, evaluated):

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 import pytest
 
-from samplers import SMCSampler, output_file
+from samplers import SamplingWarning, SMCSampler, output_file
 from samplers.evaluation import evaluator
 from samplers.record import BLOCK, MAGIC
 from tests.contract.targets import Gaussian
@@ -169,6 +169,20 @@ def test_half_of_a_step_is_found_and_the_chain_made_again(whole, damage, tmp_pat
     assert outcome(sampler) == expected and Path(f"{path}.damaged").exists()
     assert len(points_of(tmp_path / "log")) <= 2
     sampler._record.close()
+
+
+def test_a_run_that_another_processor_cannot_repeat_goes_on_from_its_last_step(whole, tmp_path):
+    """Other random numbers in place of other bits: nothing is evaluated but a comparison, and all results stay."""
+    kind, path, expected = whole
+    path = copied(path, tmp_path)
+    sampler = make(path, kind, log=tmp_path / "log")
+    other = np.random.RandomState(9).get_state()
+    sampler._record.start = sampler._record.start._replace(random_state=other)
+    with pytest.warns(SamplingWarning, match="computes other bits"):
+        go_on(sampler)
+    assert outcome(sampler) == expected and len(points_of(tmp_path / "log")) <= 1
+    sampler.run_mcmc(None, 2)
+    assert sampler.iteration == STEPS + 2 and len(points_of(tmp_path / "log")) <= 2 * N + 1
 
 
 def test_a_damaged_chain_without_a_record_is_refused(whole, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from samplers import SMCSampler, TMCMCSampler
-from samplers.evaluation.user_functions import OptionalAttributes
+from samplers.evaluation.user_target import Target
 from samplers.judgement import failures
 from samplers.judgement.failures import NearFailures, failures_near, judged_failures
 from tests.contract.targets import Box, Gaussian
@@ -123,7 +123,7 @@ def test_an_answer_that_cannot_be_used_rules_nothing_out(answer, caplog):
     known = sampler._record.latest()
     points = known.coords, known.log_prob, np.zeros(len(known.coords), bool), sampler.get_chain(flat=True)
     expected = judged_failures(*points, np.arange(2), True)
-    found = judged_failures(*points, np.arange(2), True, OptionalAttributes.of(posterior).may_be_positive)
+    found = judged_failures(*points, np.arange(2), True, Target(posterior, None, None, posterior.ndim).may_be_positive)
     assert found == expected and found.failed > 50 and "takes all points as possible" in caplog.text
 
 

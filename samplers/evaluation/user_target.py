@@ -1,0 +1,231 @@
+"""The target of a run: the user's functions, however they are to be called, as functions of arrays."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from emcee.ensemble import ndarray_to_list_of_dicts
+
+from ..interrupts import SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
+from ..record import EvaluatedBatch
+from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
+from .values import Caught, log_densities, outcomes
+
+__all__ = ["Target", "map_in"]
+
+logger = logging.getLogger(__name__)
+
+
+def map_in(pool: Any) -> Callable:
+    """``pool.map``, or Python's ``map`` without a pool; the futures of a dask client are gathered."""
+    if pool is None:
+        return map
+    if not hasattr(pool, "gather"):
+        return pool.map
+    return lambda function, items: pool.gather(pool.map(function, list(items), pure=False))
+
+
+class Target:
+    """`log_prior`, values and `sample_prior` of arrays of points, from the arguments of a sampler.
+
+    `function` is the log-posterior or the log-likelihood, and `name` says which. Its optional attributes are those of
+    the class. ValueError unless exactly one of the two functions is given and a log-prior is known, if `log_prob_fn` is
+    a method called log_likelihood, or if the function states another number of parameters than `ndim`. A sampler sets
+    `parameter_names` as emcee has them; None: functions take arrays.
+    """
+
+    parameter_names: Mapping[str, Any] | None = None
+
+    def __init__(
+        self,
+        log_prob_fn: Callable | None,
+        log_likelihood_fn: Callable | None,
+        log_prior_fn: Callable | None,
+        ndim: int,
+        args: Sequence | None = None,
+        kwargs: Mapping[str, Any] | None = None,
+        vectorize: bool = False,
+        blobs_dtype: Any = None,
+    ):
+        if (log_prob_fn is None) == (log_likelihood_fn is None):
+            given = "neither" if log_prob_fn is None else "both"
+            raise ValueError(
+                "exactly one of log_prob_fn (log-prior plus log-likelihood) and log_likelihood_fn must be given; got "
+                f"{given}. To pass a log-likelihood, use SMCSampler(nwalkers, ndim, None, log_likelihood_fn=..., "
+                "log_prior_fn=...)"
+            )
+        self.name = name = "log_likelihood_fn" if log_prob_fn is None else "log_prob_fn"
+        self.function = function = log_likelihood_fn if log_prob_fn is None else log_prob_fn
+        if not callable(function):
+            raise ValueError(f"{name} must be callable; got {function!r}")
+        owner = getattr(function, "__self__", None)
+        if not self.is_likelihood and owner is not None and function == getattr(owner, "log_likelihood", None):
+            raise ValueError(
+                "log_prob_fn is the method log_likelihood, which lacks the log-prior: the evidence would be wrong. "
+                "Pass None as log_prob_fn, and the method as log_likelihood_fn=; or pass the object itself"
+            )
+        self.log_prior_fn = getattr(function, "log_prior", None) if log_prior_fn is None else log_prior_fn
+        if not callable(self.log_prior_fn):
+            raise ValueError(
+                f"annealing starts from the prior: pass log_prior_fn, or a {name} with a method log_prior (a posterior "
+                f"object itself, not its bound method); got {self.log_prior_fn!r}"
+            )
+        self.ndim, self.vectorize, self.blobs_dtype = ndim, vectorize, blobs_dtype
+        self.caught = Caught(function, args, kwargs, vectorize)
+        names, stated = getattr(function, "parameter_names", None) or (), getattr(function, "ndim", None)
+        if isinstance(stated, Integral) and stated != ndim:
+            listed = f" ({', '.join(map(str, names))})" if names else ""
+            raise ValueError(f"ndim is {ndim}, but {name} has {stated} parameters{listed}: pass ndim={stated}")
+
+    @property
+    def is_likelihood(self) -> bool:
+        """Whether the log-prior is added to what `function` returns."""
+        return self.name == "log_likelihood_fn"
+
+    # ------------------------------------------------------------------ optional attributes of the function
+
+    @property
+    def fast_parameters(self) -> Sequence[int]:
+        """Indices of parameters whose change needs no simulation: points that differ in them count as one."""
+        return getattr(self.function, "fast_parameters", ())
+
+    @property
+    def slow_parameters(self) -> list[int]:
+        """Indices of the parameters that a simulation depends on; all parameters if none is slow."""
+        fast = set(self.fast_parameters)
+        return [j for j in range(self.ndim) if j not in fast] or list(range(self.ndim))
+
+    @property
+    def failure_count(self) -> int | None:
+        """Failed simulations by the count of the function, so that -inf may be one of them; None without a count."""
+        report = getattr(self.function, "report", None)
+        found = report() if callable(report) else None
+        return int(found["failure_count"]) if isinstance(found, Mapping) and "failure_count" in found else None
+
+    def may_be_positive(self, coords: np.ndarray) -> np.ndarray:
+        """Whether points (n, ndim) may have a positive density, (n,) bool, by the method `possible` of the function.
+
+        It knows this without a simulation; True if unknown.
+        """
+        possible, shape = getattr(self.function, "possible", None), (len(coords),)
+        if callable(possible) and len(coords) > 0:
+            found = _answer(possible, coords.copy())
+            if found is not None and found.shape == shape and found.dtype == bool:
+                return found
+            logger.warning("the verdict takes all points as possible: possible must return bool of shape %s", shape)
+        return np.ones(shape, dtype=bool)
+
+    # ------------------------------------------------------------------ functions of arrays
+
+    def as_points(self, coords: np.ndarray) -> Any:
+        """Points (n, ndim) as functions take them: rows of an array, or dictionaries.
+
+        They are copies, since a function may change its argument.
+        """
+        named = self.parameter_names
+        return coords.copy() if named is None else ndarray_to_list_of_dicts(coords.copy(), named)
+
+    def log_prior(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior (n,) of points (n, ndim), always computed in this process; -inf for NaN."""
+        points = self.as_points(coords)
+        with interrupts_end_the_run():
+            results = self.log_prior_fn(points) if self.vectorize else [self.log_prior_fn(point) for point in points]
+        return log_densities(results, len(coords), "log_prior_fn")
+
+    def answers(self, coords: np.ndarray, pool: Any = None) -> Iterable:
+        """What the function returns for each of the points (n, ndim) in turn; with `vectorize`, for all at once."""
+        points = self.as_points(coords)
+        if self.vectorize:
+            return map(self.caught, [points])
+        return map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points)
+
+    def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
+        """Log-posterior and blobs of points (n, ndim) from `answers`; ValueError if these are no log-densities."""
+        log_prob, blobs, reasons = outcomes(results, len(coords), self.blobs_dtype, self.name)
+        if self.is_likelihood:
+            log_prob = log_prob + self.log_prior(coords)
+        return EvaluatedBatch(coords, log_prob, blobs, reasons)
+
+    def sample_prior(self, n: int, random: np.random.RandomState) -> np.ndarray:
+        """Draws (n, ndim) of the prior; ValueError without the method of the function."""
+        draw = getattr(self.function, "sample_prior", None)
+        if draw is None:
+            raise ValueError(
+                f"initial_state is None and {self.name} has no method sample_prior(n, random): pass {n} draws of the "
+                "prior"
+            )
+        return np.array(draw(n, random), dtype=float)
+
+    # ------------------------------------------------------------------ the start of a run
+
+    def log_prior_of_start(self, coords: np.ndarray) -> np.ndarray:
+        """Log-prior (n,) of the points (n, ndim) that a run starts from; ValueError if one is outside the support."""
+        try:
+            log_prior = self.log_prior(coords)
+        except Exception as error:
+            points = "an array (n, ndim) of points" if self.vectorize else "an array (ndim,), one point"
+            if self.parameter_names is not None:
+                points = "dictionaries of parameters by name (parameter_names)"
+            raise ValueError(
+                f"log_prior_fn failed with {error!r}. It is called as log_prob_fn is: with {points} "
+                f"(vectorize={self.vectorize})"
+            ) from error
+        outside = np.flatnonzero(log_prior == -np.inf)
+        if len(outside) > 0:
+            raise ValueError(
+                f"{len(outside)} of {len(coords)} initial points lie outside the prior's support (log_prior -inf or "
+                f"NaN), the first of them {coords[outside[0]]}: pass draws of the prior"
+            )
+        return log_prior
+
+    def check_start(self, coords: np.ndarray) -> None:
+        """Raise ValueError for points (n, ndim) that cannot be draws of the prior (`samplers.evaluation.starts`)."""
+        fresh = self._fresh_draws(len(coords))
+        if fresh is None:
+            reason, compared = spread_by_metropolis(coords, self.log_prior), ""
+        else:
+            names = list(getattr(self.function, "parameter_names", None) or ())
+            reason, compared = compare_with_draws(coords, fresh, names), f"compared with {len(fresh)} fresh draws, "
+        if not reason:
+            return
+        known = "None, so that the sampler draws the prior" if fresh is not None else "draws of the prior"
+        raise ValueError(
+            f"initial_state must consist of draws of the prior; got points that cannot be: {compared}{reason}. "
+            f"The evidence would be wrong. Pass {known}, not points near the posterior. If they are draws of the "
+            "prior, its log-density is another one: a constant without bounds has no draws. To continue a chain, pass "
+            "None, or the State that run_mcmc returned"
+        )
+
+    def _fresh_draws(self, n: int) -> np.ndarray | None:
+        """Draws of the prior to compare n points with; None if there are none."""
+        draw = getattr(self.function, "sample_prior", None)
+        if draw is None:
+            return None
+        state, shape = np.random.get_state(), (draws_to_compare(n), self.ndim)  # noqa: NPY002
+        try:
+            fresh = _answer(draw, shape[0], np.random.RandomState(SEED), dtype=float)
+        finally:
+            np.random.set_state(state)  # noqa: NPY002  a sample_prior that uses the global generator changes no run
+        if fresh is not None and fresh.shape == shape and np.all(np.isfinite(fresh)):
+            return fresh
+        logger.warning(
+            "initial_state is tested without fresh draws: sample_prior(%d, random) must return finite numbers of "
+            "shape %s",
+            shape[0],
+            shape,
+        )
+        return None
+
+
+def _answer(method: Callable, *args: Any, dtype: Any = None) -> np.ndarray | None:
+    """What an optional method of the user returns; None if it fails."""
+    before = sys.exception()
+    try:
+        return np.asarray(method(*args), dtype=dtype)
+    except Exception as error:
+        raise_if_it_ends_the_run(error, before)
+        logger.warning("the method %s failed: %r", getattr(method, "__name__", method), error)
+        return None
