@@ -14,6 +14,9 @@ from .information.sensors import rank_sensors
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
+from .modal.modal_data import ModalData
+from .modal.modal_likelihood import ModalLikelihood, predict_modes
+from .modal.mode_models import FunctionModes
 from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel
@@ -81,6 +84,7 @@ __all__ = [
     "ExecutableModel",
     "FELikelihood",
     "FunctionModel",
+    "FunctionModes",
     "GaussianNoise",
     "GroupedFrame",
     "HalfNormal",
@@ -94,6 +98,8 @@ __all__ = [
     "LogNormal",
     "LowCycleFatigue",
     "Measurements",
+    "ModalData",
+    "ModalLikelihood",
     "ModalModel",
     "MultivariateNormal",
     "OpenSeesModel",
@@ -153,6 +159,7 @@ __all__ = [
     "plot_section",
     "plot_sensors",
     "plot_spectrum",
+    "predict_modes",
     "predict_new_event",
     "problems",
     "propagate",
