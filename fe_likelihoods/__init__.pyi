@@ -16,6 +16,7 @@ from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
 from .modal.modal_data import ModalData
 from .modal.modal_likelihood import ModalLikelihood, predict_modes
+from .modal.modal_readers import read_modal_data
 from .modal.mode_models import FunctionModes
 from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
@@ -167,6 +168,7 @@ __all__ = [
     "rank_sensors",
     "read_columns",
     "read_imposed_test",
+    "read_modal_data",
     "read_record",
     "rehearse",
     "report",

@@ -1,7 +1,7 @@
 r"""Undamped modes of a structure, and their derivatives.
 
-The modes satisfy :math:`K \phi = \lambda M \phi` with :math:`\phi^T M \phi = 1` and :math:`\lambda = (2 \pi f)^2`. Their
-derivatives by a parameter, with the derivatives K' and M' of the matrices, are
+The modes satisfy :math:`K \phi = \lambda M \phi` with :math:`\phi^T M \phi = 1` and :math:`\lambda = (2 \pi f)^2`.
+Their derivatives by a parameter, with the derivatives K' and M' of the matrices, are
 
 .. math::
 
