@@ -167,7 +167,8 @@ class ModalData:
         for group in close_groups(self.mean_frequencies[shaped], close) if len(shaped) else ():
             modes = tuple(int(shaped[each]) for each in group)
             groups += [modes] if len(modes) < self.n_sensors else [(mode,) for mode in modes]
-        return MeasuredModes(self.frequencies, self.shapes, tuple(groups), self.mode_numbers)
+        shapes = np.where(self.has_shape[:, :, None], self.shapes, 0.0)
+        return MeasuredModes(self.mean_frequencies, shapes, self.has_shape, tuple(groups), self.mode_numbers)
 
     def select(self, mode_numbers: Sequence[int]) -> "ModalData":
         """Return the modes with these numbers; ValueError for an unknown one."""

@@ -66,7 +66,6 @@ class PairedModes:
         self._rows = sensor_rows(model, data)
         self._measured = data.measured(close)
         self._there = ~np.isnan(data.frequencies)
-        self._shaped = data.has_shape[:, :, None]
         # frequencies with a covariance are compared in coordinates in which their errors are independent
         self.frequency_cv, self._whitening = data.frequency_cv, np.eye(data.n_modes)
         if data.covariance is not None:
@@ -98,7 +97,7 @@ class PairedModes:
     @property
     def measurements(self) -> Measurements:
         """The data as measurements of the channels."""
-        values = self._joined(self._there.astype(float), np.where(self._shaped, self.data.shapes, 0.0))
+        values = self._joined(self._there.astype(float), self._measured.shapes)
         return Measurements(self.channels, self.dt, values, "natural frequencies and mode shapes")
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
@@ -131,7 +130,7 @@ class PairedModes:
             basis = modes[np.ix_(self._rows, space)]
             turned = slopes[:, self._rows][:, :, list(space)]
             inverse = np.linalg.pinv(basis)
-            for k in np.flatnonzero(self._shaped[:, mode, 0]):
+            for k in np.flatnonzero(self._measured.there[:, mode]):
                 target, projected = self.data.shapes[k, mode], paired.shapes[k, mode]
                 # y = B c with c = B+ t: y' = (I - B B+) B' c + (B+)^T B'^T (t - y)
                 moved = turned @ (inverse @ target)

@@ -63,8 +63,9 @@ def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int,
 class MeasuredModes(NamedTuple):
     """Measured modes as the pairing needs them; m modes, identified n_sets times."""
 
-    frequencies: np.ndarray  # (n_sets, m) [Hz]; NaN where a mode was not identified
-    shapes: np.ndarray  # (n_sets, m, n_sensors) of unit norm; NaN where there is no shape
+    frequencies: np.ndarray  # (m,) [Hz], the means of the identifications
+    shapes: np.ndarray  # (n_sets, m, n_sensors) of unit norm; zero where there is none
+    there: np.ndarray  # (n_sets, m) whether there is a shape
     groups: tuple[tuple[int, ...], ...]  # modes that are close to each other, in ascending order of frequency
     numbers: tuple[int, ...]  # of the computed modes, for modes without a shape
 
@@ -87,52 +88,49 @@ def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: MeasuredMo
     """
     clusters = close_groups(frequencies, _COINCIDENT)
     members = {mode: cluster for cluster in clusters for mode in cluster}
-    there = ~np.isnan(measured.shapes).any(axis=2) & (measured.shapes.shape[2] > 0)
-    with np.errstate(invalid="ignore"):
-        means = np.nanmean(measured.frequencies, axis=0)
-    similar = _similarity(shapes, measured, clusters, there)
-    cost = 1.0 - similar + _FREQUENCY_WEIGHT * np.abs(np.log(frequencies / means[:, None]))
-    for mode in np.flatnonzero(~there.any(axis=0)):
+    counts = measured.there.sum(axis=0)
+    normed = _normed(shapes)
+    cosines = measured.shapes @ normed.T
+    similar = np.square(cosines)
+    for group in measured.groups:
+        for cluster in clusters:
+            if len(group) + len(cluster) > 2:
+                _compare_spaces(similar, measured, group, cluster, normed)
+    cost = np.abs(np.log(frequencies / measured.frequencies[:, None])) * _FREQUENCY_WEIGHT
+    cost += 1.0 - similar.sum(axis=0) / np.maximum(counts, 1)[:, None]
+    for mode in np.flatnonzero(counts == 0):
         cost[mode] = _FORCED
         cost[mode, measured.numbers[mode] - 1] = 0.0
     columns = linear_sum_assignment(cost)[1]
-    found = np.empty(len(means))
-    spaces: list[tuple[int, ...]] = [()] * len(means)
-    projected = np.zeros(measured.shapes.shape)
+    spaces: list[tuple[int, ...]] = [()] * len(columns)
+    projected = np.empty(measured.shapes.shape)
     for group in measured.groups:
-        own = columns[list(group)]
-        columns[list(group)] = own[np.argsort(frequencies[own], kind="stable")]
-        space = tuple(sorted({each for column in own.tolist() for each in members[column]}))
-        for mode in group:
-            found[mode], spaces[mode] = frequencies[columns[mode]], space
-            targets = measured.shapes[there[:, mode], mode]
-            if len(targets):
-                basis = shapes[list(space)].T
-                projected[there[:, mode], mode] = (basis @ np.linalg.lstsq(basis, targets.T, rcond=None)[0]).T
-    with np.errstate(invalid="ignore"):
-        squares = np.where(there, np.square(projected).sum(axis=2), 0.0)
-        assurance = np.where(there.any(axis=0), squares.sum(axis=0) / np.maximum(there.sum(axis=0), 1), np.nan)
-    return Paired(columns, assurance, found, projected, tuple(spaces))
+        modes = list(group)
+        columns[modes] = columns[modes][np.argsort(frequencies[columns[modes]], kind="stable")]
+        space = tuple(sorted({each for mode in modes for each in members[int(columns[mode])]}))
+        for mode in modes:
+            spaces[mode] = space
+            if len(space) == 1:
+                projected[:, mode] = cosines[:, mode, space] * normed[list(space)]
+            else:
+                basis = normed[list(space)].T
+                projected[:, mode] = (basis @ np.linalg.lstsq(basis, measured.shapes[:, mode].T, rcond=None)[0]).T
+    assurance = np.where(counts > 0, np.square(projected).sum(axis=(0, 2)) / np.maximum(counts, 1), np.nan)
+    return Paired(columns, assurance, frequencies[columns], projected, tuple(spaces))
 
 
-def _similarity(
-    shapes: np.ndarray, measured: MeasuredModes, clusters: Sequence[tuple[int, ...]], there: np.ndarray
-) -> np.ndarray:
-    """Modal assurance (m, n), the mean of the sets: the largest between the spaces of close measured modes and clusters
-    of computed ones that coincide.
-    """
-    total = np.zeros((measured.frequencies.shape[1], len(shapes)))
-    several = [(group, cluster) for group in measured.groups for cluster in clusters if len(group) + len(cluster) > 2]
-    for k, identified in enumerate(measured.shapes):
-        similar = np.zeros(total.shape)
-        similar[there[k]] = modal_assurance(identified[there[k]], shapes)
-        for group, cluster in several:
-            modes = [mode for mode in group if there[k, mode]]
-            if modes:
-                cosines = _basis(identified[modes]).T @ _basis(shapes[list(cluster)])
-                similar[np.ix_(modes, cluster)] = np.linalg.norm(cosines, 2) ** 2
-        total += similar
-    return total / np.maximum(there.sum(axis=0), 1)[:, None]
+def _compare_spaces(
+    similar: np.ndarray,
+    measured: MeasuredModes,
+    group: tuple[int, ...],
+    cluster: tuple[int, ...],
+    shapes: np.ndarray,
+) -> None:
+    """Let `similar` (n_sets, m, n) be the largest MAC between the spaces of close measured and of coincident modes."""
+    for k, there in enumerate(measured.there):
+        if modes := [mode for mode in group if there[mode]]:
+            cosines = _basis(measured.shapes[k, modes]).T @ _basis(shapes[list(cluster)])
+            similar[np.ix_([k], modes, cluster)] = np.linalg.norm(cosines, 2) ** 2
 
 
 def _basis(shapes: np.ndarray) -> np.ndarray:

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from fe_likelihoods import ModalData
 from fe_likelihoods.modal.pairing import (
-    MeasuredModes,
     best_scale,
-    close_groups,
     modal_assurance,
     pair_modes,
     shape_misfit,
@@ -18,10 +17,7 @@ def unit(shapes):
 
 
 def measured(frequencies, shapes, close=0.02):
-    frequencies, shapes = np.atleast_2d(np.asarray(frequencies, dtype=float)), unit(shapes)
-    shapes = shapes[None] if shapes.ndim == 2 else shapes
-    groups = close_groups(np.nanmean(frequencies, axis=0), close)
-    return MeasuredModes(frequencies, shapes, groups, tuple(range(1, frequencies.shape[1] + 1)))
+    return ModalData(frequencies, shapes, [f"sensor {k}" for k in range(np.shape(shapes)[-1])]).measured(close)
 
 
 def test_modal_assurance_is_a_squared_cosine():
@@ -109,8 +105,8 @@ def test_several_identifications_have_one_pairing_and_their_own_scales(rng):
 
 
 def test_modes_without_shapes_are_paired_by_their_number():
-    nothing = MeasuredModes(np.array([[5.0, 1.0]]), np.full((1, 2, 3), np.nan), ((1,), (0,)), (3, 1))
-    pairs = pair_modes(np.array([2.0, 4.0, 8.0]), np.eye(3), nothing)
+    nothing = ModalData([5.0, 1.0], mode_numbers=[3, 1]).measured(0.02)
+    pairs = pair_modes(np.array([2.0, 4.0, 8.0]), np.empty((3, 0)), nothing)
     assert pairs.columns.tolist() == [2, 0] and np.isnan(pairs.assurance).all() and not pairs.shapes.any()
 
 
