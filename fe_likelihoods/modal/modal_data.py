@@ -231,7 +231,7 @@ class ModalData:
             for mode, number in enumerate(self.mode_numbers)
         ]
         damping = [] if self.damping is None else ["damping"]
-        what = f"{self.n_modes} modes, {self.n_sensors} sensors, {self.n_sets} identifications"
+        what = f"modes {self.n_modes}, sensors {self.n_sensors}, identifications {self.n_sets}"
         return f"ModalData: {what}\n" + text_table([["mode", "f [Hz]", *damping, *self.sensors], *rows])
 
 

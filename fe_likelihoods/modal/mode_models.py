@@ -12,7 +12,7 @@ import numpy as np
 
 from ..models.function import FunctionModel
 from ..models.linear_system import Parts
-from ..models.modes import Modes, mode_derivatives, undamped_modes
+from ..models.undamped_modes import Modes, mode_derivatives, undamped_modes
 from ..models.user_model import ExternalModel
 from ..models.validation import check_theta
 from ..signals.channels import Channel

@@ -32,7 +32,7 @@ from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
 from .equivalent_linear import EquivalentLinear
 from .linear_system import Parts, complex_modes, superpose
-from .modes import Modes, undamped_modes
+from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
 from .validation import check_theta
 

@@ -22,7 +22,7 @@ from fe_likelihoods import (
     predict_modes,
 )
 from fe_likelihoods.modal.mode_models import StructureModes
-from fe_likelihoods.models.modes import undamped_modes
+from fe_likelihoods.models.undamped_modes import undamped_modes
 
 FLOORS = {"floor 1": 1, "floor 2": 2, "floor 3": 3, "roof": 4}
 FRAME = ShearFrame(FLOORS, [1.0, 1.1, 0.9, 1.0], [900.0] * 4)

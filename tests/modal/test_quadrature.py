@@ -39,7 +39,7 @@ def quadrature(posterior, bounds, n):
     return logs.max() + np.log(total), mean, np.sqrt(density @ np.square(points - mean) / total)
 
 
-def guided(posterior, walkers=1600, seed=3):
+def guided(posterior, walkers=300, seed=3):
     """Log-evidence and samples of a guided run."""
     sampler = SMCSampler(walkers, posterior.ndim, posterior, guide=posterior.guide(), seed=seed, vectorize=True)
     sampler.run_mcmc(None, 1)
@@ -110,15 +110,15 @@ def swapped(close):
 
 
 PROBLEMS = {
-    "five identifications": (five_identifications, [(0.8, 1.2), (0.7, 1.2)], 60),
-    "two modes": (frame_of_two, [(0.9, 1.1), (0.8, 1.0)], 50),
+    "five identifications": (five_identifications, [(0.8, 1.2), (0.7, 1.2)], 40),
+    "two modes": (frame_of_two, [(0.9, 1.1), (0.8, 1.0)], 40),
     "unknown error": (
         lambda: frame_of_two("unknown", frequency_error=HalfNormal(0.02), shape_error=0.03),
         [(0.9, 1.15), (0.75, 1.05), (0.0, 0.06)],
         28,
     ),
-    "close modes": (lambda: swapped(0.02), [(0.97, 1.06), (0.97, 1.06)], 60),
-    "close modes, each shape": (lambda: swapped(0.0), [(0.97, 1.06), (0.97, 1.06)], 60),
+    "close modes": (lambda: swapped(0.02), [(0.97, 1.06), (0.97, 1.06)], 50),
+    "close modes, each shape": (lambda: swapped(0.0), [(0.97, 1.06), (0.97, 1.06)], 50),
     "one sensor": (lambda: frame_of_two(sensors=("floor 2",)), [(0.7, 1.3), (0.6, 1.2)], 90),
 }
 
@@ -137,8 +137,9 @@ def test_the_evidence_of_five_identifications_of_two_storeys():
 def test_guided_runs_agree_with_quadrature(problem):
     make, bounds, n = PROBLEMS[problem]
     evidence, mean, deviation = quadrature(make(), bounds, n)
-    found, samples = guided(make())
-    assert found == pytest.approx(evidence, abs=0.05)
+    runs = [guided(make(), seed=seed) for seed in range(5)]
+    assert all(found == pytest.approx(evidence, abs=0.05) for found, _ in runs)
+    samples = np.concatenate([each for _, each in runs])
     assert (abs(samples.mean(axis=0) - mean) < 0.05 * deviation).all()
     assert samples.std(axis=0) == pytest.approx(deviation, rel=0.08)
 

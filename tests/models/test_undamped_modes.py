@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 
 from fe_likelihoods import LinearStructure, Record, ShearFrame, SimulationFailed
-from fe_likelihoods.models.modes import mode_derivatives, undamped_modes
+from fe_likelihoods.models.undamped_modes import mode_derivatives, undamped_modes
 
 
 def chain(stiffnesses):
