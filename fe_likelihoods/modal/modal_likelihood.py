@@ -1,5 +1,6 @@
 """Log-likelihood of natural frequencies and mode shapes, and the modes that samples of a posterior predict."""
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,10 +39,10 @@ class ModalLikelihood(FELikelihood):
         It has the sensors of the data, and may have others.
     data : ModalData
         The measured modes.
-    frequency_error, shape_error : {"common", "mode"} or float, optional
+    frequency_error, shape_error : {"common", "mode"}, optional
         What is unknown: one error of all modes, the parameters ``frequency_error`` and ``shape_error``; or one of each
-        mode, ``frequency_error_1``, ... Its variance is added to the known one of the data. A number is a known error.
-        Default: the known errors of the data, and ``"common"`` without.
+        mode, ``frequency_error_1``, ... Its variance is added to the known one of the data. Default: nothing if the
+        data have known errors, else ``"common"``.
     pool : optional
         As for `FELikelihood`.
     close : float
@@ -49,6 +50,11 @@ class ModalLikelihood(FELikelihood):
         frequencies by the order in the pair. Zero compares each shape.
     **options
         Of `FELikelihood`, such as ``cache``.
+
+    Warns
+    -----
+    UserWarning
+        If an error is unknown, and one identification has no more data of its kind than there are parameters.
 
     Raises
     ------
@@ -60,7 +66,7 @@ class ModalLikelihood(FELikelihood):
     --------
     >>> likelihood = ModalLikelihood(ShearFrame(floors, masses, stiffnesses), data)
     >>> prior = {name: LogNormal(1.0, 0.2) for name in likelihood.model.parameter_names}
-    >>> errors = {"frequency_error": HalfNormal(0.01), "shape_error": HalfNormal(0.05)}
+    >>> errors = {"frequency_error": LogNormal(0.005, 0.5), "shape_error": LogNormal(0.03, 0.5)}
     >>> posterior = Posterior(likelihood, prior | errors)
     """
 
@@ -68,8 +74,8 @@ class ModalLikelihood(FELikelihood):
         self,
         model: Model | Any,
         data: ModalData,
-        frequency_error: str | float | None = None,
-        shape_error: str | float | None = None,
+        frequency_error: str | None = None,
+        shape_error: str | None = None,
         pool: Any = None,
         *,
         close: float = _CLOSE,
@@ -81,6 +87,8 @@ class ModalLikelihood(FELikelihood):
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         paired = PairedModes(_with_modes(model), data, close)
         noise = _noise(paired, data, frequency_error, shape_error)
+        if undetermined := noise.undetermined(len(paired.parameter_names)):
+            warnings.warn(undetermined, stacklevel=2)
         super().__init__(paired, paired.measurements, noise, pool, **options)
         self.data = data
 
@@ -121,13 +129,12 @@ def _error(what: str, given: Any, known: np.ndarray | None, m: int) -> tuple[str
     """What is unknown of an error, and its known values (m,)."""
     if given is None:
         given = "common" if known is None else ""
-    if given in ("", "common", "mode"):
-        return given, (0.0,) * m if known is None else tuple(known.tolist())
-    if isinstance(given, str) or isinstance(given, bool) or not np.isscalar(given) or not 0.0 < given < 0.5:
+    if given not in ("", "common", "mode"):
         raise ValueError(
-            f'ModalLikelihood: {what} must be "common", "mode" or a known error such as 0.01; got {given!r}'
+            f'ModalLikelihood: {what} must be "common" or "mode"; got {given!r}: known errors belong to the data '
+            "(frequency_cv, shape_error), or are numbers in the mapping of priors"
         )
-    return "", (float(given),) * m
+    return given, (0.0,) * m if known is None else tuple(known.tolist())
 
 
 class PredictedModes(NamedTuple):
@@ -194,8 +201,8 @@ def predict_modes(
     SimulationFailed
         If a sample cannot be simulated.
     """
-    likelihood = model if isinstance(model, ModalLikelihood) else None
-    data = likelihood.data if data is None and likelihood is not None else data
+    likelihood = model if isinstance(getattr(model, "model", None), PairedModes) else None
+    data = likelihood.model.data if data is None and likelihood is not None else data
     if not isinstance(data, ModalData):
         raise ValueError(f"predict_modes: expected the ModalData to compare with in data=; got {type(data).__name__}")
     inner = _with_modes(model) if likelihood is None else likelihood.model.model
@@ -210,7 +217,7 @@ def predict_modes(
     batch = simulate_batch(inner, rows, pool)
     if failed := [reason for reason in batch.reasons if reason]:
         raise SimulationFailed(f"{len(failed)} of {len(rows)} samples cannot be simulated; the first: {failed[0]}")
-    paired = PairedModes(inner, data, _CLOSE)
+    paired = PairedModes(inner, data, _CLOSE if likelihood is None else likelihood.model.close)
     found = [paired.pair(modes) for modes in batch.response]
     result = PredictedModes(
         data,

@@ -80,6 +80,20 @@ class ModalNoise:
         kinds = {"": [], "common": [""], "mode": [f"_{number}" for number in numbers]}
         return tuple(f"{what}_error{end}" for what in ("frequency", "shape") for end in kinds[getattr(self, what)])
 
+    def undetermined(self, n_structural: int) -> str:
+        """A warning if the structural parameters can fit all data of an unknown error exactly; else empty."""
+        for what, known, count in (
+            ("frequency", self.frequency_known, sum(self.counts)),
+            ("shape", self.shape_known, sum(self.freedoms)),
+        ):
+            if self.n_sets == 1 and getattr(self, what) and not any(known) and count <= n_structural:
+                return (
+                    f"{n_structural} parameters can fit {count} independent data exactly, so they do not determine the "
+                    f"{what}_error, and it may go to zero: state the error of the identification in the data "
+                    f"({'frequency_cv' if what == 'frequency' else 'shape_error'}), or give it a LogNormal prior"
+                )
+        return ""
+
     def deviations(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations of frequencies and of components of shapes, (n, m) each, at parameters (n, n_noise)."""
         m, parameters = len(self.channels), np.asarray(parameters, dtype=float)

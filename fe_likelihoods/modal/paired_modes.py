@@ -62,7 +62,7 @@ class PairedModes:
     time_label = "frequency, then components of the shape"
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
-        self.model, self.data = model, data
+        self.model, self.data, self.close = model, data, close
         self._rows = sensor_rows(model, data)
         self._measured = data.measured(close)
         self._there = ~np.isnan(data.frequencies)

@@ -1,10 +1,13 @@
 """Likelihood of modes: its density, derivatives, caches, what is refused, and what is remarked on."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from fe_likelihoods import (
+    Channel,
     FELikelihood,
     FunctionModes,
     HalfNormal,
@@ -21,9 +24,11 @@ from fe_likelihoods import (
     SimulationCache,
     predict_modes,
 )
+from fe_likelihoods.modal.load_test import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
 from fe_likelihoods.models.undamped_modes import undamped_modes
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*parameters can fit")
 FLOORS = {"floor 1": 1, "floor 2": 2, "floor 3": 3, "roof": 4}
 FRAME = ShearFrame(FLOORS, [1.0, 1.1, 0.9, 1.0], [900.0] * 4)
 PRIOR = {f"stiffness_{i}": LogNormal(1.0, 0.3) for i in range(1, 5)}
@@ -68,8 +73,10 @@ def test_the_density_of_known_and_unknown_errors(rng):
     known = ModalLikelihood(FRAME, identified([1, 1, 1, 1], [1], rng, frequency_cv=0.01, shape_error=0.02))
     assert known.parameter_names == tuple(PRIOR)
     assert known(theta) == pytest.approx(independent(theta, known.data, 0.01, 0.02), rel=1e-12)
-    both = ModalLikelihood(FRAME, known.data, "common", 0.05)
-    assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.data, 0.0005**0.5, 0.05), rel=1e-12)
+    both = ModalLikelihood(FRAME, known.data, "common")
+    assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.data, 0.0005**0.5, 0.02), rel=1e-12)
+    prior = PRIOR | {"frequency_error": LogNormal(0.01, 0.5), "shape_error": 0.04}
+    assert Posterior(likelihood, prior).log_likelihood([*theta, 0.02]) == pytest.approx(expected, rel=1e-12)
     each = ModalLikelihood(FRAME, data, "mode", "mode")
     assert each.parameter_names[4:] == ("frequency_error_3", "frequency_error_1", "shape_error_3", "shape_error_1")
     assert each([*theta, 0.02, 0.02, 0.04, 0.04]) == pytest.approx(expected, rel=1e-12)
@@ -185,6 +192,18 @@ def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(r
     assert "paired with different computed modes: 1 (50%), 2 (50%)" in swapped.remarks[0]
 
 
+def test_an_error_that_the_data_do_not_determine_is_warned_of(rng):
+    few, many = identified(np.ones(4), [1, 2], rng), identified(np.ones(4), [1, 2], rng, n_sets=2)
+    with pytest.warns(UserWarning, match=r"4 parameters can fit 2 independent data .* frequency_error"):
+        ModalLikelihood(FRAME, few)
+    with pytest.warns(UserWarning, match=r"4 parameters can fit 3 independent data .* shape_error"):
+        ModalLikelihood(FRAME, identified(np.ones(4), [1], rng, frequency_cv=0.01))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ModalLikelihood(FRAME, many)
+        ModalLikelihood(FRAME, identified(np.ones(4), [1, 2], rng, frequency_cv=0.002), "common")
+
+
 @pytest.mark.parametrize(
     ("make", "text"),
     [
@@ -192,8 +211,11 @@ def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(r
         (lambda data: ModalLikelihood(ShearFrame({"roof": 4}, [1] * 4, [1] * 4), data), "has no sensors floor 1"),
         (lambda data: ModalLikelihood(StructureModes(FRAME, 2), data), "has 2 modes, and 3 were measured"),
         (lambda data: StructureModes(FRAME, 5), "has 4 modes; got n_modes=5"),
-        (lambda data: ModalLikelihood(FRAME, data, frequency_error="each"), '"common", "mode" or a known error'),
-        (lambda data: ModalLikelihood(FRAME, data, shape_error=2.0), "shape_error must be"),
+        (
+            lambda data: ModalLikelihood(FRAME, data, frequency_error="each"),
+            'frequency_error must be "common" or "mode"',
+        ),
+        (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
         (lambda data: ModalLikelihood(FRAME, data, close=2), "close must be a share"),
         (lambda data: predict_modes(FRAME, np.ones((1, 4))), "in data="),
         (
@@ -215,3 +237,54 @@ def test_a_model_without_modes_is_refused(rng):
     model = FunctionModel(lambda theta: np.zeros((1, 3)), ("a",), (Channel("u", "displacement", "m"),), 1.0, 3)
     with pytest.raises(ValueError, match="whose first channel is a frequency"):
         ModalLikelihood(model, identified(np.ones(4), [1], rng))
+
+
+@pytest.mark.slow
+def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
+    """One posterior of three data sets, each with its program and cache; another sampler finds the same."""
+    from samplers import SMCSampler, TMCMCSampler
+
+    truth = np.array([1.0, 0.8, 1.2, 1.1])
+    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
+    response = model.simulate([*truth, *[0.02] * 4])
+    histories = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.3 * rng.normal(size=(1, 200))))
+    modes = ModalLikelihood(model, identified(truth, [1, 2], rng, frequency_cv=0.01, shape_error=0.03))
+
+    def pulled(theta):
+        return np.cumsum(1.0 / (900.0 * theta))[:, None]
+
+    top = tuple(Channel(name, "displacement", "m") for name in FLOORS)
+    test = LoadTest(top, ["roof"], pulled(truth) + 1e-4 * rng.normal(size=(4, 1)), errors=dict.fromkeys(FLOORS, 1e-4))
+    static = FELikelihood(test.model(pulled, tuple(PRIOR)), test.measurements)
+    # sensors of different kinds have the same names
+    joint = JointLikelihood({"modes": modes, "static": static, "histories": histories}, separate=["sigma_roof"])
+    known = {name if name != "sigma_roof" else "sigma_roof_static": error for name, error in test.known.items()}
+    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
+    prior = PRIOR | damping | {"sigma_roof_histories": HalfNormal(1.0)} | known
+    found = []
+    for seed, make in enumerate((SMCSampler, SMCSampler, TMCMCSampler)):
+        posterior = Posterior(joint, prior)
+        guide = posterior.guide() if seed == 0 else None
+        sampler = make(300, posterior.ndim, posterior, guide=guide, seed=seed, vectorize=True)
+        sampler.run_mcmc(None, 1 if guide else 4)
+        samples = sampler.get_chain(flat=True)
+        assert (abs(samples.mean(axis=0)[:4] - truth) < 4 * samples.std(axis=0)[:4]).all()
+        found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
+    for evidence, mean, _ in found[1:]:
+        assert evidence == pytest.approx(found[0][0], abs=0.5)
+        assert (abs(mean - found[0][1]) < 0.4 * found[0][2]).all()
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_bits(rng, shared_pool):
+    def matrices(theta):
+        storeys = 900.0 * theta
+        return np.diag(storeys + [*storeys[1:], 0.0]) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1), np.eye(4)
+
+    data = identified(np.ones(4), [1, 2], rng, frequency_cv=0.01, shape_error=0.03)
+    model = FunctionModes(matrices, tuple(PRIOR), {name: floor - 1 for name, floor in FLOORS.items()}, 4)
+    points = rng.uniform(0.8, 1.2, (6, 4))
+    with shared_pool(2) as pool:
+        np.testing.assert_array_equal(
+            ModalLikelihood(model, data, pool=pool)(points), ModalLikelihood(model, data)(points)
+        )
