@@ -210,14 +210,14 @@ class ModalData:
                 shapes[mode] = np.linalg.svd(found, full_matrices=False)[2][0]
                 squares = np.maximum(1.0 - np.square(found @ shapes[mode]), 0.0).sum()
                 errors[mode] = np.sqrt(squares / (max(len(found) - 1, 1) * max(self.n_sensors - 1, 1)))
-        return ModalData(
-            frequencies,
-            shapes if self.n_sensors else None,
-            self.sensors,
+        return replace(
+            self,
+            frequencies=frequencies,
+            shapes=shapes,
             damping=None if self.damping is None else np.nanmean(self.damping, axis=0),
             frequency_cv=np.nanstd(self.frequencies, axis=0, ddof=1) / frequencies,
+            covariance=None,
             shape_error=errors if (errors > 0.0).all() else self.shape_error,
-            mode_numbers=self.mode_numbers,
         )
 
     def __repr__(self) -> str:

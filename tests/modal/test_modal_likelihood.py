@@ -262,17 +262,17 @@ def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
     damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
     prior = PRIOR | damping | {"sigma_roof_histories": HalfNormal(1.0)} | known
     found = []
-    for seed, make in enumerate((SMCSampler, SMCSampler, TMCMCSampler)):
+    for seed, make in enumerate((SMCSampler, TMCMCSampler)):
         posterior = Posterior(joint, prior)
         guide = posterior.guide() if seed == 0 else None
-        sampler = make(300, posterior.ndim, posterior, guide=guide, seed=seed, vectorize=True)
+        sampler = make(200, posterior.ndim, posterior, guide=guide, seed=seed, vectorize=True)
         sampler.run_mcmc(None, 1 if guide else 4)
         samples = sampler.get_chain(flat=True)
         assert (abs(samples.mean(axis=0)[:4] - truth) < 4 * samples.std(axis=0)[:4]).all()
         found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
-    for evidence, mean, _ in found[1:]:
-        assert evidence == pytest.approx(found[0][0], abs=0.5)
-        assert (abs(mean - found[0][1]) < 0.4 * found[0][2]).all()
+    (evidence, mean, deviation), other = found
+    assert other[0] == pytest.approx(evidence, abs=0.5)
+    assert (abs(other[1] - mean) < 0.4 * deviation).all()
 
 
 @pytest.mark.slow
