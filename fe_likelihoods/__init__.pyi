@@ -15,7 +15,7 @@ from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
 from .modal.modal_data import ModalData
-from .modal.modal_likelihood import ModalLikelihood, predict_modes
+from .modal.modal_likelihood import ModalLikelihood
 from .modal.modal_readers import read_modal_data
 from .modal.mode_models import FunctionModes
 from .models.equivalent_linear import EquivalentLinear
@@ -160,7 +160,6 @@ __all__ = [
     "plot_section",
     "plot_sensors",
     "plot_spectrum",
-    "predict_modes",
     "predict_new_event",
     "problems",
     "propagate",

@@ -36,7 +36,6 @@ from fe_likelihoods import (
     Posterior,
     ShearFrame,
     StoredPosterior,
-    predict_modes,
     stiffness_loss,
     to_si,
 )
@@ -87,7 +86,7 @@ before = identify(healthy, seed=1)
 print(before)
 sampler, posterior = calibrate(before.select([1, 2, 3]), seed=1)
 print(sampler.verdict)
-modes = predict_modes(posterior.likelihood, sampler.get_chain(flat=True), before)
+modes = posterior.likelihood.predict_modes(sampler.get_chain(flat=True), before)
 print(modes)  # modes 4 and 5 were not used
 
 # %%

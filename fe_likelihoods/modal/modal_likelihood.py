@@ -1,6 +1,7 @@
 """Log-likelihood of natural frequencies and mode shapes, and the modes that samples of a posterior predict."""
 
 import warnings
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from .modal_noise import ModalNoise
 from .mode_models import StructureModes
 from .paired_modes import PairedModes
 
-__all__ = ["ModalLikelihood", "PredictedModes", "predict_modes"]
+__all__ = ["ModalLikelihood", "PredictedModes"]
 
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 _RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
@@ -90,7 +91,48 @@ class ModalLikelihood(FELikelihood):
         if undetermined := noise.undetermined(len(paired.parameter_names)):
             warnings.warn(undetermined, stacklevel=2)
         super().__init__(paired, paired.measurements, noise, pool, **options)
-        self.data = data
+
+    def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
+        """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
+
+        Parameters
+        ----------
+        samples : (n, n_parameters) array_like, or mapping
+            Samples of the structural parameters; the parameters of the errors may follow.
+        data : ModalData, optional
+            Measured modes for the comparison, such as modes that were held out. Default: the data.
+        most : int
+            Largest number of samples that are simulated, evenly spaced among all.
+
+        Returns
+        -------
+        PredictedModes
+            Print it for a table.
+
+        Raises
+        ------
+        ValueError
+            For samples of another shape, or if the model has other sensors or fewer modes than the data.
+        SimulationFailed
+            If a sample cannot be simulated.
+        """
+        paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
+        names = paired.parameter_names
+        short = isinstance(samples, Mapping) or np.shape(samples)[-1:] == (len(names),)
+        rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
+        batch = simulate_batch(paired.model, rows, self.simulator.pool)
+        if failed := [reason for reason in batch.reasons if reason]:
+            raise SimulationFailed(f"{len(failed)} of {len(rows)} samples cannot be simulated; the first: {failed[0]}")
+        found = [paired.pair(modes) for modes in batch.response]
+        result = PredictedModes(
+            paired.data,
+            np.stack([each.frequencies for each in found]),
+            np.stack([each.assurance for each in found]),
+            np.stack([each.columns for each in found]) + 1,
+            (),
+        )
+        return result._replace(remarks=tuple(_remarks(result)))
 
 
 def _with_modes(model: Any) -> Model:
@@ -171,62 +213,6 @@ class PredictedModes(NamedTuple):
             values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]
             rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}"])
         return "\n".join([text_table(rows), *self.remarks])
-
-
-def predict_modes(
-    model: ModalLikelihood | Model | Any, samples: Any, data: ModalData | None = None, most: int = 400
-) -> PredictedModes:
-    """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
-
-    Parameters
-    ----------
-    model : ModalLikelihood, or a model as it takes
-        The model, which is simulated for the samples.
-    samples : (n, n_parameters) array_like, or mapping
-        Samples of the structural parameters; for a likelihood, noise parameters may follow.
-    data : ModalData, optional
-        Measured modes for the comparison, such as modes that were held out. Default: the data of the likelihood.
-    most : int
-        Largest number of samples that are simulated, evenly spaced among all.
-
-    Returns
-    -------
-    PredictedModes
-        Print it for a table.
-
-    Raises
-    ------
-    ValueError
-        Without data, for samples of another shape, or as `ModalLikelihood`.
-    SimulationFailed
-        If a sample cannot be simulated.
-    """
-    likelihood = model if isinstance(getattr(model, "model", None), PairedModes) else None
-    data = likelihood.model.data if data is None and likelihood is not None else data
-    if not isinstance(data, ModalData):
-        raise ValueError(f"predict_modes: expected the ModalData to compare with in data=; got {type(data).__name__}")
-    inner = _with_modes(model) if likelihood is None else likelihood.model.model
-    names = inner.parameter_names
-    if isinstance(samples, dict) or np.shape(samples)[-1:] == (len(names),):
-        rows = np.atleast_2d(as_points(samples, names))
-    else:
-        expected = names if likelihood is None else likelihood.parameter_names
-        rows = np.atleast_2d(as_points(samples, expected))[:, : len(names)]
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
-    pool = None if likelihood is None else likelihood.simulator.pool
-    batch = simulate_batch(inner, rows, pool)
-    if failed := [reason for reason in batch.reasons if reason]:
-        raise SimulationFailed(f"{len(failed)} of {len(rows)} samples cannot be simulated; the first: {failed[0]}")
-    paired = PairedModes(inner, data, _CLOSE if likelihood is None else likelihood.model.close)
-    found = [paired.pair(modes) for modes in batch.response]
-    result = PredictedModes(
-        data,
-        np.stack([each.frequencies for each in found]),
-        np.stack([each.assurance for each in found]),
-        np.stack([each.columns for each in found]) + 1,
-        (),
-    )
-    return result._replace(remarks=tuple(_remarks(result)))
 
 
 def _remarks(modes: PredictedModes) -> list[str]:

@@ -22,7 +22,6 @@ from fe_likelihoods import (
     Record,
     ShearFrame,
     SimulationCache,
-    predict_modes,
 )
 from fe_likelihoods.modal.load_test import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -72,9 +71,9 @@ def test_the_density_of_known_and_unknown_errors(rng):
     assert likelihood([*theta, 0.02, 0.04]) == pytest.approx(expected, rel=1e-12)
     known = ModalLikelihood(FRAME, identified([1, 1, 1, 1], [1], rng, frequency_cv=0.01, shape_error=0.02))
     assert known.parameter_names == tuple(PRIOR)
-    assert known(theta) == pytest.approx(independent(theta, known.data, 0.01, 0.02), rel=1e-12)
-    both = ModalLikelihood(FRAME, known.data, "common")
-    assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.data, 0.0005**0.5, 0.02), rel=1e-12)
+    assert known(theta) == pytest.approx(independent(theta, known.model.data, 0.01, 0.02), rel=1e-12)
+    both = ModalLikelihood(FRAME, known.model.data, "common")
+    assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.model.data, 0.0005**0.5, 0.02), rel=1e-12)
     prior = PRIOR | {"frequency_error": LogNormal(0.01, 0.5), "shape_error": 0.04}
     assert Posterior(likelihood, prior).log_likelihood([*theta, 0.02]) == pytest.approx(expected, rel=1e-12)
     each = ModalLikelihood(FRAME, data, "mode", "mode")
@@ -169,7 +168,7 @@ def test_frequencies_alone_are_paired_by_number():
     )
     assert likelihood.parameter_names == ("f",)
     assert likelihood([2.02]) == pytest.approx(2 * norm.logpdf(0.01, 0.0, 0.01))
-    assert np.isnan(predict_modes(likelihood, [[2.0]]).assurance).all()
+    assert np.isnan(likelihood.predict_modes([[2.0]]).assurance).all()
 
 
 def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(rng):
@@ -178,17 +177,19 @@ def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(r
     shapes = data.shapes[0].copy()
     shapes[2] = shapes[0] + shapes[1] + StructureModes(FRAME).simulate(truth)[1:, 3]
     strange = ModalData(2 * np.pi * data.frequencies[0], shapes, data.sensors)
-    found = predict_modes(FRAME, truth[None], strange)
+    found = ModalLikelihood(FRAME, data).predict_modes(truth[None], strange)
     assert "in rad/s" in found.remarks[0] and "measured frequencies are 6.28 times" in found.remarks[0]
     assert "No computed mode resembles the measured mode 3" in found.remarks[1] and "select([1, 2])" in found.remarks[1]
     assert len(found.remarks) == 2 and found.remarks[1] in str(found)
-    assert predict_modes(FRAME, truth[None], data).remarks == ()
+    assert ModalLikelihood(FRAME, data).predict_modes(truth[None]).remarks == ()
 
     def crossing(theta):
         return np.diag([1.0, theta[0]]), np.eye(2)
 
     turned = ModalData([0.16, 0.17], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
-    swapped = predict_modes(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), [[0.9], [1.1], [1.2], [0.8]], turned)
+    swapped = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), turned).predict_modes(
+        [[0.9], [1.1], [1.2], [0.8]]
+    )
     assert "paired with different computed modes: 1 (50%), 2 (50%)" in swapped.remarks[0]
 
 
@@ -217,7 +218,7 @@ def test_an_error_that_the_data_do_not_determine_is_warned_of(rng):
         ),
         (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
         (lambda data: ModalLikelihood(FRAME, data, close=2), "close must be a share"),
-        (lambda data: predict_modes(FRAME, np.ones((1, 4))), "in data="),
+        (lambda data: ModalLikelihood(FRAME, data).predict_modes(np.ones((1, 3))), "shape"),
         (
             lambda data: ModalLikelihood(
                 LinearStructure(FRAME, Record("m", 0.1, np.ones(5))).parts, data.at(["roof"])

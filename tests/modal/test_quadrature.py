@@ -19,7 +19,6 @@ from fe_likelihoods import (
     Posterior,
     ShearFrame,
     Uniform,
-    predict_modes,
     read_modal_data,
     to_si,
 )
@@ -175,7 +174,7 @@ def test_held_out_modes_of_a_measured_frame_are_predicted(shared):
     likelihood = ModalLikelihood(frame, data.select([1, 2]))
     posterior = Posterior(likelihood, {f"stiffness_{i}": LogNormal(1.0, 0.2) for i in (1, 2, 3, 4)})
     _, samples = guided(posterior, 200)
-    modes = predict_modes(likelihood, samples, data)
+    modes = likelihood.predict_modes(samples, data)
     low, high = modes.interval(0.9)
     assert (low[2:] < data.frequencies[0, 2:]).all() and (data.frequencies[0, 2:] < high[2:]).all()
     assert (np.median(modes.assurance, axis=0) > 0.9).all() and modes.remarks == ()
