@@ -29,7 +29,9 @@ from ..simulation.model import SimulationFailed
 __all__ = ["Modes", "mode_derivatives", "undamped_modes"]
 
 _ROUND_OFF = 1e-8  # of matrices that are symmetric, as a share of the largest element
-_SMALLEST = 1e-10  # eigenvalue, as a share of the largest computed one, from which a structure is supported
+_CANCELS = 1e-14  # energy of the lowest mode, as a share of the sum of its terms' sizes: round-off of a free structure
+_MASSLESS = 1e-15  # eigenvalue 1 / lambda, as a share of the largest one: round-off
+_FREE = "the structure can move without deformation, or its stiffness matrix is not positive definite"
 _COINCIDENT = 2e-6  # relative difference of eigenvalues whose modes are any basis of their space
 
 
@@ -43,13 +45,14 @@ class Modes(NamedTuple):
 def undamped_modes(stiffness: Any, mass: Any, n: int | None = None) -> Modes:
     """Lowest n modes (default: all) of symmetric matrices (n_dofs, n_dofs), NumPy arrays or SciPy sparse ones.
 
-    Sparse matrices use the Lanczos method with shift and invert about zero; both matrices then need not be inverted.
+    The largest eigenvalues 1 / lambda of the inverse problem M phi = (1 / lambda) K phi are the low modes to full
+    precision, and degrees of freedom may have no mass. Sparse matrices use the Lanczos method with shift and invert.
 
     Raises
     ------
     SimulationFailed
-        If the matrices are not finite, not symmetric or of different shapes, the mass is not positive definite, the
-        structure can move without deformation, or there are fewer than n modes.
+        If the matrices are not finite, not symmetric or of different shapes, the structure can move without
+        deformation, or fewer than n degrees of freedom have a positive mass.
     """
     in_band = sparse.issparse(stiffness) or sparse.issparse(mass)
     stiffness, mass = (sparse.csc_array(each) if in_band else np.asarray(each, float) for each in (stiffness, mass))
@@ -58,8 +61,8 @@ def undamped_modes(stiffness: Any, mass: Any, n: int | None = None) -> Modes:
             f"stiffness and mass must be square matrices of one size; they are {stiffness.shape} and {mass.shape}"
         )
     for what, matrix in (("stiffness", stiffness), ("mass", mass)):
-        size, skew = abs(matrix).max(), abs(matrix - matrix.T).max()
-        if not np.isfinite(size) or not skew <= _ROUND_OFF * size:
+        largest, skew = abs(matrix).max(), abs(matrix - matrix.T).max()
+        if not np.isfinite(largest) or not skew <= _ROUND_OFF * largest:
             raise SimulationFailed(f"the {what} matrix is not finite and symmetric: its asymmetry is {skew:.3g}")
     size = stiffness.shape[0]
     n = size if n is None else n
@@ -72,20 +75,20 @@ def undamped_modes(stiffness: Any, mass: Any, n: int | None = None) -> Modes:
             start = np.random.default_rng(0).standard_normal(size)  # the same in each run, and orthogonal to no mode
             squares, shapes = eigsh(stiffness, n, mass, sigma=0.0, v0=start)
             order = np.argsort(squares)
-            squares, shapes = squares[order], shapes[:, order]
+            squares, shapes = squares[order], shapes[:, order].T
         else:
-            dense = (each.toarray() if in_band else each for each in (stiffness, mass))
-            squares, shapes = eigh(*dense, subset_by_index=[0, n - 1])
+            dense = (each.toarray() if in_band else each for each in (mass, stiffness))
+            inverse, shapes = eigh(*dense, subset_by_index=[size - n, size - 1])
+            inverse, shapes = inverse[::-1], shapes[:, ::-1].T
+            if not inverse[-1] > _MASSLESS * inverse[0]:
+                raise SimulationFailed(f"fewer than {n} degrees of freedom have a positive mass: compute fewer modes")
+            squares, shapes = 1.0 / inverse, shapes / np.sqrt(inverse)[:, None]
     except (np.linalg.LinAlgError, RuntimeError, ArithmeticError) as error:
-        raise SimulationFailed(
-            f"the modes cannot be found ({error}): is the mass positive definite, and the structure supported?"
-        ) from error
-    if not squares[0] > _SMALLEST * abs(squares[-1]):
-        raise SimulationFailed(
-            f"the structure can move without deformation, or the stiffness is not positive: an eigenvalue is "
-            f"{squares[0]:.3g} 1/s2, the largest one {squares[-1]:.3g}"
-        )
-    return Modes(np.sqrt(squares) / (2.0 * np.pi), shapes.T)
+        raise SimulationFailed(f"{_FREE}: {error}") from error
+    lowest = np.abs(shapes[0])
+    if not squares[0] > _CANCELS * (lowest @ (abs(stiffness) @ lowest)):
+        raise SimulationFailed(f"{_FREE}: the lowest eigenvalue is {squares[0]:.3g} 1/s2")
+    return Modes(np.sqrt(squares) / (2.0 * np.pi), shapes)
 
 
 def mode_derivatives(modes: Modes, stiffness_slope: np.ndarray, mass_slope: np.ndarray) -> Modes:

@@ -124,7 +124,7 @@ def test_dampings_are_no_parameters_of_modes():
         (([1.0, 2.0], np.ones((2, 3))), ["a"], "shape"),
         (([1.0, 2.0], np.ones((2, 1)) * 1j), ["a"], "complex"),
         ((np.eye(2), np.eye(2)), ["a"], "give sensors as a mapping"),
-        ((np.eye(2), -np.eye(2)), {"a": 0}, "mass positive definite"),
+        ((np.eye(2), -np.eye(2)), {"a": 0}, "have a positive mass"),
     ],
 )
 def test_what_are_no_modes_is_a_failed_simulation(returned, sensors, text):
