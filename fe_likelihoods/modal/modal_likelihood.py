@@ -8,6 +8,7 @@ import numpy as np
 
 from ..likelihood.likelihood import FELikelihood
 from ..models.linear_structure import LinearStructure
+from ..noise.protocol import Noise
 from ..priors.points import as_points
 from ..simulation.model import Model, SimulationFailed, simulate_batch
 from ..text_tables import text_table
@@ -91,6 +92,12 @@ class ModalLikelihood(FELikelihood):
         if undetermined := noise.undetermined(len(paired.parameter_names)):
             warnings.warn(undetermined, stacklevel=2)
         super().__init__(paired, paired.measurements, noise, pool, **options)
+
+    def with_noise(self, noise: Noise) -> "ModalLikelihood":
+        """The same likelihood with other errors, as `FELikelihood.with_noise`."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(super().with_noise(noise)))
+        return other
 
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
         """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.

@@ -75,7 +75,9 @@ def test_the_density_of_known_and_unknown_errors(rng):
     both = ModalLikelihood(FRAME, known.model.data, "common")
     assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.model.data, 0.0005**0.5, 0.02), rel=1e-12)
     prior = PRIOR | {"frequency_error": LogNormal(0.01, 0.5), "shape_error": 0.04}
-    assert Posterior(likelihood, prior).log_likelihood([*theta, 0.02]) == pytest.approx(expected, rel=1e-12)
+    posterior = Posterior(likelihood, prior)
+    assert posterior.log_likelihood([*theta, 0.02]) == pytest.approx(expected, rel=1e-12)
+    assert posterior.likelihood.predict_modes([*theta, 0.02]).numbers.tolist() == [[3, 1]]
     each = ModalLikelihood(FRAME, data, "mode", "mode")
     assert each.parameter_names[4:] == ("frequency_error_3", "frequency_error_1", "shape_error_3", "shape_error_1")
     assert each([*theta, 0.02, 0.02, 0.04, 0.04]) == pytest.approx(expected, rel=1e-12)

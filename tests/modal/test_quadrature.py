@@ -148,11 +148,11 @@ def test_emcee_agrees_with_quadrature():
     make, bounds, n = PROBLEMS["two modes"]
     _, mean, deviation = quadrature(make(), bounds, n)
     posterior = make()
-    sampler = emcee.EnsembleSampler(40, 2, posterior, vectorize=True)
+    sampler = emcee.EnsembleSampler(32, 2, posterior, vectorize=True)
     sampler.random_state = np.random.RandomState(2).get_state()
-    sampler.run_mcmc(posterior.sample_start(40, 1), 1500)
+    sampler.run_mcmc(posterior.sample_start(32, 1), 800)
     samples = sampler.get_chain(discard=100, flat=True)
-    assert (abs(samples.mean(axis=0) - mean) < 0.05 * deviation).all()
+    assert (abs(samples.mean(axis=0) - mean) < 0.1 * deviation).all()
 
 
 def test_close_modes_whose_order_changes_have_two_modes_in_the_plane_and_one_by_their_shapes():
