@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ __all__ = ["ModalLikelihood", "PredictedModes"]
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 _RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
 _CHANGES = 0.05  # share of the samples with another pairing that is reported
-_RADIANS = 2.0 * np.pi, 0.1  # rad/s over Hz, and how near to it the ratios of all modes are [log]
+_RADIANS = 2.0 * np.pi, 0.25  # rad/s over Hz, and how near to it the ratios of all modes are [log]
 
 
 class ModalLikelihood(FELikelihood):
@@ -56,7 +57,8 @@ class ModalLikelihood(FELikelihood):
     Warns
     -----
     UserWarning
-        If an error is unknown, and one identification has no more data of its kind than there are parameters.
+        If frequencies seem to be in rad/s; if an error is unknown, and one identification has no more data of its kind
+        than there are parameters.
 
     Raises
     ------
@@ -92,6 +94,10 @@ class ModalLikelihood(FELikelihood):
         if undetermined := noise.undetermined(len(paired.parameter_names)):
             warnings.warn(undetermined, stacklevel=2)
         super().__init__(paired, paired.measurements, noise, pool, **options)
+        if isinstance(paired.model, StructureModes):
+            with suppress(SimulationFailed):  # at the nominal values, of which most parameters are multiples
+                if radians := _in_radians(self.predict_modes(np.ones(len(paired.parameter_names)))):
+                    warnings.warn(f"With all parameters at 1: {radians}", stacklevel=2)
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
         """The same likelihood with other errors, as `FELikelihood.with_noise`."""
@@ -121,17 +127,26 @@ class ModalLikelihood(FELikelihood):
         ValueError
             For samples of another shape, or if the model has other sensors or fewer modes than the data.
         SimulationFailed
-            If a sample cannot be simulated.
+            If no sample can be simulated.
+
+        Examples
+        --------
+        Before a run, draws of the prior show wrong units, and modes that the model does not have:
+
+        >>> print(likelihood.predict_modes(posterior.sample_prior(100)))
         """
         paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
         names = paired.parameter_names
         short = isinstance(samples, Mapping) or np.shape(samples)[-1:] == (len(names),)
         rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
-        batch = simulate_batch(paired.model, rows, self.simulator.pool)
-        if failed := [reason for reason in batch.reasons if reason]:
-            raise SimulationFailed(f"{len(failed)} of {len(rows)} samples cannot be simulated; the first: {failed[0]}")
-        found = [paired.pair(modes) for modes in batch.response]
+        cheap = isinstance(paired.model, StructureModes)
+        batch = simulate_batch(paired.model, rows, None if cheap else self.simulator.pool)
+        failed = [reason for reason in batch.reasons if reason]
+        if len(failed) == len(rows):
+            raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {failed[0]}")
+        simulated = (modes for modes, reason in zip(batch.response, batch.reasons, strict=True) if not reason)
+        found = [paired.pair(modes) for modes in simulated]
         result = PredictedModes(
             paired.data,
             np.stack([each.frequencies for each in found]),
@@ -139,7 +154,8 @@ class ModalLikelihood(FELikelihood):
             np.stack([each.columns for each in found]) + 1,
             (),
         )
-        return result._replace(remarks=tuple(_remarks(result)))
+        left_out = [f"{len(failed)} samples are left out, whose simulations fail: {failed[0]}"] if failed else []
+        return result._replace(remarks=(*left_out, *_remarks(result)))
 
 
 def _with_modes(model: Any) -> Model:
@@ -224,13 +240,8 @@ class PredictedModes(NamedTuple):
 
 def _remarks(modes: PredictedModes) -> list[str]:
     """What is wrong with pairs of measured and computed modes, in words."""
-    data, remarks = modes.data, []
+    data, remarks = modes.data, [text] if (text := _in_radians(modes)) else []
     resembling = np.median(modes.assurance, axis=0)
-    logs = np.log(data.mean_frequencies / np.median(modes.frequencies, axis=0))[~(resembling < _RESEMBLES)]
-    target, near = np.log(_RADIANS[0]), _RADIANS[1]
-    for sign, whose in ((1.0, "measured"), (-1.0, "computed")):
-        if len(logs) and (np.abs(sign * logs - target) < near).all():
-            remarks.append(f"The {whose} frequencies are 6.28 times the others: are they in rad/s instead of Hz?")
     for k in np.flatnonzero(resembling < _RESEMBLES):
         others = [number for number in data.mode_numbers if number != data.mode_numbers[k]]
         remarks.append(
@@ -247,3 +258,13 @@ def _remarks(modes: PredictedModes) -> list[str]:
                 "posterior may have several modes; more sensors tell the shapes apart."
             )
     return remarks
+
+
+def _in_radians(modes: PredictedModes) -> str:
+    """A sentence if measured and computed frequencies of resembling modes differ by the factor of rad/s to Hz."""
+    resemble = ~(np.median(modes.assurance, axis=0) < _RESEMBLES)
+    logs = np.log(modes.data.mean_frequencies / np.median(modes.frequencies, axis=0))[resemble]
+    for sign, whose in ((1.0, "measured"), (-1.0, "computed")):
+        if len(logs) and (np.abs(sign * logs - np.log(_RADIANS[0])) < _RADIANS[1]).all():
+            return f"The {whose} frequencies are about 6.28 times the others: are they in rad/s instead of Hz?"
+    return ""

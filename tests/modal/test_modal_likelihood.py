@@ -22,6 +22,7 @@ from fe_likelihoods import (
     Record,
     ShearFrame,
     SimulationCache,
+    SimulationFailed,
 )
 from fe_likelihoods.modal.load_test import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -180,8 +181,14 @@ def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(r
     shapes[2] = shapes[0] + shapes[1] + StructureModes(FRAME).simulate(truth)[1:, 3]
     strange = ModalData(2 * np.pi * data.frequencies[0], shapes, data.sensors)
     found = ModalLikelihood(FRAME, data).predict_modes(truth[None], strange)
-    assert "in rad/s" in found.remarks[0] and "measured frequencies are 6.28 times" in found.remarks[0]
+    assert "in rad/s" in found.remarks[0] and "measured frequencies are about 6.28 times" in found.remarks[0]
     assert "No computed mode resembles the measured mode 3" in found.remarks[1] and "select([1, 2])" in found.remarks[1]
+    with pytest.warns(UserWarning, match="With all parameters at 1: The measured .* in rad/s"):
+        ModalLikelihood(FRAME, strange)
+    partly = ModalLikelihood(FRAME, data).predict_modes([truth, -truth])
+    assert len(partly.numbers) == 1 and partly.remarks[0].startswith("1 samples are left out")
+    with pytest.raises(SimulationFailed, match="none of 1 samples"):
+        ModalLikelihood(FRAME, data).predict_modes(-truth)
     assert len(found.remarks) == 2 and found.remarks[1] in str(found)
     assert ModalLikelihood(FRAME, data).predict_modes(truth[None]).remarks == ()
 
