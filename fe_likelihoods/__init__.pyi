@@ -14,6 +14,10 @@ from .information.sensors import rank_sensors
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
+from .modal.modal_data import ModalData
+from .modal.modal_likelihood import ModalLikelihood
+from .modal.modal_readers import read_modal_data
+from .modal.mode_models import FunctionModes
 from .models.equivalent_linear import EquivalentLinear
 from .models.executable import ExecutableModel
 from .models.function import FunctionModel
@@ -81,6 +85,7 @@ __all__ = [
     "ExecutableModel",
     "FELikelihood",
     "FunctionModel",
+    "FunctionModes",
     "GaussianNoise",
     "GroupedFrame",
     "HalfNormal",
@@ -94,6 +99,8 @@ __all__ = [
     "LogNormal",
     "LowCycleFatigue",
     "Measurements",
+    "ModalData",
+    "ModalLikelihood",
     "ModalModel",
     "MultivariateNormal",
     "OpenSeesModel",
@@ -160,6 +167,7 @@ __all__ = [
     "rank_sensors",
     "read_columns",
     "read_imposed_test",
+    "read_modal_data",
     "read_record",
     "rehearse",
     "report",

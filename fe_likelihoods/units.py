@@ -64,6 +64,21 @@ _FACTORS = {
     },
     "energy": {"J": 1.0, "kJ": 1e3, "MJ": 1e6},
     "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/km": 1e-3, "1/in": 1.0 / INCH, "1/ft": 1.0 / FOOT},
+    "stiffness": {
+        "N/m": 1.0,
+        "N/mm": 1e3,
+        "kN/m": 1e3,
+        "kN/mm": 1e6,
+        "MN/m": 1e6,
+        "lbf/in": POUND_FORCE / INCH,
+        "kip/in": 1e3 * POUND_FORCE / INCH,
+        "kip/ft": 1e3 * POUND_FORCE / FOOT,
+    },
+    "mass": {"kg": 1.0, "tonne": 1e3, "lb": POUND_FORCE / G0, "lbf s2/in": POUND_FORCE / INCH},
+    "frequency": {"Hz": 1.0, "kHz": 1e3, "rad/s": 0.5 / np.pi, "rpm": 1.0 / 60.0},
+    "eigenvalue": {"1/s2": 1.0},
+    "temperature": {"degC": 1.0},  # no kelvin: a factor cannot convert it
+    "dimensionless": {"1": 1.0, "%": 1e-2},  # and a strain where no dimension is stated
     "strain": {"1": 1.0, "%": 1e-2, "microstrain": 1e-6},
     "rotation": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
@@ -97,7 +112,9 @@ def find_unit(name: str, dimension: str | None = None) -> Unit:
     unit = _lookup(name) if isinstance(name, str) else None
     if unit is None:
         raise ValueError(f"unknown unit {name!r}; known units: {_known(dimension)}")
-    if dimension is not None and unit.dimension != dimension:
+    if dimension is not None and unit.name in _FACTORS[dimension]:
+        return unit._replace(dimension=dimension)
+    if dimension is not None:
         raise ValueError(
             f"expected a unit of {dimension}, got {name!r}, a unit of {unit.dimension}; {_known(dimension)}"
         )
@@ -166,11 +183,11 @@ def _lookup(name: str) -> Unit | None:
     for prefix, letter in (("milli", "m"), ("micro", "u"), (f"[{_MICRO}]", "u")):
         text = re.sub(rf"{prefix}(?=s(ec|$))", letter, text, flags=re.IGNORECASE)
     text = re.sub(r"sec(onds?|s)?(?![a-z])", "s", text, flags=re.IGNORECASE)
-    text = text.replace("**", "").replace("^", "").replace("²", "2")
+    text = text.replace("**", "").replace("^", "").replace("²", "2").replace("°", "deg")
     product = _BY_LOWER_CASE.get(text.replace("_", "").lower())
     text = re.sub(r"/s/s$", "/s2", text.replace("_", "/"), flags=re.IGNORECASE)
     unit = _BY_LOWER_CASE.get(text.lower())
-    if unit is None and product is not None and product.dimension == "moment":  # kN_m; c_m is no unit
+    if product is not None and product.dimension == "moment":  # kN_m; c_m is no unit
         unit = product
     if unit is not None and unit.name.startswith("M") and not text.startswith("M"):
         return None

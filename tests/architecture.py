@@ -40,6 +40,7 @@ ORDER = {
         ("plots",),
         ("column_damage", "information"),
         ("prediction",),
+        ("modal",),
         ("events", "models"),
         ("likelihood",),
         ("emulation",),

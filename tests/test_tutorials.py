@@ -416,6 +416,21 @@ def test_noise_is_worth_nothing_and_the_rates_have_their_closed_form(tmp_path):
     assert abs(values["noise"]) <= 4.0 * summary["values"]["noise"][1]
 
 
+# 15
+
+
+@pytest.mark.slow
+def test_modes_find_the_damaged_storey_and_the_truck_the_stiffness(tmp_path):
+    """The modes that were left out are near their intervals, the girder has 0.9 of its stiffness."""
+    run_tutorial("15_modes_and_load_tests.py", "--out", str(tmp_path))
+    found = json.loads((tmp_path / "summary.json").read_text())
+    assert found["losses"][2] > 0.95 and max(found["losses"][:2] + found["losses"][3:]) < 0.05
+    mean, deviation = found["girder"]
+    assert abs(mean - 0.9) < 4.0 * deviation < 0.02
+    low, measured, high = np.array(found["held out"])
+    assert (abs(measured - 0.5 * (low + high)) < 1.5 * (high - low)).all()
+
+
 # the data, and the form of the scripts
 
 

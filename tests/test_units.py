@@ -29,6 +29,12 @@ from fe_likelihoods.units import DIMENSIONS, G0, UNITS, find_unit, from_si, to_s
         (1, "1/in", 1 / 0.0254),
         (2, "1/km", 0.002),
         (1, "microstrain", 1e-6),
+        (2 * np.pi, "rad/s", 1.0),
+        (90, "rpm", 1.5),
+        (10, "lbf/in", 1751.2683524647636),  # NIST SP 811
+        (1, "kN/mm", 1e6),
+        (386.08858267716535, "lb", 175.12683524647636),  # the mass of one lbf s2/in
+        (1, "lbf s2/in", 175.12683524647636),
     ],
 )
 def test_factors_agree_with_their_definitions(value, unit, expected):
@@ -43,7 +49,19 @@ def test_from_si_is_the_inverse_of_to_si(unit, rng):
 
 
 def test_every_dimension_has_an_si_unit_of_factor_one():
-    assert all(UNITS[unit].factor == 1 and UNITS[unit].dimension == name for name, unit in DIMENSIONS.items())
+    assert all(find_unit(unit, name) == (unit, 1, name) for name, unit in DIMENSIONS.items())
+
+
+def test_a_share_is_a_strain_only_where_no_other_dimension_is_stated():
+    assert find_unit("%").dimension == "strain" and find_unit("%", "dimensionless") == ("%", 0.01, "dimensionless")
+    with pytest.raises(ValueError, match="expected a unit of dimensionless, got 'microstrain'"):
+        find_unit("microstrain", "dimensionless")
+
+
+def test_a_temperature_is_in_degrees_and_an_underscore_in_a_moment_is_no_quotient():
+    assert find_unit("°C").dimension == "temperature" and find_unit("kN_m").name == "kN m"
+    with pytest.raises(ValueError, match="temperature: degC"):
+        find_unit("K", "temperature")
 
 
 @pytest.mark.parametrize(

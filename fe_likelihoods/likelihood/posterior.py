@@ -19,6 +19,7 @@ from ..priors.priors import Prior
 from .block_likelihood import BlockLogLikelihood
 from .evaluation_queue import EvaluationQueue
 from .joint import JointLikelihood
+from .known_errors import without_known
 from .likelihood import FELikelihood
 from .parameters import Parameter
 from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, predictive_draws
@@ -41,7 +42,8 @@ class Posterior:
     ----------
     likelihood : FELikelihood or JointLikelihood
     prior : Prior, or mapping of parameter names to distributions
-        It must have exactly the likelihood's parameters, in any order.
+        It must have exactly the likelihood's parameters, in any order. A number instead of a distribution is the known
+        value of a noise parameter, which is then no parameter of the posterior.
 
     Raises
     ------
@@ -60,6 +62,8 @@ class Posterior:
         likelihood: FELikelihood | JointLikelihood,
         prior: Prior | Mapping[str, Distribution],
     ) -> None:
+        if isinstance(prior, Mapping):
+            likelihood, prior = without_known(likelihood, prior)
         self.likelihood = likelihood
         prior = prior if isinstance(prior, Prior) else Prior(prior)
         self.prior = prior.reorder(likelihood.parameter_names)

@@ -25,13 +25,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import same_sampling, sample_window
 from .equivalent_linear import EquivalentLinear
 from .linear_system import Parts, complex_modes, superpose
+from .undamped_modes import Modes, undamped_modes
 from .user_model import ExternalModel
+from .validation import check_theta
 
 __all__ = ["LinearStructure", "Sensor"]
 
@@ -221,6 +224,19 @@ class LinearStructure(ExternalModel):
         if self.lags or isinstance(self.parts, EquivalentLinear):  # later motion counts: a late one, or its level
             return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.lags, self.outputs)
         return self.with_record([support.trim(0.0, until) for support in self.supports])
+
+    def modes(self, theta: ArrayLike, n: int | None = None) -> Modes:
+        """Return the lowest n undamped modes (default: all), with shapes (n, n_channels) at the channels of the parts.
+
+        `theta` is as for `simulate`. Raises SimulationFailed as `undamped_modes`, and ValueError for an
+        `EquivalentLinear`, whose stiffness depends on the motion.
+        """
+        if isinstance(self.parts, EquivalentLinear):
+            raise ValueError("an EquivalentLinear structure has no modes of its own: take the modes of its parts")
+        values = check_theta(theta, self.parameter_names)
+        system = self.parts.assemble(values[: len(values) - len(self.lags)])
+        modes = undamped_modes(system.stiffness, system.mass, n)
+        return modes._replace(shapes=modes.shapes @ system.shape.T)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
         n = len(theta) - len(self.lags)

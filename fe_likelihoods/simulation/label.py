@@ -41,7 +41,7 @@ __all__ = [
     "value_digest",
 ]
 
-SOURCES = ("kernels/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "noise/*.py", "units.py")
+SOURCES = ("kernels/*.py", "modal/*.py", "models/*.py", "signals/*.py", "simulation/model.py", "noise/*.py", "units.py")
 MOST_OBJECTS = 1_000_000  # in one value; further objects are left out
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, type(...), type(NotImplemented))
 _WRAPPED = ("__func__", "__self__", "fget", "fset", "fdel", "func", "args", "keywords", "__wrapped__", "cell_contents")

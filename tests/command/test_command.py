@@ -334,7 +334,11 @@ def test_another_file_of_the_same_name_is_refused(finished):
         ("steps = 2", "steps = 2\nseed = -1", "[sampler] seed: expected a whole number of 0 or more; got -1"),
         ("draws = 10", "draws = -5", "[prediction] draws: expected a whole number of 0 or more; got -5"),
         ("draws = 10", "quantiles = [5, 50]", "[prediction] quantiles: expected a list of different numbers between 0"),
-        ("half-normal(5 mm)", "half-normal(5 kg)", "[priors] sigma_displacement: unknown unit 'kg'"),
+        (
+            "half-normal(5 mm)",
+            "half-normal(5 kg)",
+            "[priors] sigma_displacement: expected a unit of displacement, got 'kg'",
+        ),
         ("half-normal(5 mm)", "half-normal(0.2 g)", "[priors] sigma_displacement: expected a unit of displacement"),
         ("half-normal(5 mm)", "halfnormal(5)", "[priors] sigma_displacement: expected a distribution in quotes"),
         ("damping =", "dampng =", "[priors] dampng: the model has no such parameter; did you mean damping?"),

@@ -1,0 +1,1 @@
+"""Natural frequencies, mode shapes and static load tests as data."""

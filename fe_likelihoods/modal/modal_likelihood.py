@@ -1,0 +1,270 @@
+"""Log-likelihood of natural frequencies and mode shapes, and the modes that samples of a posterior predict."""
+
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..likelihood.likelihood import FELikelihood
+from ..models.linear_structure import LinearStructure
+from ..noise.protocol import Noise
+from ..priors.points import as_points
+from ..simulation.model import Model, SimulationFailed, simulate_batch
+from ..text_tables import text_table
+from .modal_data import ModalData
+from .modal_noise import ModalNoise
+from .mode_models import StructureModes
+from .paired_modes import PairedModes
+
+__all__ = ["ModalLikelihood", "PredictedModes"]
+
+_CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
+_RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
+_CHANGES = 0.05  # share of the samples with another pairing that is reported
+_RADIANS = 2.0 * np.pi, 0.25  # rad/s over Hz, and how near to it the ratios of all modes are [log]
+
+
+class ModalLikelihood(FELikelihood):
+    """Log-likelihood of structural parameters, given natural frequencies and mode shapes.
+
+    Modes are paired by their shapes at every point. One number per frequency and per shape is cached for a simulation,
+    so that all errors are served without another one. It is an `FELikelihood`: `Posterior`, all samplers, guides and
+    `JointLikelihood` take it. The channels of its ``model`` are the measured modes
+    (`fe_likelihoods.modal.paired_modes`).
+
+    Parameters
+    ----------
+    model : Model, LinearStructure or Parts
+        A model that has modes: a `FunctionModes`; any model whose channels are `modal_channels`, such as an
+        `OpenSeesModel` or an `ExecutableModel`; or a linear structure, such as a `ShearFrame` or a `LinearStructure`.
+        It has the sensors of the data, and may have others.
+    data : ModalData
+        The measured modes.
+    frequency_error, shape_error : {"common", "mode"}, optional
+        What is unknown: one error of all modes, the parameters ``frequency_error`` and ``shape_error``; or one of each
+        mode, ``frequency_error_1``, ... Its variance is added to the known one of the data. Default: nothing if the
+        data have known errors, else ``"common"``.
+    pool : optional
+        As for `FELikelihood`.
+    close : float
+        Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
+        frequencies by the order in the pair. Zero compares each shape.
+    **options
+        Of `FELikelihood`, such as ``cache``.
+
+    Warns
+    -----
+    UserWarning
+        If frequencies seem to be in rad/s; if an error is unknown, and one identification has no more data of its kind
+        than there are parameters.
+
+    Raises
+    ------
+    ValueError
+        If the model has no modes, other sensors or fewer modes, an error is neither known nor unknown, or as
+        `FELikelihood`.
+
+    Examples
+    --------
+    >>> likelihood = ModalLikelihood(ShearFrame(floors, masses, stiffnesses), data)
+    >>> prior = {name: LogNormal(1.0, 0.2) for name in likelihood.model.parameter_names}
+    >>> errors = {"frequency_error": LogNormal(0.005, 0.5), "shape_error": LogNormal(0.03, 0.5)}
+    >>> posterior = Posterior(likelihood, prior | errors)
+    """
+
+    def __init__(
+        self,
+        model: Model | Any,
+        data: ModalData,
+        frequency_error: str | None = None,
+        shape_error: str | None = None,
+        pool: Any = None,
+        *,
+        close: float = _CLOSE,
+        **options: Any,
+    ) -> None:
+        if not isinstance(data, ModalData):
+            raise ValueError(f"ModalLikelihood: expected ModalData; got {type(data).__name__}")
+        if not 0.0 <= close < 1.0:
+            raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
+        paired = PairedModes(_with_modes(model), data, close)
+        noise = _noise(paired, data, frequency_error, shape_error)
+        if undetermined := noise.undetermined(len(paired.parameter_names)):
+            warnings.warn(undetermined, stacklevel=2)
+        super().__init__(paired, paired.measurements, noise, pool, **options)
+        if isinstance(paired.model, StructureModes):
+            with suppress(SimulationFailed):  # at the nominal values, of which most parameters are multiples
+                if radians := _in_radians(self.predict_modes(np.ones(len(paired.parameter_names)))):
+                    warnings.warn(f"With all parameters at 1: {radians}", stacklevel=2)
+
+    def with_noise(self, noise: Noise) -> "ModalLikelihood":
+        """The same likelihood with other errors, as `FELikelihood.with_noise`."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(super().with_noise(noise)))
+        return other
+
+    def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
+        """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
+
+        Parameters
+        ----------
+        samples : (n, n_parameters) array_like, or mapping
+            Samples of the structural parameters; the parameters of the errors may follow.
+        data : ModalData, optional
+            Measured modes for the comparison, such as modes that were held out. Default: the data.
+        most : int
+            Largest number of samples that are simulated, evenly spaced among all.
+
+        Returns
+        -------
+        PredictedModes
+            Print it for a table.
+
+        Raises
+        ------
+        ValueError
+            For samples of another shape, or if the model has other sensors or fewer modes than the data.
+        SimulationFailed
+            If no sample can be simulated.
+
+        Examples
+        --------
+        Before a run, draws of the prior show wrong units, and modes that the model does not have:
+
+        >>> print(likelihood.predict_modes(posterior.sample_prior(100)))
+        """
+        paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
+        names = paired.parameter_names
+        short = isinstance(samples, Mapping) or np.shape(samples)[-1:] == (len(names),)
+        rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
+        cheap = isinstance(paired.model, StructureModes)
+        batch = simulate_batch(paired.model, rows, None if cheap else self.simulator.pool)
+        failed = [reason for reason in batch.reasons if reason]
+        if len(failed) == len(rows):
+            raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {failed[0]}")
+        simulated = (modes for modes, reason in zip(batch.response, batch.reasons, strict=True) if not reason)
+        found = [paired.pair(modes) for modes in simulated]
+        result = PredictedModes(
+            paired.data,
+            np.stack([each.frequencies for each in found]),
+            np.stack([each.assurance for each in found]),
+            np.stack([each.columns for each in found]) + 1,
+            (),
+        )
+        left_out = [f"{len(failed)} samples are left out, whose simulations fail: {failed[0]}"] if failed else []
+        return result._replace(remarks=(*left_out, *_remarks(result)))
+
+
+def _with_modes(model: Any) -> Model:
+    """A model that has modes."""
+    model = model.parts if isinstance(model, LinearStructure) else model
+    return StructureModes(model) if hasattr(model, "assemble") else model
+
+
+def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any) -> ModalNoise:
+    """The errors, from what the data and the arguments say."""
+    sizes = np.ones(data.n_modes, dtype=int)
+    for group in paired.groups:
+        sizes[list(group)] = len(group)
+    shapes = data.has_shape.sum(axis=0)
+    if data.covariance is not None and frequency_error is not None:
+        raise ValueError(
+            "ModalLikelihood: the covariance of the frequencies is known; leave frequency_error out, or give the data "
+            "frequency_cv instead of covariance to add an unknown error"
+        )
+    frequency, frequency_known = _error("frequency_error", frequency_error, paired.frequency_cv, data.n_modes)
+    shape, shape_known = _error("shape_error", shape_error, data.shape_error, data.n_modes)
+    return ModalNoise(
+        channels=paired.channels,
+        n_sets=data.n_sets,
+        n_sensors=data.n_sensors,
+        counts=tuple((~np.isnan(data.frequencies)).sum(axis=0).tolist()),
+        freedoms=tuple((shapes * np.maximum(data.n_sensors - sizes, 0)).tolist()),
+        frequency_known=frequency_known,
+        shape_known=shape_known,
+        frequency=frequency,
+        shape=shape if shapes.any() and data.n_sensors > 1 else "",
+    )
+
+
+def _error(what: str, given: Any, known: np.ndarray | None, m: int) -> tuple[str, tuple[float, ...]]:
+    """What is unknown of an error, and its known values (m,)."""
+    if given is None:
+        given = "common" if known is None else ""
+    if given not in ("", "common", "mode"):
+        raise ValueError(
+            f'ModalLikelihood: {what} must be "common" or "mode"; got {given!r}: known errors belong to the data '
+            "(frequency_cv, shape_error), or are numbers in the mapping of priors"
+        )
+    return given, (0.0,) * m if known is None else tuple(known.tolist())
+
+
+class PredictedModes(NamedTuple):
+    """Modes of a model for n parameter samples, paired with m measured modes.
+
+    Attributes
+    ----------
+    data : ModalData
+        The measured modes.
+    frequencies : ndarray, shape (n, m)
+        Computed frequencies [Hz].
+    assurance : ndarray, shape (n, m)
+        Modal assurance criterion; NaN for modes without a measured shape.
+    numbers : ndarray, shape (n, m)
+        Numbers of the computed modes, from 1.
+    remarks : tuple of str
+        Modes that no computed mode resembles, pairings that change between the samples, and units that look wrong.
+    """
+
+    data: ModalData
+    frequencies: np.ndarray
+    assurance: np.ndarray
+    numbers: np.ndarray
+    remarks: tuple[str, ...]
+
+    def interval(self, level: float = 0.9) -> np.ndarray:
+        """Central intervals (2, m) of the computed frequencies [Hz], without the error of the identification."""
+        return np.quantile(self.frequencies, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+
+    def __str__(self) -> str:
+        low, high = self.interval()
+        rows = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC"]]
+        for k, number in enumerate(self.data.mode_numbers):
+            values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]
+            rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}"])
+        return "\n".join([text_table(rows), *self.remarks])
+
+
+def _remarks(modes: PredictedModes) -> list[str]:
+    """What is wrong with pairs of measured and computed modes, in words."""
+    data, remarks = modes.data, [text] if (text := _in_radians(modes)) else []
+    resembling = np.median(modes.assurance, axis=0)
+    for k in np.flatnonzero(resembling < _RESEMBLES):
+        others = [number for number in data.mode_numbers if number != data.mode_numbers[k]]
+        remarks.append(
+            f"No computed mode resembles the measured mode {data.mode_numbers[k]} ({data.mean_frequencies[k]:.4g} Hz): "
+            f"its best MAC is {resembling[k]:.2f}. It is compared all the same; if its identification is doubtful, "
+            f"leave it out, data.select({others}), else look for what the model lacks, or compute more modes."
+        )
+    for k, numbers in enumerate(modes.numbers.T):
+        values, counts = np.unique(numbers, return_counts=True)
+        if len(values) > 1 and counts.max() < (1.0 - _CHANGES) * len(numbers):
+            shares = ", ".join(f"{v} ({c / len(numbers):.0%})" for v, c in zip(values, counts, strict=True))
+            remarks.append(
+                f"The measured mode {data.mode_numbers[k]} is paired with different computed modes: {shares}. The "
+                "posterior may have several modes; more sensors tell the shapes apart."
+            )
+    return remarks
+
+
+def _in_radians(modes: PredictedModes) -> str:
+    """A sentence if measured and computed frequencies of resembling modes differ by the factor of rad/s to Hz."""
+    resemble = ~(np.median(modes.assurance, axis=0) < _RESEMBLES)
+    logs = np.log(modes.data.mean_frequencies / np.median(modes.frequencies, axis=0))[resemble]
+    for sign, whose in ((1.0, "measured"), (-1.0, "computed")):
+        if len(logs) and (np.abs(sign * logs - np.log(_RADIANS[0])) < _RADIANS[1]).all():
+            return f"The {whose} frequencies are about 6.28 times the others: are they in rad/s instead of Hz?"
+    return ""

@@ -1,0 +1,135 @@
+r"""Errors of natural frequencies and mode shapes.
+
+With the coefficient of variation c of a frequency and the standard deviation :math:`\sigma` of a component of a shape
+with a norm of 1, the log-likelihood of one identified mode at n sensors is
+
+.. math::
+
+    \log L = -\log(c \sqrt{2 \pi}) - \frac{(f / \hat f - 1)^2}{2 c^2}
+    - (n - k) \log(\sigma \sqrt{2 \pi}) - \frac{1 - \mathrm{MAC}}{2 \sigma^2} .
+
+The shape has n - k degrees of freedom, because the scale (k = 1), or the place in a plane of k close modes, is fitted.
+The variance of each error is the known variance plus the variance of the unknown error.
+
+References
+----------
+M. W. Vanik, J. L. Beck, S. K. Au, Bayesian probabilistic approach to structural health monitoring, Journal of
+Engineering Mechanics 126(7), 2000, 738-745, doi:10.1061/(ASCE)0733-9399(2000)126:7(738).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..noise.gaussian import HALF_LOG_TWO_PI
+from ..signals.channels import Channel
+
+__all__ = ["ModalNoise", "ModeSums"]
+
+
+@dataclass(frozen=True)
+class ModeSums:
+    """Statistic of residuals: for each mode the sums of squares of all, of its frequencies and of its shapes."""
+
+    n_sets: int
+
+    def __call__(self, residuals: np.ndarray) -> np.ndarray:
+        """Sums (3 m,) for residuals (m, n_sets (1 + n_sensors))."""
+        squares = np.square(residuals).reshape(len(residuals), self.n_sets, -1)
+        sums = squares[:, :, 0].sum(axis=1), squares[:, :, 1:].sum(axis=(1, 2))
+        return np.concatenate([sums[0] + sums[1], *sums])
+
+
+@dataclass(frozen=True)
+class ModalNoise:
+    """Errors of m modes, with a `Noise`'s members: known errors, unknown ones, or both.
+
+    Frequencies have the known errors `frequency_known` (m,), shapes `shape_known` (m,), zero if none is known.
+    `frequency` and `shape` say what is unknown: ``"common"`` for one error of all modes, ``"mode"`` for one each, or an
+    empty text for none. `counts` and `freedoms` (m,) are the numbers of frequencies, and of degrees of freedom of the
+    shapes.
+    """
+
+    channels: tuple[Channel, ...]
+    n_sets: int
+    n_sensors: int
+    counts: tuple[int, ...]
+    freedoms: tuple[int, ...]
+    frequency_known: tuple[float, ...]
+    shape_known: tuple[float, ...]
+    frequency: str
+    shape: str
+    level = "si"  # the errors do not depend on the response
+
+    @property
+    def title(self) -> str:
+        """Name for reports."""
+        return "errors of natural frequencies and mode shapes"
+
+    @property
+    def statistic(self) -> ModeSums:
+        """What the likelihood needs of a simulation."""
+        return ModeSums(self.n_sets)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """``frequency_error`` and ``shape_error``, or one of each per mode, ``frequency_error_2``."""
+        numbers = [channel.name.split()[-1] for channel in self.channels]
+        kinds = {"": [], "common": [""], "mode": [f"_{number}" for number in numbers]}
+        return tuple(f"{what}_error{end}" for what in ("frequency", "shape") for end in kinds[getattr(self, what)])
+
+    def undetermined(self, n_structural: int) -> str:
+        """A warning if the structural parameters can fit all data of an unknown error exactly; else empty."""
+        for what, known, count in (
+            ("frequency", self.frequency_known, sum(self.counts)),
+            ("shape", self.shape_known, sum(self.freedoms)),
+        ):
+            if self.n_sets == 1 and getattr(self, what) and not any(known) and count <= n_structural:
+                return (
+                    f"{n_structural} parameters can fit {count} independent data exactly, so they do not determine the "
+                    f"{what}_error, and it may go to zero: state the error of the identification in the data "
+                    f"({'frequency_cv' if what == 'frequency' else 'shape_error'}), or give it a LogNormal prior"
+                )
+        return ""
+
+    def deviations(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations of frequencies and of components of shapes, (n, m) each, at parameters (n, n_noise)."""
+        m, parameters = len(self.channels), np.asarray(parameters, dtype=float)
+        split = {"": 0, "common": 1, "mode": m}[self.frequency]
+        found = []
+        for known, unknown in (
+            (self.frequency_known, parameters[:, :split]),
+            (self.shape_known, parameters[:, split:]),
+        ):
+            # an unknown error that is not positive is impossible, also beside a known one
+            unknown = np.where(unknown > 0.0, unknown, np.nan)
+            squares = np.square(unknown) if unknown.shape[1] else np.zeros((len(parameters), 1))
+            found.append(np.sqrt(np.square(known) + squares) * np.ones((len(parameters), m)))
+        return found[0], found[1]
+
+    def log_likelihood(self, statistics: np.ndarray, n_samples: Any, parameters: np.ndarray) -> np.ndarray:
+        """Log-likelihood (n,) for the statistics (n, 3 m); -inf for impossible errors."""
+        m = len(self.channels)
+        total = np.zeros(len(statistics))
+        sums = statistics[:, m : 2 * m], statistics[:, 2 * m :]
+        for deviations, squares, counts in zip(
+            self.deviations(parameters), sums, (self.counts, self.freedoms), strict=True
+        ):
+            used = np.array(counts) > 0
+            spread = deviations[:, used]
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                terms = np.array(counts)[used] * (np.log(spread) + HALF_LOG_TWO_PI)
+                total -= (terms + 0.5 * squares[:, used] / np.square(spread)).sum(axis=1)
+        return np.where(np.isnan(total) | (total == math.inf), -np.inf, total)
+
+    def standard_deviations(self, parameters: np.ndarray) -> np.ndarray:
+        """Standard deviations (n, m) of the frequencies, as shares."""
+        return self.deviations(parameters)[0]
+
+    def response_deviations(self, parameters: np.ndarray, response: np.ndarray, dt: Any = None) -> np.ndarray:
+        """Standard deviations of all samples (m, n_sets (1 + n_sensors)); zero where nothing was measured."""
+        frequency, shape = (each[0][:, None] for each in self.deviations(np.atleast_2d(parameters)))
+        one = np.hstack([frequency, np.repeat(shape, self.n_sensors, axis=1)])
+        return np.tile(one, self.n_sets) * (np.asarray(response) != 0.0)

@@ -1,0 +1,172 @@
+"""Modal data from files and from programs of operational modal analysis."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..signals.tables import Table, column_names, read_table, stated_unit
+from ..units import to_si
+from .modal_data import ModalData, real_shapes
+
+__all__ = ["read_modal_data"]
+
+_FREQUENCY, _DAMPING, _MODE, _SET = ("frequency", "freq", "f"), ("damping", "xi"), ("mode",), ("set", "identification")
+_SCATTER = 10.0  # of phases [deg] above which the real part of a shape loses part of it
+
+
+def read_modal_data(
+    source: str | Path | Any,
+    sensors: Sequence[str] = (),
+    *,
+    unit: str | None = None,
+    variables: Mapping[str, str] | None = None,
+    **options: Any,
+) -> ModalData:
+    """Read natural frequencies and mode shapes.
+
+    Parameters
+    ----------
+    source : path, or result of an identification
+        * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
+          its unit, such as ``frequency_Hz``; optional columns ``mode`` (its number), ``damping`` and ``set`` (the
+          number of the identification, where there are several); all other columns are sensors.
+        * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
+        * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``.
+    sensors : sequence of str, optional
+        Names of the sensors. In a table: the columns that are sensors, in this order. Needed for other sources.
+    unit : str, optional
+        Unit of the frequencies, where the file does not state it: ``"Hz"`` or ``"rad/s"``. A result of pyOMA2 is in
+        hertz.
+    variables : mapping of str to str, optional
+        Names of the MATLAB variables: ``{"frequencies": "f", "shapes": "Phi", "damping": "xi"}``, without those that
+        do not exist.
+    **options
+        Of `ModalData`, such as ``frequency_cv``.
+
+    Returns
+    -------
+    ModalData
+        Complex shapes are made real (`real_shapes`).
+
+    Raises
+    ------
+    ValueError
+        If the unit is not known, columns or variables are missing, or as `ModalData`.
+
+    Warns
+    -----
+    UserWarning
+        If the phases of a complex shape scatter by more than 10 degrees.
+
+    Examples
+    --------
+    >>> data = read_modal_data("modes.csv", frequency_cv=0.005, shape_error=0.02)
+    """
+    if hasattr(source, "Fn") and hasattr(source, "Phi"):
+        return _of_result(source, sensors, options)
+    if not isinstance(source, str | Path):
+        raise ValueError(f"read_modal_data: expected a path, or a result with Fn and Phi; got {type(source).__name__}")
+    if Path(source).suffix.lower() == ".mat":
+        return _of_matlab(Path(source), sensors, unit, variables or {}, options)
+    return _of_table(read_table(source), sensors, unit, options)
+
+
+def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
+    names = column_names(table)
+    words = [name.lower().replace("[", " ").replace("(", " ").replace("_", " ").split()[0] for name in names]
+    found = {
+        what: next((place for place, word in enumerate(words) if word in known), None)
+        for what, known in (("frequency", _FREQUENCY), ("damping", _DAMPING), ("mode", _MODE), ("set", _SET))
+    }
+    if found["frequency"] is None:
+        raise ValueError(
+            f"{table.file}: expected a column of frequencies, such as frequency_Hz; the columns are {', '.join(names)}"
+        )
+    others = [name for place, name in enumerate(names) if place not in found.values()]
+    if unknown := [name for name in sensors if name not in others]:
+        raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
+    sensors = tuple(sensors) or tuple(others)
+    values = {what: None if place is None else table.values[:, place] for what, place in found.items()}
+    stated = stated_unit(table, found["frequency"], "frequency")
+    frequencies = _in_hertz(values["frequency"], stated, unit, f"{table.file}, column {names[found['frequency']]!r}")
+    shapes = table.values[:, [names.index(name) for name in sensors]]
+    sets = np.zeros(len(frequencies)) if values["set"] is None else values["set"]
+    modes = values["mode"]
+    if modes is None:  # the place among the lines of its identification
+        modes = np.array([(sets[: place + 1] == each).sum() for place, each in enumerate(sets)])
+    numbers, order = np.unique(modes), np.unique(sets)
+    shape = len(order), len(numbers)
+    rows = np.searchsorted(order, sets), np.searchsorted(numbers, modes)
+    if len(set(zip(*rows, strict=True))) < len(modes) or (numbers != np.round(numbers)).any():
+        raise ValueError(
+            f"{table.file}: expected different whole numbers in the column of modes; got {modes.tolist()}: give a "
+            "column 'set' with the number of the identification if there are several"
+        )
+    placed = {"frequencies": np.full(shape, np.nan), "shapes": np.full((*shape, len(sensors)), np.nan)}
+    placed["frequencies"][rows], placed["shapes"][rows] = frequencies, shapes
+    if values["damping"] is not None:
+        placed["damping"] = np.full(shape, np.nan)
+        named = stated_unit(table, found["damping"], "dimensionless")
+        placed["damping"][rows] = to_si(values["damping"], named or "1", "dimensionless")
+    return ModalData(sensors=sensors, mode_numbers=numbers.astype(int).tolist(), **placed, **options)
+
+
+def _of_matlab(
+    path: Path, sensors: Sequence[str], unit: str | None, variables: Mapping[str, str], options: dict[str, Any]
+) -> ModalData:
+    from scipy.io import loadmat  # slow to import
+
+    try:
+        content = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    except NotImplementedError:
+        raise ValueError(f"{path}: a file of version 7.3; save it with '-v7', or read it with h5py") from None
+    missing = [name for name in variables.values() if name not in content]
+    if missing or not {"frequencies"} <= set(variables) <= {"frequencies", "shapes", "damping"}:
+        raise ValueError(
+            f"{path}: name the variables, such as variables={{'frequencies': 'f', 'shapes': 'Phi'}}; got "
+            f"{dict(variables)}, the file has {', '.join(content)}"
+        )
+    values = {what: np.squeeze(content[name]) for what, name in variables.items()}
+    values["frequencies"] = _in_hertz(np.atleast_1d(values["frequencies"]), None, unit, str(path))
+    if "shapes" in values:
+        m = len(values["frequencies"])
+        values["shapes"] = _real(np.reshape(content[variables["shapes"]], (-1, m)).T)
+    return ModalData(sensors=sensors, **values, **options)
+
+
+def _of_result(result: Any, sensors: Sequence[str], options: dict[str, Any]) -> ModalData:
+    """Modes of a result with the attributes of pyOMA2, whose shapes have the modes in columns."""
+    if result.Fn is None or result.Phi is None:
+        raise ValueError("read_modal_data: the result has no modes yet; choose them first, with mpe or mpe_from_plot")
+    frequencies = np.atleast_1d(np.asarray(result.Fn, dtype=float))
+    if (deviations := getattr(result, "Fn_std", None)) is not None:
+        options = {"frequency_cv": np.ravel(deviations) / frequencies} | options
+    if (damping := getattr(result, "Xi", None)) is not None:
+        options = {"damping": np.ravel(damping)} | options
+    return ModalData(frequencies, _real(np.asarray(result.Phi).T), sensors, **options)
+
+
+def _in_hertz(values: np.ndarray, stated: str | None, given: str | None, where: str) -> np.ndarray:
+    """Frequencies [Hz]; ValueError if the unit is not known, or is stated and given differently."""
+    if stated is None and given is None:
+        raise ValueError(f"{where}: the unit of the frequencies is not stated; give unit='Hz' or unit='rad/s'")
+    if stated is not None and given is not None and stated != given:
+        raise ValueError(f"{where}: the file states {stated}, and unit={given!r} is given: leave unit out")
+    return to_si(values, stated or given, "frequency")
+
+
+def _real(shapes: np.ndarray) -> np.ndarray:
+    """Real shapes; warns if complex ones lose much."""
+    if not np.iscomplexobj(shapes):
+        return shapes
+    real, scatter = real_shapes(shapes)
+    if (bad := np.flatnonzero(scatter > _SCATTER)).size:
+        warnings.warn(
+            f"the phases of the shapes of modes {(bad + 1).tolist()} scatter by {scatter[bad].round(1).tolist()} "
+            "degrees, so their real parts are poor shapes: look at the identification, or leave these shapes out",
+            stacklevel=4,
+        )
+    return real

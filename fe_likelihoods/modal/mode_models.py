@@ -1,0 +1,235 @@
+"""Models that have modes.
+
+A model that has modes is an ordinary model: its first channel is the natural frequency, each other channel is a sensor,
+and its samples are modes instead of times. The response (1 + n_sensors, n_modes) of every kind of model, a function, an
+OpenSees script or a program, can therefore be modes.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..models.function import FunctionModel
+from ..models.linear_system import Parts
+from ..models.undamped_modes import Modes, mode_derivatives, undamped_modes
+from ..models.user_model import ExternalModel
+from ..models.validation import check_theta
+from ..signals.channels import Channel
+from ..simulation.model import SimulationFailed
+
+__all__ = ["FunctionModes", "StructureModes", "modal_channels", "modal_response", "opensees_modes"]
+
+_DAMPING = 0.05  # of a structure whose undamped modes are computed: without effect
+_STEP = 1e-4  # for central differences of matrices, as a share of a parameter
+
+
+def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
+    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor."""
+    return Channel("frequency", "frequency", "Hz"), *(Channel(name, "dimensionless", "1") for name in sensors)
+
+
+def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) -> np.ndarray:
+    """Response (1 + n_sensors, n_modes) of a model that has modes.
+
+    Parameters
+    ----------
+    frequencies : (n,) array_like
+        Natural frequencies [Hz].
+    shapes : (n, n_sensors) array_like
+        Mode shapes in any scale, a row for each mode.
+    n_modes : int, optional
+        Number of modes in the response; others are left out.
+
+    Raises
+    ------
+    SimulationFailed
+        If a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies differ.
+    """
+    frequencies, shapes = np.asarray(frequencies, dtype=float), np.asarray(shapes)
+    if frequencies.ndim != 1 or shapes.ndim != 2 or len(shapes) != len(frequencies):
+        raise SimulationFailed(
+            f"expected frequencies (n,) and shapes (n, n_sensors), a row for each mode; got {frequencies.shape} and "
+            f"{shapes.shape}: transpose the shapes if their columns are modes"
+        )
+    if not (frequencies > 0.0).all():
+        raise SimulationFailed(f"natural frequencies must be positive; they are {frequencies} Hz")
+    if n_modes is not None and len(frequencies) < n_modes:
+        raise SimulationFailed(f"expected {n_modes} modes or more; got {len(frequencies)}")
+    order = np.argsort(frequencies, kind="stable")[:n_modes]
+    return np.vstack([frequencies[order], shapes[order].T])
+
+
+def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Modes of the present OpenSees model as the response (1 + n_sensors, n_modes) of a model that has modes.
+
+    Parameters
+    ----------
+    ops : module
+        ``openseespy.opensees``, as an `OpenSeesModel` passes it.
+    n_modes : int
+        Number of modes, less than the number of degrees of freedom that have a mass.
+    sensors : sequence of (node, degree of freedom)
+        Where the sensors are, in the order of the channels.
+
+    Raises
+    ------
+    SimulationFailed
+        If ``ops.eigen`` fails, or an eigenvalue is not positive.
+
+    Examples
+    --------
+    >>> def frame(ops, theta):
+    ...     ...
+    ...     return opensees_modes(ops, 4, [(2, 1), (3, 1)])
+    >>> model = OpenSeesModel(frame, ("stiffness",), modal_channels(["floor 1", "floor 2"]), 1.0, 4)
+    """
+    try:
+        squares = np.array(ops.eigen(n_modes) or [], dtype=float)
+    except Exception as error:  # openseespy raises its own class
+        raise SimulationFailed(f"ops.eigen failed: {error}") from error
+    if len(squares) != n_modes or not (squares > 0.0).all():
+        raise SimulationFailed(
+            f"ops.eigen({n_modes}) returned the eigenvalues {squares.tolist()}, expected {n_modes} positive ones: is "
+            "the structure supported, and do more degrees of freedom than modes have a mass?"
+        )
+    shapes = [[ops.nodeEigenvector(node, mode, dof) for node, dof in sensors] for mode in range(1, n_modes + 1)]
+    return modal_response(np.sqrt(squares) / (2.0 * np.pi), np.reshape(shapes, (n_modes, len(sensors))))
+
+
+class _ModesOf:
+    """Function of theta that makes the response of what a user's function returns: matrices, or modes."""
+
+    def __init__(self, function: Callable[..., Any], dofs: tuple[int, ...] | None, n_modes: int) -> None:
+        self.function, self.dofs, self.n_modes = function, dofs, n_modes
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        returned = self.function(theta)
+        if not isinstance(returned, tuple | list) or len(returned) != 2:
+            raise SimulationFailed(
+                "expected the function to return (stiffness, mass) or (frequencies, shapes); got "
+                f"{type(returned).__name__}"
+            )
+        first, second = returned
+        if len(getattr(first, "shape", np.shape(first))) == 1:
+            return modal_response(first, second, self.n_modes)
+        modes = undamped_modes(first, second, self.n_modes)
+        if self.dofs is None:
+            raise SimulationFailed("the function returns matrices: give sensors as a mapping of names to rows of these")
+        return modal_response(modes.frequencies, modes.shapes[:, list(self.dofs)])
+
+
+class FunctionModes(FunctionModel):
+    """Python function as a model that has modes.
+
+    Parameters
+    ----------
+    function : callable
+        Function of theta (n_parameters,) that returns the stiffness and the mass matrix, as NumPy arrays or SciPy
+        sparse matrices in consistent units (N/m and kg), or frequencies (n,) [Hz] and shapes (n, n_sensors), a row for
+        each mode.
+    parameter_names : sequence of str
+        Names of the structural parameters, in the order of theta.
+    sensors : mapping of str to int, or sequence of str
+        Names of the sensors. For matrices, with the row of the matrix, from 0, that each sensor measures.
+    n_modes : int
+        Number of modes that are computed, at least the measured ones; twice as many let the pairing pass over local
+        modes.
+    **options
+        Of `FunctionModel`: ``version``, ``depends_on``, ``isolated``, ``time_limit``, ``memory_limit``.
+
+    Examples
+    --------
+    >>> def frame(theta):
+    ...     k1, k2 = theta
+    ...     return np.array([[k1 + k2, -k2], [-k2, k2]]), np.eye(2)
+    >>> model = FunctionModes(frame, ("k1", "k2"), {"floor 1": 0, "floor 2": 1}, 2)
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        parameter_names: Sequence[str],
+        sensors: Mapping[str, int] | Sequence[str],
+        n_modes: int,
+        **options: Any,
+    ) -> None:
+        dofs = tuple(int(row) for row in sensors.values()) if isinstance(sensors, Mapping) else None
+        if not callable(function):
+            raise ValueError(f"FunctionModes: expected a function of the parameters; got {function!r}")
+        called = _ModesOf(function, dofs, n_modes)
+        super().__init__(called, parameter_names, modal_channels(tuple(sensors)), 1.0, n_modes, **options)
+
+    def code_parts(self) -> dict[str, Any]:
+        """User code and rows of the sensors, for the label of stored simulations."""
+        return super().code_parts() | {"rows of the sensors": self.function.dofs}
+
+    @property
+    def _user_function(self) -> Callable[..., Any]:
+        return self.function.function
+
+
+class StructureModes(ExternalModel):
+    """Modes of a linear structure of this library, such as a `ShearFrame`, as a model.
+
+    Its parameters are those of the structure except dampings, which the undamped modes do not depend on. Its sensors
+    are the channels of the structure. It has derivatives.
+
+    Parameters
+    ----------
+    parts : Parts
+        Structure with a method ``assemble``.
+    n_modes : int, optional
+        Number of modes. Default: all of a frame or a `ModalModel`.
+
+    Raises
+    ------
+    ValueError
+        If the number of modes is not known, or the structure has fewer.
+    """
+
+    path_dependent = False
+    time_label = "mode"
+
+    def __init__(self, parts: Parts, n_modes: int | None = None) -> None:
+        known = len(getattr(parts, "masses", ())) or getattr(parts, "n_modes", None)
+        if n_modes is None and known is None:
+            raise ValueError(f"StructureModes: give n_modes, the number of modes of the {type(parts).__name__}")
+        if n_modes is not None and known is not None and n_modes > known:
+            raise ValueError(f"StructureModes: the {type(parts).__name__} has {known} modes; got n_modes={n_modes}")
+        names = tuple(name for name in parts.parameter_names if not name.startswith("damping"))
+        super().__init__(names, modal_channels(parts.channel_names), 1.0, known if n_modes is None else n_modes)
+        self.parts = parts
+        self.fingerprint = self._digest(repr(parts))
+
+    def _system(self, theta: np.ndarray) -> Any:
+        given = dict(zip(self.parameter_names, theta, strict=True))
+        return self.parts.assemble(np.array([given.get(name, _DAMPING) for name in self.parts.parameter_names]))
+
+    def _modes(self, theta: np.ndarray) -> tuple[Any, Modes]:
+        system = self._system(theta)
+        return system, undamped_modes(system.stiffness, system.mass)
+
+    def _respond(self, theta: np.ndarray) -> np.ndarray:
+        system, modes = self._modes(theta)
+        return modal_response(modes.frequencies, modes.shapes @ system.shape.T, self.n_steps)
+
+    def jacobian(self, theta: np.ndarray) -> np.ndarray:
+        """Derivatives (n_parameters, 1 + n_sensors, n_modes) of the response, exact but for differences of matrices."""
+        theta = check_theta(theta, self.parameter_names)
+        system, modes = self._modes(theta)
+        steps = _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
+        ends = [[self._system(theta + sign * step) for sign in (1.0, -1.0)] for step in np.diag(steps)]
+        stiff, heavy, sensors = (
+            np.stack(
+                [
+                    (getattr(up, what) - getattr(down, what)) / (2.0 * step)
+                    for (up, down), step in zip(ends, steps, strict=True)
+                ]
+            )
+            for what in ("stiffness", "mass", "shape")
+        )
+        slopes = mode_derivatives(modes, stiff, heavy)
+        shapes = slopes.shapes @ system.shape.T + modes.shapes @ sensors.transpose(0, 2, 1)
+        rows = np.concatenate([slopes.frequencies[:, None, :], shapes.transpose(0, 2, 1)], axis=1)
+        return rows[:, :, : self.n_steps]

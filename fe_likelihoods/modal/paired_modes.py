@@ -1,0 +1,139 @@
+"""Modes of a model at the measured modes, as a response that a likelihood can compare.
+
+Each measured mode is a channel. Its samples are, for each identification, the computed frequency as a multiple of the
+measured one, and the projection of the measured shape on the computed one, at all sensors. They are smooth functions of
+the parameters as long as the pairing stays, so emulators and searches of modes of the posterior need nothing else. The
+residuals are the relative frequency errors and the vectors of squared length 1 - MAC.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..models.base import digest
+from ..signals.channels import Channel, Measurements
+from ..signals.sampling import array_digest
+from ..simulation.model import Model, SimulationFailed
+from ..simulation.user_code import is_of_user
+from .modal_data import ModalData
+from .pairing import Paired, pair_modes
+
+__all__ = ["PairedModes", "sensor_rows"]
+
+_OF_THE_MODEL = (
+    "code_parts",
+    "nominal",
+    "nominal_units",
+    "parameter_units",
+    "range_remark",
+    "response_tolerance",
+    "time_limit",
+)
+
+
+def sensor_rows(model: Model, data: ModalData) -> list[int]:
+    """Rows of a model's response that are the sensors of the data; ValueError if the model has no modes at them."""
+    if [channel.dimension for channel in model.channels[:1]] != ["frequency"]:
+        raise ValueError(
+            f"expected a model that has modes, whose first channel is a frequency; the channels of "
+            f"{type(model).__name__} are {', '.join(channel.name for channel in model.channels)}: use FunctionModes, "
+            "or modal_channels(sensors) and modal_response (fe_likelihoods.modal.mode_models)"
+        )
+    names = [channel.name for channel in model.channels]
+    if unknown := [name for name in data.sensors if name not in names[1:]]:
+        raise ValueError(
+            f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
+            "them, or leave them out of the data with data.at(sensors)"
+        )
+    by_number = [data.mode_numbers[mode] for mode in np.flatnonzero(~data.has_shape.any(axis=0))]
+    if max([data.n_modes, *by_number]) > model.n_steps:
+        raise ValueError(
+            f"the model has {model.n_steps} modes, and {data.n_modes} were measured, with the numbers "
+            f"{data.mode_numbers}: compute more modes (n_modes), twice as many as were measured"
+        )
+    return [names.index(name) for name in data.sensors]
+
+
+class PairedModes:
+    """Model of the measured modes: the modes of another model, paired with them."""
+
+    dt = 1.0
+    path_dependent = False
+    time_label = "frequency, then components of the shape"
+
+    def __init__(self, model: Model, data: ModalData, close: float) -> None:
+        self.model, self.data, self.close = model, data, close
+        self._rows = sensor_rows(model, data)
+        self._measured = data.measured(close)
+        self._there = ~np.isnan(data.frequencies)
+        # frequencies with a covariance are compared in coordinates in which their errors are independent
+        self.frequency_cv, self._whitening = data.frequency_cv, np.eye(data.n_modes)
+        if data.covariance is not None:
+            factor = np.linalg.cholesky(data.covariance / np.outer(data.mean_frequencies, data.mean_frequencies))
+            self.frequency_cv = np.diag(factor).copy()
+            self._whitening = self.frequency_cv[:, None] * np.linalg.inv(factor)
+        self.parameter_names = tuple(model.parameter_names)
+        self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
+        self.n_steps = data.n_sets * (1 + data.n_sensors)
+        self.groups = self._measured.groups
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the model, the data and the groups of close modes."""
+        parts = type(self).__name__, self.model.fingerprint, self.data.fingerprint, repr(self.groups)
+        return digest(*parts, array_digest(self._whitening))
+
+    def __getattr__(self, name: str) -> Any:
+        """Optional members of the model, such as `code_parts`, and `jacobian` if the model has it."""
+        model = vars(self).get("model")
+        if model is not None and name == "code_parts" and is_of_user(type(model).__module__):
+            return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
+        if model is not None and name in _OF_THE_MODEL:
+            return getattr(model, name)
+        if model is not None and name == "jacobian" and getattr(model, "jacobian", None) is not None:
+            return self._differentiate
+        raise AttributeError(f"{type(self).__name__} has no {name}")
+
+    @property
+    def measurements(self) -> Measurements:
+        """The data as measurements of the channels."""
+        values = self._joined(self._there.astype(float), self._measured.shapes)
+        return Measurements(self.channels, self.dt, values, "natural frequencies and mode shapes")
+
+    def simulate(self, theta: np.ndarray) -> np.ndarray:
+        """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
+        paired = self.pair(self.model.simulate(theta))
+        return self._joined(self._ratios(paired.frequencies), paired.shapes)
+
+    def pair(self, modes: np.ndarray) -> Paired:
+        """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
+        if not (modes[0] > 0.0).all():
+            raise SimulationFailed(f"natural frequencies must be positive; they are {modes[0]} Hz")
+        return pair_modes(modes[0], modes[self._rows].T, self._measured)
+
+    def _ratios(self, frequencies: np.ndarray) -> np.ndarray:
+        """Frequencies (..., m) as multiples (..., n_sets, m) of the measured ones; zero where there is none."""
+        return np.where(self._there, frequencies[..., None, :] / self.data.frequencies, 0.0)
+
+    def _joined(self, ratios: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+        """Response (..., m, n_steps) of ratios (..., n_sets, m) and shapes (..., n_sets, m, n_sensors)."""
+        whitened = ratios @ self._whitening.T
+        blocks = np.concatenate([whitened[..., None], shapes], axis=-1)
+        return np.moveaxis(blocks, -3, -2).reshape(*blocks.shape[:-3], len(self.channels), self.n_steps)
+
+    def _differentiate(self, theta: np.ndarray) -> np.ndarray:
+        """Derivatives (n_parameters, m, n_steps) of the response while the pairing stays."""
+        modes, slopes = self.model.simulate(theta), np.asarray(self.model.jacobian(theta))
+        paired = self.pair(modes)
+        shapes = np.zeros((len(slopes), *paired.shapes.shape))
+        for mode, space in enumerate(paired.spaces):
+            basis = modes[np.ix_(self._rows, space)]
+            turned = slopes[:, self._rows][:, :, list(space)]
+            inverse = np.linalg.pinv(basis)
+            for k in np.flatnonzero(self._measured.there[:, mode]):
+                target, projected = self.data.shapes[k, mode], paired.shapes[k, mode]
+                # y = B c with c = B+ t: y' = (I - B B+) B' c + (B+)^T B'^T (t - y)
+                moved = turned @ (inverse @ target)
+                moved = moved - moved @ inverse.T @ basis.T
+                shapes[:, k, mode] = moved + (target - projected) @ turned @ inverse
+        return self._joined(self._ratios(slopes[:, 0, paired.columns]), shapes)

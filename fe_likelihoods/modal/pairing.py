@@ -1,0 +1,145 @@
+r"""Which computed mode a measured mode is, and how far they differ.
+
+The scale and the sign of a mode shape are arbitrary. With the best scale
+:math:`a = \phi \cdot \hat\phi / \phi \cdot \phi` the residual of a measured shape is
+
+.. math:: r = \hat\phi - a \phi, \qquad |r|^2 = |\hat\phi|^2 (1 - \mathrm{MAC}), \qquad
+   \mathrm{MAC} = \frac{(\phi \cdot \hat\phi)^2}{(\phi \cdot \phi) (\hat\phi \cdot \hat\phi)}.
+
+Modes are paired by their shapes, never by their order, because the order changes with the parameters and local modes of
+a model lie between global ones. Where two measured frequencies are close, an identification finds the plane of the two
+shapes, and not the shapes in it. The measured shapes are then compared with their projections on the plane of the two
+computed shapes, and the frequencies by their order in the pair.
+
+References
+----------
+R. J. Allemang, The modal assurance criterion: twenty years of use and abuse, Sound and Vibration 37(8), 2003, 14-23.
+E. Simoen, G. De Roeck, G. Lombaert, Dealing with uncertainty in model updating for damage assessment: a review,
+Mechanical Systems and Signal Processing 56, 2015, 123-149, doi:10.1016/j.ymssp.2014.11.001.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+__all__ = ["MeasuredModes", "Paired", "best_scale", "close_groups", "modal_assurance", "pair_modes", "shape_misfit"]
+
+_FREQUENCY_WEIGHT = 0.1  # of |log(f / measured f)| beside 1 - MAC: decides only where the shapes hardly do
+_COINCIDENT = 1e-6  # relative difference of computed frequencies whose shapes are any basis of their space
+_SAME = 1e-6  # smallest singular value of shapes that the sensors tell apart, as a share of the largest
+_FORCED = 1e3  # cost of any pairing but the one by number
+
+
+def modal_assurance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Modal assurance criterion (m, n) between the shapes in the rows of two arrays, (m, n_sensors), (n, n_sensors).
+
+    It is 1 for shapes that differ by a factor only, and 0 for orthogonal shapes.
+    """
+    return np.square(_normed(first) @ _normed(second).T)
+
+
+def best_scale(shape: np.ndarray, measured: np.ndarray) -> float:
+    """Factor of a computed shape (n_sensors,) that brings it nearest to a measured one."""
+    return float(shape @ measured / (shape @ shape))
+
+
+def shape_misfit(shape: np.ndarray, measured: np.ndarray) -> float:
+    """Squared distance of a measured shape (n_sensors,) from the best multiple of a computed one, |m|² (1 - MAC)."""
+    return float(np.square(measured - best_scale(shape, measured) * shape).sum())
+
+
+def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int, ...], ...]:
+    """Groups of modes whose frequencies follow each other at ratios below 1 + `close`, in ascending order."""
+    order = np.argsort(frequencies, kind="stable")
+    groups = [[int(order[0])]]
+    for before, mode in zip(order, order[1:], strict=False):
+        near = frequencies[mode] < (1.0 + close) * frequencies[before]
+        groups = [*groups[:-1], [*groups[-1], int(mode)]] if near else [*groups, [int(mode)]]
+    return tuple(map(tuple, groups))
+
+
+class MeasuredModes(NamedTuple):
+    """Measured modes as the pairing needs them; m modes, identified n_sets times."""
+
+    frequencies: np.ndarray  # (m,) [Hz], the means of the identifications
+    shapes: np.ndarray  # (n_sets, m, n_sensors) of unit norm; zero where there is none
+    there: np.ndarray  # (n_sets, m) whether there is a shape
+    groups: tuple[tuple[int, ...], ...]  # modes that are close to each other, in ascending order of frequency
+    numbers: tuple[int, ...]  # of the computed modes, for modes without a shape
+
+
+class Paired(NamedTuple):
+    """Computed modes at the measured ones."""
+
+    columns: np.ndarray  # (m,) numbers of the computed modes, from 0
+    assurance: np.ndarray  # (m,) modal assurance, the mean of the sets; with a space of modes where they are close
+    frequencies: np.ndarray  # (m,) [Hz]
+    shapes: np.ndarray  # (n_sets, m, n_sensors) projections of the measured shapes; zero where there is none
+    spaces: tuple[tuple[int, ...], ...]  # computed modes on whose space each measured shape is projected
+
+
+def pair_modes(frequencies: np.ndarray, shapes: np.ndarray, measured: MeasuredModes) -> Paired:
+    """Pair n computed modes with m measured ones; frequencies (n,) [Hz] and shapes (n, n_sensors) in any scale.
+
+    Pairs are assigned so that the sum of 1 - MAC, with a weak term in the frequencies, is least. Modes without a shape
+    are paired by their number.
+    """
+    clusters = close_groups(frequencies, _COINCIDENT)
+    members = {mode: cluster for cluster in clusters for mode in cluster}
+    counts = measured.there.sum(axis=0)
+    normed = _normed(shapes)
+    cosines = measured.shapes @ normed.T
+    similar = np.square(cosines)
+    for group in measured.groups:
+        for cluster in clusters:
+            if len(group) + len(cluster) > 2:
+                _compare_spaces(similar, measured, group, cluster, normed)
+    cost = np.abs(np.log(frequencies / measured.frequencies[:, None])) * _FREQUENCY_WEIGHT
+    cost += 1.0 - similar.sum(axis=0) / np.maximum(counts, 1)[:, None]
+    for mode in np.flatnonzero(counts == 0):
+        cost[mode] = _FORCED
+        cost[mode, measured.numbers[mode] - 1] = 0.0
+    columns = linear_sum_assignment(cost)[1]
+    spaces: list[tuple[int, ...]] = [()] * len(columns)
+    projected = np.empty(measured.shapes.shape)
+    for group in measured.groups:
+        modes = list(group)
+        columns[modes] = columns[modes][np.argsort(frequencies[columns[modes]], kind="stable")]
+        space = tuple(sorted({each for mode in modes for each in members[int(columns[mode])]}))
+        for mode in modes:
+            spaces[mode] = space
+            if len(space) == 1:
+                projected[:, mode] = cosines[:, mode, space] * normed[list(space)]
+            else:
+                basis = normed[list(space)].T
+                projected[:, mode] = (basis @ np.linalg.lstsq(basis, measured.shapes[:, mode].T, rcond=None)[0]).T
+    assurance = np.where(counts > 0, np.square(projected).sum(axis=(0, 2)) / np.maximum(counts, 1), np.nan)
+    return Paired(columns, assurance, frequencies[columns], projected, tuple(spaces))
+
+
+def _compare_spaces(
+    similar: np.ndarray,
+    measured: MeasuredModes,
+    group: tuple[int, ...],
+    cluster: tuple[int, ...],
+    shapes: np.ndarray,
+) -> None:
+    """Let `similar` (n_sets, m, n) be the largest MAC between the spaces of close measured and of coincident modes."""
+    for k, there in enumerate(measured.there):
+        if modes := [mode for mode in group if there[mode]]:
+            cosines = _basis(measured.shapes[k, modes]).T @ _basis(shapes[list(cluster)])
+            similar[np.ix_([k], modes, cluster)] = np.linalg.norm(cosines, 2) ** 2
+
+
+def _basis(shapes: np.ndarray) -> np.ndarray:
+    """Orthonormal basis (n_sensors, k) of the space of shapes in rows."""
+    left, values, _ = np.linalg.svd(shapes.T, full_matrices=False)
+    return left[:, values > _SAME * values[0]]
+
+
+def _normed(shapes: np.ndarray) -> np.ndarray:
+    """Shapes in rows with unit norm; a shape of zeros stays."""
+    lengths = np.linalg.norm(shapes, axis=-1, keepdims=True)
+    return shapes / np.where(lengths > 0.0, lengths, 1.0)

@@ -1,0 +1,47 @@
+"""Static load tests: known errors, missing values, and the conjugate posterior of a linear flexibility."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, to_si
+from fe_likelihoods.modal.load_test import LoadTest
+
+CHANNELS = Channel("midspan", "displacement", "mm"), Channel("bottom", "strain", "microstrain")
+CASES = ("one truck", "two trucks", "four trucks")
+UNIT = np.array([[0.001, 0.002, 0.004], [2e-5, 4e-5, 8e-5]])  # for a flexibility of one
+VALUES = 1.1 * UNIT + np.array([[1e-5, -1e-5, 0.0], [0.0, 1e-6, np.nan]])
+
+
+def test_the_posterior_of_a_flexibility_is_normal():
+    test = LoadTest(CHANNELS, CASES, VALUES, errors={"midspan": 2e-5, "bottom": 1e-6})
+    model = test.model(lambda theta: theta[0] * UNIT, ("flexibility",))
+    posterior = Posterior(FELikelihood(model, test.measurements), {"flexibility": Uniform(0.5, 2.0)} | test.known)
+    assert posterior.parameter_names == ["flexibility"] and model.time_label == "load case"
+    weights = UNIT / np.array([[2e-5], [1e-6]])
+    weights[1, 2] = 0.0
+    precision = np.square(weights).sum()
+    mean = (weights * np.nan_to_num(VALUES) / np.array([[2e-5], [1e-6]])).sum() / precision
+    x = mean + np.array([0.0, 1.0, -2.0]) / np.sqrt(precision)
+    logs = posterior(x[:, None])
+    np.testing.assert_allclose(logs - logs[0], [0.0, -0.5, -2.0], atol=1e-9)
+
+
+def test_a_table_has_the_units_of_the_channels():
+    lines = LoadTest(CHANNELS, CASES, VALUES).table(1.1 * UNIT).splitlines()
+    assert lines[0].split("  ")[0] == "load case" and "bottom [microstrain] computed" in lines[0]
+    assert lines[1].split() == ["one", "truck", "1.11", "1.1", "22", "22"] and lines[3].split()[-2:] == ["nan", "88"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((CHANNELS, CASES[:2], VALUES), "each of 2 load cases; got 3"),
+        ((CHANNELS, ("a", "a", "b"), VALUES), "different names of load cases"),
+        ((CHANNELS, CASES, to_si(1.0, "mm")), "shape"),
+        ((CHANNELS, CASES, VALUES, {"top": 1.0}), "standard deviations .* of midspan, bottom; got top"),
+        ((CHANNELS, CASES, VALUES, {"midspan": 0.0}), "got midspan: 0.0"),
+    ],
+)
+def test_bad_tests_are_refused(arguments, text):
+    with pytest.raises(ValueError, match=text):
+        LoadTest(*arguments[:3], errors=arguments[3] if len(arguments) > 3 else None)

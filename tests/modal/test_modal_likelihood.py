@@ -1,0 +1,300 @@
+"""Likelihood of modes: its density, derivatives, caches, what is refused, and what is remarked on."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    FunctionModes,
+    HalfNormal,
+    JointLikelihood,
+    LinearStructure,
+    LogNormal,
+    Measurements,
+    ModalData,
+    ModalLikelihood,
+    ModalModel,
+    Posterior,
+    Record,
+    ShearFrame,
+    SimulationCache,
+    SimulationFailed,
+)
+from fe_likelihoods.modal.load_test import LoadTest
+from fe_likelihoods.modal.mode_models import StructureModes
+from fe_likelihoods.models.undamped_modes import undamped_modes
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*parameters can fit")
+FLOORS = {"floor 1": 1, "floor 2": 2, "floor 3": 3, "roof": 4}
+FRAME = ShearFrame(FLOORS, [1.0, 1.1, 0.9, 1.0], [900.0] * 4)
+PRIOR = {f"stiffness_{i}": LogNormal(1.0, 0.3) for i in range(1, 5)}
+
+
+def identified(truth, modes, rng, cv=0.01, error=0.03, n_sets=1, **options):
+    """Synthetic identifications of some modes of the frame, with arbitrary scales and signs."""
+    response = StructureModes(FRAME).simulate(truth)[:, [mode - 1 for mode in modes]]
+    shapes = response[1:].T / np.linalg.norm(response[1:], axis=0)[:, None]
+    shape = (n_sets, len(modes))
+    factors = rng.uniform(0.3, 3.0, shape) * rng.choice([-1.0, 1.0], shape)
+    return ModalData(
+        response[0] * (1.0 + cv * rng.normal(size=shape)),
+        factors[..., None] * (shapes + error * rng.normal(size=(*shape, len(FLOORS)))),
+        tuple(FLOORS),
+        mode_numbers=modes,
+        **options,
+    )
+
+
+def independent(theta, data, cv, sigma):
+    """Log-likelihood of single modes, written out."""
+    storeys = 900.0 * np.asarray(theta)
+    stiffness = np.diag(storeys + [*storeys[1:], 0.0]) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1)
+    frequencies, shapes = undamped_modes(stiffness, np.diag(FRAME.masses))
+    total = 0.0
+    for k in range(data.n_sets):
+        for j, number in enumerate(data.mode_numbers):
+            total += norm.logpdf(frequencies[number - 1] / data.frequencies[k, j], 1.0, cv)
+            mac = (shapes[number - 1] @ data.shapes[k, j]) ** 2 / (shapes[number - 1] @ shapes[number - 1])
+            total += 3 * norm.logpdf(0.0, 0.0, sigma) - 0.5 * (1.0 - mac) / sigma**2
+    return total
+
+
+def test_the_density_of_known_and_unknown_errors(rng):
+    data = identified([1.0, 0.9, 1.1, 1.0], [3, 1], rng, n_sets=2)
+    likelihood = ModalLikelihood(FRAME, data)
+    assert likelihood.parameter_names == (*PRIOR, "frequency_error", "shape_error")
+    theta = np.array([1.02, 0.95, 1.05, 0.98])
+    expected = independent(theta, data, 0.02, 0.04)
+    assert likelihood([*theta, 0.02, 0.04]) == pytest.approx(expected, rel=1e-12)
+    known = ModalLikelihood(FRAME, identified([1, 1, 1, 1], [1], rng, frequency_cv=0.01, shape_error=0.02))
+    assert known.parameter_names == tuple(PRIOR)
+    assert known(theta) == pytest.approx(independent(theta, known.model.data, 0.01, 0.02), rel=1e-12)
+    both = ModalLikelihood(FRAME, known.model.data, "common")
+    assert both([*theta, 0.02]) == pytest.approx(independent(theta, known.model.data, 0.0005**0.5, 0.02), rel=1e-12)
+    prior = PRIOR | {"frequency_error": LogNormal(0.01, 0.5), "shape_error": 0.04}
+    posterior = Posterior(likelihood, prior)
+    assert posterior.log_likelihood([*theta, 0.02]) == pytest.approx(expected, rel=1e-12)
+    assert posterior.likelihood.predict_modes([*theta, 0.02]).numbers.tolist() == [[3, 1]]
+    each = ModalLikelihood(FRAME, data, "mode", "mode")
+    assert each.parameter_names[4:] == ("frequency_error_3", "frequency_error_1", "shape_error_3", "shape_error_1")
+    assert each([*theta, 0.02, 0.02, 0.04, 0.04]) == pytest.approx(expected, rel=1e-12)
+    assert likelihood([*theta, 0.0, 0.04]) == likelihood([*theta, 0.02, -1.0]) == -np.inf
+
+
+def test_every_error_is_served_by_one_simulation(rng, tmp_path):
+    data = identified([1.0, 0.9, 1.1, 1.0], [1, 2], rng)
+    likelihood = ModalLikelihood(FRAME, data, cache=SimulationCache(tmp_path / "modes.db"))
+    points = np.column_stack([np.ones((50, 4)), rng.uniform(0.001, 0.1, (50, 2))])
+    values = likelihood(points)
+    assert likelihood.simulations == 1 and np.isfinite(values).all() and len(set(values)) == 50
+    assert likelihood.simulator.n_numbers == 6
+    again = ModalLikelihood(FRAME, data, "mode", cache=SimulationCache(tmp_path / "modes.db"))
+    assert np.isfinite(again([1, 1, 1, 1, 0.01, 0.02, 0.03])) and again.disk_hits == 1
+
+
+def test_a_covariance_of_the_frequencies(rng):
+    from scipy.stats import multivariate_normal
+
+    data = identified([1.0, 0.9, 1.1, 1.0], [1, 2], rng, shape_error=0.03)
+    covariance = np.array([[4e-4, 3e-4], [3e-4, 1e-3]])
+    correlated = ModalData(
+        data.frequencies, data.shapes, data.sensors, covariance=covariance, shape_error=0.03, mode_numbers=[1, 2]
+    )
+    alone = ModalLikelihood(FRAME, data)
+    theta = np.array([1.02, 0.95, 1.05, 0.98])
+    found = StructureModes(FRAME).simulate(theta)[0, :2]
+    measured, cv = data.frequencies[0], 0.01
+    shapes_only = alone([*theta, cv]) - norm.logpdf(found / measured, 1.0, cv).sum()
+    relative = covariance / np.outer(measured, measured)
+    expected = shapes_only + multivariate_normal.logpdf(found / measured - 1.0, None, relative)
+    assert ModalLikelihood(FRAME, correlated)(theta) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["single", "sets", "pair", "modal model"])
+def test_derivatives_agree_with_differences(kind, rng):
+    frame, theta = FRAME, np.array([1.0, 0.9, 1.1, 1.0])
+    data = identified(theta, [3, 1], rng, n_sets=2 if kind == "sets" else 1)
+    if kind == "pair":
+        shapes = StructureModes(FRAME).simulate(theta)[1:, :2].T + 0.03 * rng.normal(size=(2, 4))
+        data = ModalData([3.0, 3.02], shapes, tuple(FLOORS))
+    if kind == "modal model":
+        frame, theta = ModalModel(list(FLOORS), 2), np.array([1.0, 3.0, *rng.normal(size=8)])
+        data = ModalData([1.0, 3.1], rng.normal(size=(2, 4)), tuple(FLOORS))
+    model = ModalLikelihood(frame, data).model
+    names = [name for name in frame.parameter_names if not name.startswith("damping")]
+    assert list(model.parameter_names) == names and hasattr(model, "jacobian")
+    found = model.jacobian(theta)
+    for p, unit in enumerate(np.eye(len(theta))):
+        difference = (model.simulate(theta + 1e-6 * unit) - model.simulate(theta - 1e-6 * unit)) / 2e-6
+        np.testing.assert_allclose(found[p], difference, atol=1e-6 * max(1.0, abs(difference).max()))
+
+
+def test_a_guide_finds_the_frame_with_few_simulations(rng):
+    from samplers import SMCSampler
+
+    truth = np.array([1.0, 0.8, 1.2, 1.1])
+    posterior = Posterior(
+        ModalLikelihood(FRAME, identified(truth, [1, 2, 3], rng, n_sets=3, frequency_cv=0.01, shape_error=0.03)), PRIOR
+    )
+    sampler = SMCSampler(100, 4, posterior, guide=posterior.guide(starts=4), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    assert (abs(samples.mean(axis=0) - truth) < 4 * samples.std(axis=0)).all()
+    assert posterior.likelihood.simulations < 500
+
+
+def test_modes_and_histories_share_a_stiffness(rng):
+    truth = np.array([1.0, 0.8, 1.2, 1.1])
+    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
+    response = model.simulate([*truth, *[0.02] * 4])
+    histories = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.1 * rng.normal(size=(1, 200))))
+    modes = ModalLikelihood(model, identified(truth, [1, 2], rng))
+    joint = JointLikelihood({"modes": modes, "histories": histories})
+    noise = {"frequency_error": HalfNormal(0.02), "shape_error": HalfNormal(0.05), "sigma_roof": HalfNormal(1.0)}
+    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
+    posterior = Posterior(joint, PRIOR | damping | noise)
+    point = dict(zip(PRIOR, truth, strict=True)) | {f"damping_{i}": 0.02 for i in range(1, 5)}
+    point |= {"frequency_error": 0.01, "shape_error": 0.03, "sigma_roof": 0.1}
+    alone = modes([*truth, 0.01, 0.03]) + histories([*truth, *[0.02] * 4, 0.1])
+    assert posterior.log_likelihood(point) == pytest.approx(alone, rel=1e-12)
+    posterior.guide(starts=4)  # histories and modes have one
+
+
+def test_frequencies_alone_are_paired_by_number():
+    data = ModalData([2.0, 8.0], frequency_cv=0.01, mode_numbers=[1, 3])
+    likelihood = ModalLikelihood(
+        FunctionModes(lambda theta: (theta * [1.0, 2.0, 4.0], np.empty((3, 0))), ("f",), (), 3), data
+    )
+    assert likelihood.parameter_names == ("f",)
+    assert likelihood([2.02]) == pytest.approx(2 * norm.logpdf(0.01, 0.0, 0.01))
+    assert np.isnan(likelihood.predict_modes([[2.0]]).assurance).all()
+
+
+def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(rng):
+    truth = np.ones(4)
+    data = identified(truth, [1, 2, 3], rng, error=0.0, cv=0.0)
+    shapes = data.shapes[0].copy()
+    shapes[2] = shapes[0] + shapes[1] + StructureModes(FRAME).simulate(truth)[1:, 3]
+    strange = ModalData(2 * np.pi * data.frequencies[0], shapes, data.sensors)
+    found = ModalLikelihood(FRAME, data).predict_modes(truth[None], strange)
+    assert "in rad/s" in found.remarks[0] and "measured frequencies are about 6.28 times" in found.remarks[0]
+    assert "No computed mode resembles the measured mode 3" in found.remarks[1] and "select([1, 2])" in found.remarks[1]
+    with pytest.warns(UserWarning, match="With all parameters at 1: The measured .* in rad/s"):
+        ModalLikelihood(FRAME, strange)
+    partly = ModalLikelihood(FRAME, data).predict_modes([truth, -truth])
+    assert len(partly.numbers) == 1 and partly.remarks[0].startswith("1 samples are left out")
+    with pytest.raises(SimulationFailed, match="none of 1 samples"):
+        ModalLikelihood(FRAME, data).predict_modes(-truth)
+    assert len(found.remarks) == 2 and found.remarks[1] in str(found)
+    assert ModalLikelihood(FRAME, data).predict_modes(truth[None]).remarks == ()
+
+    def crossing(theta):
+        return np.diag([1.0, theta[0]]), np.eye(2)
+
+    turned = ModalData([0.16, 0.17], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
+    swapped = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), turned).predict_modes(
+        [[0.9], [1.1], [1.2], [0.8]]
+    )
+    assert "paired with different computed modes: 1 (50%), 2 (50%)" in swapped.remarks[0]
+
+
+def test_an_error_that_the_data_do_not_determine_is_warned_of(rng):
+    few, many = identified(np.ones(4), [1, 2], rng), identified(np.ones(4), [1, 2], rng, n_sets=2)
+    with pytest.warns(UserWarning, match=r"4 parameters can fit 2 independent data .* frequency_error"):
+        ModalLikelihood(FRAME, few)
+    with pytest.warns(UserWarning, match=r"4 parameters can fit 3 independent data .* shape_error"):
+        ModalLikelihood(FRAME, identified(np.ones(4), [1], rng, frequency_cv=0.01))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ModalLikelihood(FRAME, many)
+        ModalLikelihood(FRAME, identified(np.ones(4), [1, 2], rng, frequency_cv=0.002), "common")
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda data: ModalLikelihood(FRAME, "modes"), "expected ModalData"),
+        (lambda data: ModalLikelihood(ShearFrame({"roof": 4}, [1] * 4, [1] * 4), data), "has no sensors floor 1"),
+        (lambda data: ModalLikelihood(StructureModes(FRAME, 2), data), "has 2 modes, and 3 were measured"),
+        (lambda data: StructureModes(FRAME, 5), "has 4 modes; got n_modes=5"),
+        (
+            lambda data: ModalLikelihood(FRAME, data, frequency_error="each"),
+            'frequency_error must be "common" or "mode"',
+        ),
+        (lambda data: ModalLikelihood(FRAME, data, shape_error=0.02), "numbers in the mapping of priors"),
+        (lambda data: ModalLikelihood(FRAME, data, close=2), "close must be a share"),
+        (lambda data: ModalLikelihood(FRAME, data).predict_modes(np.ones((1, 3))), "shape"),
+        (
+            lambda data: ModalLikelihood(
+                LinearStructure(FRAME, Record("m", 0.1, np.ones(5))).parts, data.at(["roof"])
+            ).first(1),
+            "cannot be shortened",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, text, rng):
+    with pytest.raises(ValueError, match=text):
+        make(identified(np.ones(4), [1, 2, 3], rng))
+
+
+def test_a_model_without_modes_is_refused(rng):
+    from fe_likelihoods import Channel, FunctionModel
+
+    model = FunctionModel(lambda theta: np.zeros((1, 3)), ("a",), (Channel("u", "displacement", "m"),), 1.0, 3)
+    with pytest.raises(ValueError, match="whose first channel is a frequency"):
+        ModalLikelihood(model, identified(np.ones(4), [1], rng))
+
+
+@pytest.mark.slow
+def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
+    """One posterior of three data sets, each with its program and cache; another sampler finds the same."""
+    from samplers import SMCSampler, TMCMCSampler
+
+    truth = np.array([1.0, 0.8, 1.2, 1.1])
+    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
+    response = model.simulate([*truth, *[0.02] * 4])
+    histories = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.3 * rng.normal(size=(1, 200))))
+    modes = ModalLikelihood(model, identified(truth, [1, 2], rng, frequency_cv=0.01, shape_error=0.03))
+
+    def pulled(theta):
+        return np.cumsum(1.0 / (900.0 * theta))[:, None]
+
+    top = tuple(Channel(name, "displacement", "m") for name in FLOORS)
+    test = LoadTest(top, ["roof"], pulled(truth) + 1e-4 * rng.normal(size=(4, 1)), errors=dict.fromkeys(FLOORS, 1e-4))
+    static = FELikelihood(test.model(pulled, tuple(PRIOR)), test.measurements)
+    # sensors of different kinds have the same names
+    joint = JointLikelihood({"modes": modes, "static": static, "histories": histories}, separate=["sigma_roof"])
+    known = {name if name != "sigma_roof" else "sigma_roof_static": error for name, error in test.known.items()}
+    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
+    prior = PRIOR | damping | {"sigma_roof_histories": HalfNormal(1.0)} | known
+    found = []
+    for seed, make in enumerate((SMCSampler, TMCMCSampler)):
+        posterior = Posterior(joint, prior)
+        guide = posterior.guide() if seed == 0 else None
+        sampler = make(200, posterior.ndim, posterior, guide=guide, seed=seed, vectorize=True)
+        sampler.run_mcmc(None, 1 if guide else 4)
+        samples = sampler.get_chain(flat=True)
+        assert (abs(samples.mean(axis=0)[:4] - truth) < 4 * samples.std(axis=0)[:4]).all()
+        found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
+    (evidence, mean, deviation), other = found
+    assert other[0] == pytest.approx(evidence, abs=0.5)
+    assert (abs(other[1] - mean) < 0.4 * deviation).all()
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_bits(rng, shared_pool):
+    def matrices(theta):
+        storeys = 900.0 * theta
+        return np.diag(storeys + [*storeys[1:], 0.0]) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1), np.eye(4)
+
+    data = identified(np.ones(4), [1, 2], rng, frequency_cv=0.01, shape_error=0.03)
+    model = FunctionModes(matrices, tuple(PRIOR), {name: floor - 1 for name, floor in FLOORS.items()}, 4)
+    points = rng.uniform(0.8, 1.2, (6, 4))
+    with shared_pool(2) as pool:
+        np.testing.assert_array_equal(
+            ModalLikelihood(model, data, pool=pool)(points), ModalLikelihood(model, data)(points)
+        )

@@ -1,0 +1,80 @@
+"""Modal data from tables, MATLAB files and results of pyOMA2."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from fe_likelihoods import read_modal_data
+
+SHAPES = np.array([[1.0, 2.0, 3.0], [-2.0, -1.0, 2.0]])
+UNIT = SHAPES / np.linalg.norm(SHAPES, axis=1, keepdims=True)
+
+
+def written(folder, *lines):
+    path = folder / "modes.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_table_has_a_line_for_each_mode(tmp_path):
+    path = written(
+        tmp_path, "mode,frequency_Hz,damping_%,floor 1,floor 2,floor 3", "2,3.0,1.5,-2,-1,2", "1,1.0,1.0,1,2,3"
+    )
+    data = read_modal_data(path, frequency_cv=0.01)
+    assert data.mode_numbers == (1, 2) and data.frequencies.tolist() == [[1.0, 3.0]] and data.frequency_cv[1] == 0.01
+    np.testing.assert_allclose(data.damping, [[0.010, 0.015]], rtol=1e-12)
+    np.testing.assert_allclose(data.shapes[0], UNIT, rtol=1e-12)
+    assert read_modal_data(path, ["floor 3", "floor 1"]).sensors == ("floor 3", "floor 1")
+
+
+def test_units_are_stated_or_given(tmp_path):
+    lines = ("6.283185307179586,1,2", "12.566370614359172,1,-1")
+    for head, options in (("frequency [rad/s],a,b", {}), ("frequency,a,b", {"unit": "rad/s"})):
+        data = read_modal_data(written(tmp_path, head, *lines), **options)
+        np.testing.assert_allclose(data.frequencies, [[1.0, 2.0]], rtol=1e-15)
+    for head, options, text in (
+        ("frequency,a,b", {}, "unit='Hz' or unit='rad/s'"),
+        ("frequency_Hz,a,b", {"unit": "rad/s"}, "states Hz"),
+        ("omega,a,b", {}, "expected a column of frequencies"),
+        ("frequency_Hz,a,b", {"sensors": ["c"]}, "the sensors are a, b"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            read_modal_data(written(tmp_path, head, *lines), **options)
+
+
+def test_a_table_of_several_identifications(tmp_path):
+    head = "set,mode,frequency_Hz,a,b"
+    data = read_modal_data(written(tmp_path, head, "1,1,1.0,1,2", "1,2,3.0,1,-1", "2,2,3.1,1,-1", "2,1,1.1,-1,-2"))
+    assert data.n_sets == 2 and data.frequencies.tolist() == [[1.0, 3.0], [1.1, 3.1]]
+    missed = read_modal_data(written(tmp_path, head, "1,1,1.0,1,2", "1,2,3.0,1,-1", "2,2,3.1,1,-1"))
+    assert np.isnan(missed.frequencies[1, 0]) and missed.has_shape.tolist() == [[True, True], [False, True]]
+    with pytest.raises(ValueError, match="a column 'set'"):
+        read_modal_data(written(tmp_path, "mode,frequency_Hz,a,b", "1,1.0,1,2", "1,1.1,1,2"))
+
+
+def test_a_matlab_file(tmp_path):
+    path = tmp_path / "modes.mat"
+    savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES.T, "xi": [0.01, 0.02]})
+    names = {"frequencies": "f", "shapes": "Phi", "damping": "xi"}
+    data = read_modal_data(path, ["a", "b", "c"], unit="Hz", variables=names)
+    np.testing.assert_allclose(data.shapes[0], UNIT, rtol=1e-12)
+    assert data.damping.tolist() == [[0.01, 0.02]] and data.frequencies.tolist() == [[1.0, 3.0]]
+    for variables in ({}, {"frequencies": "fn"}, {"frequencies": "f", "modes": "Phi"}):
+        with pytest.raises(ValueError, match="the file has f, Phi, xi"):
+            read_modal_data(path, unit="Hz", variables=variables)
+
+
+def test_a_result_of_an_identification():
+    turned = SHAPES.T * np.exp([0.4j, -1.0j])
+    result = SimpleNamespace(Fn=np.array([1.0, 3.0]), Phi=turned, Xi=[0.01, 0.02], Fn_std=np.array([0.01, 0.06]))
+    data = read_modal_data(result, ["a", "b", "c"])
+    np.testing.assert_allclose(np.abs((data.shapes[0] * UNIT).sum(axis=1)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
+    with pytest.warns(UserWarning, match=r"modes \[1\] scatter"):
+        read_modal_data(SimpleNamespace(Fn=[1.0], Phi=np.exp(1j * np.array([[0.0], [1.0]]))), ["a", "b"])
+    with pytest.raises(ValueError, match="choose them first"):
+        read_modal_data(SimpleNamespace(Fn=None, Phi=None))
+    with pytest.raises(ValueError, match="expected a path"):
+        read_modal_data(7)
