@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..likelihood.evaluation_queue import EvaluationQueue
 from ..noise.protocol import noise_title
 from ..noise.statistics import needs_response, sums_of_squares
 from ..signals.comparison import Comparison, measured_values
@@ -231,11 +232,15 @@ class ResponseTarget:
             result[inside] += log_density(coords[inside])
         return result
 
-    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
+    def at_median_noise(self, coords: np.ndarray) -> np.ndarray:
+        """Parameters (n, ndim) at structural coordinates (n, n_structural)."""
         full = np.zeros((len(coords), self.ndim))
         full[:, : self.n_structural] = coords
-        return self._prior.from_normal(full)[:, : self.n_structural]
+        return self._prior.from_normal(full)
+
+    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
+        return self.at_median_noise(coords)[:, : self.n_structural]
 
     def _prior_of_noise(self) -> Any:
         """Prior of the noise parameters; None without any, or if they have a joint distribution with structural ones.
@@ -404,9 +409,9 @@ class ResponseTarget:
         at_samples = [[self.comparison.at_samples(each) for each in rows] for rows in by_coords]
         return np.where(self.comparison.missing, 0.0, -np.array(at_samples))
 
-    def running_requests(self) -> Any:
-        """Requests for simulations that go on while others are waited for; `run` finds their responses in the cache."""
-        return self._likelihood.simulator.running_requests()
+    def evaluation_queue(self) -> EvaluationQueue:
+        """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""
+        return EvaluationQueue(self.posterior.likelihood, self._prior, responses=True)
 
     def _residuals(self, responses: np.ndarray) -> np.ndarray:
         """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""
