@@ -65,6 +65,9 @@ class FailureLog:
         self._names = tuple(parameter_names)
         self._latest: OrderedDict[bytes, str] = OrderedDict()  # reasons by structural parameters
 
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_latest": OrderedDict()}
+
     def reason(self, theta: np.ndarray) -> str:
         """Reason of the failure at the structural parameters `theta`; empty if none of the last failures was there."""
         return self._latest.get((theta + 0.0).tobytes(), "")

@@ -221,7 +221,7 @@ class Simulator:
             left = np.flatnonzero(~requested.done)
             statistics = requested.statistics
             if len(left):
-                statistics[left] = [new.statistics for new in self._run([keys[row] for row in left], False)]
+                statistics[left] = [new.statistics for new in self._new([keys[row] for row in left], False)]
         return statistics if len(keys) == len(which) else statistics[which]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
@@ -234,7 +234,7 @@ class Simulator:
         keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
         requested = self._look_up(keys, which, True)
         left = np.flatnonzero(~requested.done)
-        for row, new in zip(left, self._run([keys[row] for row in left], True), strict=True):
+        for row, new in zip(left, self._new([keys[row] for row in left], True), strict=True):
             requested.responses[row], requested.reasons[row] = new.response, new.reason
         if len(keys) == len(which):
             return SimulationBatch(requested.responses, requested.reasons)
@@ -288,7 +288,7 @@ class Simulator:
 
     def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> Requested:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        requested = self._known.look_up(keys, full, self._verifying)
+        requested = self._known.look_up(keys, full, self._run)
         counts = np.bincount(which, minlength=len(keys))
         self.cache_hits += int(counts[requested.done & requested.finite].sum())
         self.disk_hits += int(counts[requested.on_disk].sum())
@@ -306,10 +306,10 @@ class Simulator:
         self.failures.check(len(self._running.simulations))
 
     @interrupts_end_the_run()
-    def _run(self, keys: list[bytes], full: bool) -> list[Simulated]:
+    def _new(self, keys: list[bytes], full: bool) -> list[Simulated]:
         """Results of new simulations of distinct keys: one by one as they arrive from the pool, or in parts."""
         if self.streams and keys:
-            return self._run_in_pool(keys, full)
+            return self._new_in_pool(keys, full)
         results: list[Simulated] = []
         while len(results) < len(keys):
             self._check_before()
@@ -338,7 +338,7 @@ class Simulator:
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
-    def _run_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:
+    def _new_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:
         arrived: SimpleQueue = SimpleQueue()
         simulations = self._send(keys, full, arrived)
         left = dict.fromkeys(simulations)
@@ -486,7 +486,7 @@ class Simulator:
             self.response_memory.store(self.model.fingerprint, keys, outcomes)
         if self.cache is not None:
             response = None if batch is None else batch.response
-            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, self._verifying)
+            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, self._run)
             self.cache.store_remark(self.model)
         if not full:
             return [Simulated(row, reason, None) for row, reason in zip(misfit, reasons, strict=True)]
@@ -496,7 +496,7 @@ class Simulator:
     # the model ----------------------------------------------------------------------------------------------------
 
     @property
-    def _verifying(self) -> VerifyingRun:
+    def _run(self) -> VerifyingRun:
         tolerance = None if self.cache is None else self.cache.tolerance
         return VerifyingRun(self.model, self.pool, self.measured, self.statistic, self.n_numbers, tolerance)
 
@@ -504,7 +504,7 @@ class Simulator:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
         try:
-            self._checked.before(self._verifying, lambda: self._known.earlier_points(self._verifying))
+            self._checked.before(self._run, lambda: self._known.earlier_points(self._run))
         except ChangedModel:
             self._drop_unchecked()
             raise
@@ -515,7 +515,7 @@ class Simulator:
             seconds = time.perf_counter() - self._running.since
         last = not self._running.simulations
         try:
-            self._checked.after(self._verifying, thetas, misfit, reasons, seconds, last)
+            self._checked.after(self._run, thetas, misfit, reasons, seconds, last)
         except ChangedModel:
             self._drop_unchecked()
             raise
