@@ -45,7 +45,8 @@ class _Part:
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
         self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
-        self.running: dict[Simulation, list[_Point]] = {}
+        self.running: dict[bytes, Simulation] = {}
+        self.points: dict[Simulation, list[_Point]] = {}
         self.unstarted: list[_Point] = []  # without a pool that takes single items
 
     def thetas(self, points: Sequence[_Point]) -> np.ndarray:
@@ -130,7 +131,7 @@ class EvaluationQueue:
             if self._error is not None:
                 raise self._error
             for part in self._parts:
-                if part.running:
+                if part.points:
                     part.simulator.check_failures()
             if not self._evaluate_some():
                 self._receive(wait=True)
@@ -146,7 +147,7 @@ class EvaluationQueue:
         self._require_open()
         for part in self._parts:
             # not all of them may have announced their end
-            self._taken += [each for each in part.running if each.future.done()]
+            self._taken += [each for each in part.points if each.future.done()]
         self._receive(wait=False)
         return self._collected + self._finished
 
@@ -156,7 +157,7 @@ class EvaluationQueue:
             return
         self._closed = True
         for part in self._parts:
-            left = part.simulator.leave(list(part.running), self._arrived, running=False)
+            left = part.simulator.leave(part.points, running=False)
             if left:
                 threading.Thread(target=_cache_rest, args=(part.simulator, left), daemon=True).start()
 
@@ -170,12 +171,17 @@ class EvaluationQueue:
         if not part.simulator.streams:
             part.unstarted += points
         elif points:
-            simulations = part.simulator.request(part.thetas(points), self._responses, self._arrived)
-            for point, simulation in zip(points, simulations, strict=True):
+            thetas = part.thetas(points) + 0.0
+            keys = [theta.tobytes() for theta in thetas]
+            new = [place for place, key in enumerate(keys) if key not in part.running]
+            found = dict(zip(new, part.simulator.request(thetas[new], self._responses, self._arrived), strict=True))
+            for place, point in enumerate(points):
+                simulation = found[place] if place in found else part.running[keys[place]]
                 if simulation.future is None:
                     self._pass_on(stage, point, simulation.result.statistics)
                 else:
-                    part.running.setdefault(simulation, []).append(point)
+                    part.running[keys[place]] = simulation
+                    part.points.setdefault(simulation, []).append(point)
 
     def _evaluate_some(self) -> bool:
         """Evaluate some points of a part that has no pool for single items; returns whether there were any."""
@@ -198,11 +204,12 @@ class EvaluationQueue:
         """Take simulations that have ended; with `wait`, at least one."""
         self._taken += take_all(self._arrived, wait=wait and not self._taken)
         for stage, part in enumerate(self._parts):
-            ended = [each for each in dict.fromkeys(self._taken) if each in part.running]
+            ended = [each for each in dict.fromkeys(self._taken) if each in part.points]
             with suppress(Exception):  # which is the error of each simulation
                 part.simulator.receive(ended)
             for simulation in ended:
-                points = part.running.pop(simulation)
+                points = part.points.pop(simulation)
+                del part.running[simulation.key]
                 try:
                     if simulation.error is not None:
                         raise simulation.error

@@ -62,18 +62,17 @@ class Simulated(NamedTuple):
 class Simulation:
     """A simulation that was requested of a `Simulator`, by the key of its parameters (see `distinct_keys`).
 
-    When it has ended, it has a `result`, or an `error` for which the model is not to blame. `full` ones return their
-    response. While it runs, `users` are the queues of those who wait for it; it is then `received`, or cancelled.
+    A known one has a `result` at once. One that was sent to a pool has a `future`; it is `received` when it has ended
+    or was cancelled, and then has a `result`, or an `error` for which the model is not to blame. `full` ones return
+    their response.
     """
 
-    __slots__ = ("error", "full", "future", "key", "received", "result", "users")
+    __slots__ = ("error", "full", "future", "key", "received", "result")
 
-    def __init__(self, key: bytes, full: bool, result: Simulated | None = None) -> None:
-        self.key, self.full, self.result = key, full, result
+    def __init__(self, key: bytes, full: bool, future: Future | None = None, result: Simulated | None = None) -> None:
+        self.key, self.full, self.future, self.result = key, full, future, result
         self.error: BaseException | None = None
-        self.future: Future | None = None
-        self.users: set[SimpleQueue] = set()
-        self.received = result is not None
+        self.received = False
 
 
 def take_all(arrived: SimpleQueue, wait: bool) -> list[Simulation]:
@@ -91,7 +90,7 @@ class _Running:
 
     def __init__(self) -> None:
         self.owner, self.lock = os.getpid(), threading.RLock()
-        self.simulations: dict[tuple[bytes, bool], Simulation] = {}
+        self.simulations: set[Simulation] = set()
         self.functions: dict[bool, tuple[Model, Callable]] = {}  # that are sent, so that each is pickled once
         self.since = self.counted_until = 0.0  # wall time of the first of them, and of the last arrival [s]
 
@@ -241,7 +240,7 @@ class Simulator:
         return SimulationBatch(requested.responses[which], [requested.reasons[row] for row in which])
 
     def request(self, thetas: np.ndarray, full: bool, arrived: SimpleQueue) -> list[Simulation]:
-        """Simulations at n structural parameters, sent to the pool unless they are known or run already.
+        """Simulations at n structural parameters, sent to the pool unless they are known; duplicates are one object.
 
         Those that have a `future` will come through the queue `arrived` when they have ended: pass them to `receive`,
         or to `leave` if they are not needed any more. Raises the errors of `statistics`.
@@ -251,9 +250,8 @@ class Simulator:
         found: dict[int, Simulation] = {}
         for row in np.flatnonzero(requested.done).tolist():
             response = requested.responses[row] if full else None
-            found[row] = Simulation(
-                keys[row], full, Simulated(requested.statistics[row], requested.reasons[row], response)
-            )
+            result = Simulated(requested.statistics[row], requested.reasons[row], response)
+            found[row] = Simulation(keys[row], full, result=result)
         left = np.flatnonzero(~requested.done).tolist()
         found |= dict(zip(left, self._send([keys[row] for row in left], full, arrived), strict=True))
         return [found[row] for row in which]
@@ -353,12 +351,12 @@ class Simulator:
                 if left:
                     self.check_failures()
         except BaseException:
-            self.leave(left, arrived, running=True)
+            self.leave(left, running=True)
             raise
         return [simulation.result for simulation in simulations]
 
     def _send(self, keys: list[bytes], full: bool, arrived: SimpleQueue) -> list[Simulation]:
-        """Submit simulations of n distinct keys to the pool, unless they run already."""
+        """Submit simulations of n distinct keys to the pool."""
         if not keys:
             return []
         self._check_before()
@@ -367,18 +365,13 @@ class Simulator:
             if not running.simulations:
                 running.functions.clear()
                 running.since = running.counted_until = time.perf_counter()
-            new = {key: Simulation(key, full) for key in keys if (key, full) not in running.simulations}
-            if new:
-                futures = self.pool.submit_all(self._sent_function(full), list(thetas_of(list(new), self.n_structural)))
-                for simulation, future in zip(new.values(), futures, strict=True):
-                    simulation.future = future
-                    running.simulations[simulation.key, full] = simulation
-            wanted = [running.simulations[key, full] for key in keys]
-            for simulation in wanted:  # with the lock: another thread that leaves must not cancel what is wanted here
-                if arrived not in simulation.users:
-                    simulation.users.add(arrived)
-                    simulation.future.add_done_callback(partial(_arrive, arrived, simulation))
-        return wanted
+            thetas = list(thetas_of(keys, self.n_structural))
+            futures = self.pool.submit_all(self._sent_function(full), thetas)
+            sent = [Simulation(key, full, future) for key, future in zip(keys, futures, strict=True)]
+            running.simulations.update(sent)
+        for simulation in sent:
+            simulation.future.add_done_callback(partial(_arrive, arrived, simulation))
+        return sent
 
     def receive(self, ended: Iterable[Simulation]) -> None:
         """Count and cache simulations that have ended in the pool, and record failures; sets `result` or `error`.
@@ -393,7 +386,7 @@ class Simulator:
                     if simulation.received or simulation.full is not full:
                         continue
                     simulation.received = True
-                    running.simulations.pop((simulation.key, full), None)
+                    running.simulations.discard(simulation)
                     try:
                         outcome, opened = unpack(simulation.future.result(), self.pool)
                         self._checked.complete(opened)
@@ -406,23 +399,20 @@ class Simulator:
                 if some:
                     self._record_outcomes(some, outcomes)
 
-    def leave(self, simulations: Iterable[Simulation], arrived: SimpleQueue, running: bool) -> list[Simulation]:
-        """Stop waiting: ended simulations are cached, others are cancelled if nobody else waits for them.
+    def leave(self, simulations: Iterable[Simulation], running: bool) -> list[Simulation]:
+        """Stop waiting: ended simulations are cached, others are cancelled; with `running`, also those that have begun.
 
-        With `running`, started simulations are cancelled too. Returns the simulations that go on.
+        Returns the simulations that go on.
         """
         in_pool = self._running
         with in_pool.lock:
             left = [each for each in simulations if not each.received]
+            if unended := [each.future for each in left if not each.future.done()]:
+                self.pool.give_up(unended, running)
             for each in left:
-                each.users.discard(arrived)
-            unused = [each for each in left if not each.users and not each.future.done()]
-            if unused:
-                self.pool.give_up([each.future for each in unused], running)
-            for each in unused:
                 if each.future.cancelled():
                     each.received = True
-                    in_pool.simulations.pop((each.key, each.full), None)
+                    in_pool.simulations.discard(each)
             self.receive([each for each in left if each.future.done()])
             return [each for each in left if not each.received]
 

@@ -2,8 +2,6 @@
 
 import pickle
 import signal
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
 import numpy as np
@@ -412,36 +410,6 @@ def test_what_is_requested_comes_through_a_queue_and_is_known_after_it(thetas, p
     assert arrived.empty() and simulator.simulations == simulator.cache.info().simulations == len(thetas)
     simulator.simulate(thetas)
     assert simulator.simulations == len(thetas)
-
-
-def test_a_thread_that_leaves_does_not_cancel_what_another_has_just_requested(thetas):
-    """Its simulation would have no result, and the other thread would wait for ever."""
-    mine, other, gate = SimpleQueue(), SimpleQueue(), threading.Event()
-
-    class Leaving:
-        """The lock, which is given to the thread that leaves as soon as the other one releases it."""
-
-        def __init__(self, lock):
-            self.lock = lock
-
-        def __enter__(self):
-            return self.lock.__enter__()
-
-        def __exit__(self, *exception):
-            self.lock.__exit__(*exception)
-            simulator._running.lock = self.lock
-            simulator.leave(started, mine, running=False)
-
-    with ThreadPoolExecutor(1) as pool:
-        simulator = likelihood_of(Line(), pool=pool).simulator
-        pool.submit(gate.wait)
-        started = simulator.request(thetas[:1], False, mine)
-        simulator._running.lock = Leaving(simulator._running.lock)
-        (running,) = simulator.request(thetas[:1], False, other)
-        gate.set()
-        assert other.get(timeout=60.0) is running
-        simulator.receive([running])
-    assert running.result is not None
 
 
 def test_one_point_has_the_value_of_a_batch(thetas):
