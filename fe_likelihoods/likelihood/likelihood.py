@@ -299,32 +299,24 @@ class FELikelihood(SumOfParts):
         return self.simulator.simulate(thetas)
 
     def of_statistics(self, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
-        """Log-likelihood of points with possible noise parameters, from the statistics of their simulations.
+        """Log-likelihood (n,) of points (n, ndim) from the statistics (n, n_numbers) of their simulations.
 
-        Parameters
-        ----------
-        rows : (n, ndim) float
-            Structural parameters, then noise parameters.
-        misfit : (n, n_numbers) float
-            What `Simulator.statistics` returns for them.
-
-        Returns
-        -------
-        (n,) float
-            -inf where the simulation failed.
+        -inf where the simulation failed, or where the noise parameters are impossible.
         """
         values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self.simulator.n_structural :])
-        usable = values < np.inf  # neither NaN nor infinite
-        simulated = np.isfinite(misfit).all(axis=1)
-        for row in np.flatnonzero(simulated & ~usable):
-            self.simulator.failures.add(
-                rows[row, : self.simulator.n_structural], f"the log-likelihood of the noise is {values[row]}"
-            )
+        simulated, usable = np.isfinite(misfit).all(axis=1), values < np.inf  # neither NaN nor infinite
+        if not usable.all():
+            for row in np.flatnonzero(simulated & ~usable & self.possible(rows)):
+                theta, reason = (
+                    rows[row, : self.simulator.n_structural],
+                    f"the log-likelihood of the noise is {values[row]}",
+                )
+                self.simulator.failures.add(theta, reason)
         return np.where(simulated & usable, values, -np.inf)
 
     def parts(self) -> list[tuple["FELikelihood", list[int]]]:
         """This likelihood with the indices of its parameters."""
-        return [(self, list(range(self.ndim)))]
+        return [(self, list(range(len(self.parameter_names))))]
 
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""

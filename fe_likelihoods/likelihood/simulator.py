@@ -204,10 +204,11 @@ class Simulator:
         """Sums of squared residuals (n, n_channels) [SI unit squared], without time shifts; NaN for failures."""
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
-    def statistics(self, thetas: np.ndarray) -> np.ndarray:
+    def statistics(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None) -> np.ndarray:
         """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural); NaN if failed.
 
-        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. Raises
+        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. Where `possible`, called
+        unless all rows are in memory, is False (n,), nothing is simulated and rows may be NaN. Raises
         `TooManyFailures`, `ChangedModel` or `StaleCache`; simulations that have ended are cached, except after the
         model has changed.
         """
@@ -215,6 +216,11 @@ class Simulator:
         statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
         if all(known):
             self.cache_hits += len(which)
+        elif possible is not None and not (wanted := possible()).all():
+            statistics = np.full((len(which), self.n_numbers), np.nan)
+            if wanted.any():
+                statistics[wanted] = self.statistics(thetas[wanted])
+            return statistics
         else:
             requested = self._look_up(keys, which, False)
             left = np.flatnonzero(~requested.done)
@@ -303,7 +309,6 @@ class Simulator:
         """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""
         self.failures.check(len(self._running.simulations))
 
-    @interrupts_end_the_run()
     def _new(self, keys: list[bytes], full: bool) -> list[Simulated]:
         """Results of new simulations of distinct keys: one by one as they arrive from the pool, or in parts."""
         if self.streams and keys:
@@ -336,6 +341,7 @@ class Simulator:
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         return min(_ROUNDS_PER_CHUNK * workers, largest), largest
 
+    @interrupts_end_the_run()
     def _new_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:
         arrived: SimpleQueue = SimpleQueue()
         simulations = self._send(keys, full, arrived)

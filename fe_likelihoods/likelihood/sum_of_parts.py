@@ -1,6 +1,7 @@
 """A log-likelihood as a sum over its parts, each of which has one model and one data set."""
 
 from abc import abstractmethod
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,12 +64,12 @@ class SumOfParts:
         """
         points = as_points(x, self.parameter_names)
         rows = points if points.ndim == 2 else points[None]
-        total = np.where(self.possible(rows), 0.0, -np.inf)
+        total = np.zeros(len(rows))
         for part, columns in self.parts():
-            left = np.flatnonzero(total > -np.inf)
+            left = (total > -np.inf).nonzero()[0]
             if len(left):
-                own = rows[left[:, None], columns]
-                statistics = part.simulator.statistics(own[:, : part.simulator.n_structural])
+                own, possible = rows[left[:, None], columns], partial(self.possible, rows[left])
+                statistics = part.simulator.statistics(own[:, : part.simulator.n_structural], possible)
                 total[left] += part.of_statistics(own, statistics)
         return total if points.ndim == 2 else float(total[0])
 
