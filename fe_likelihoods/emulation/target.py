@@ -17,14 +17,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..likelihood.evaluation_queue import EvaluationQueue
-from ..noise.protocol import noise_title
-from ..noise.statistics import needs_response, sums_of_squares
-from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.model import derivatives_batch, most_responses
 from .archive import Archive
-from .quadratic import check_quadratic
-from .stacked import TIME_SHIFTS, stack
+from .data_sets import DataSets
 
 __all__ = ["NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
 
@@ -52,19 +48,6 @@ _DAMPED = 0.0, 1.0, 10.0, 100.0
 def _finite(coords: np.ndarray) -> np.ndarray:
     """Coordinates of parameters that were rounded to a bound of their prior are finite: `_AT_BOUND`."""
     return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
-
-
-class _Likelihood(Protocol):
-    """Part of `FELikelihood` that is used here."""
-
-    model: Any
-    measurements: Any
-    measured: Any
-    n_samples: Any
-    noise: Any
-    simulator: Any
-
-    def simulate(self, thetas: np.ndarray) -> Any: ...
 
 
 class _Posterior(Protocol):
@@ -103,49 +86,24 @@ def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence
     return compute()
 
 
-class _WithoutMissing(NamedTuple):
-    """A statistic of residuals, which are zero where a sample is missing, for a noise that expects NaN there."""
-
-    statistic: Callable[[np.ndarray], np.ndarray]
-    missing: np.ndarray
-
-    def __call__(self, residuals: np.ndarray) -> np.ndarray:
-        return self.statistic(np.where(self.missing, np.nan, residuals))
-
-
 class ResponseTarget:
     """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations.
 
-    ValueError if the statistics of the noise are not quadratic in the residuals, its level depends on the response, or
-    it has time shifts. `n_samples` is an int, or `SampleCounts` where some are missing; `differentiable` says whether
-    the model has a method ``jacobian``; `unchecked` is not empty until its derivatives have been compared with a
-    difference, and is shared with `shortened` targets; `scales` (n_channels,) are the standard deviations of the
-    measured channels [SI], 1 for a constant channel.
+    ValueError as for `DataSets`, whose `model`, `measured`, `statistic` and `with_gaps` these are. `differentiable`
+    says whether the model has a method ``jacobian``; `unchecked` is not empty until its derivatives have been compared
+    with a difference, and is shared with `shortened` targets; `scales` (n_channels,) are the standard deviations of
+    the measured channels [SI], 1 for a constant channel.
     """
 
     def __init__(self, posterior: _Posterior) -> None:
         self.posterior = posterior
-        self._likelihood: _Likelihood = stack(posterior.likelihood)
         self._prior = posterior.prior
-        self.model, self.noise = self._likelihood.model, self._likelihood.noise
+        self._data = DataSets(posterior.likelihood)
+        self.model, self.measured, self.statistic = self._data.model, self._data.measured, self._data.statistic
+        self.with_gaps = self._data.with_gaps
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
-        self.comparison = self._likelihood.measured
-        if isinstance(self.comparison, Comparison) and self.comparison.lags is not None:
-            raise ValueError(TIME_SHIFTS)
-        self.measured = measured_values(self.comparison)
         self.n_steps = self.measured.shape[1]
-        self.n_samples = self._likelihood.n_samples
-        self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
-        if needs_response(self.statistic):
-            raise ValueError(
-                f"the level of {noise_title(self.noise)} depends on the response, so the posterior cannot be "
-                'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", with bands of '
-                "frequency or without, or AutoregressiveNoise"
-            )
-        if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
-            self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
-        check_quadratic(self.statistic, self.measured)
         low, self._median, high = self._prior.from_normal(np.array([[-2.0], [0.0], [2.0]]) * np.ones(self.ndim))
         logarithmic = np.array(self._prior.logarithmic)
         factors = (low > 0.0) & (high < _LARGEST_FACTOR * low)  # the prior keeps them away from zero
@@ -182,19 +140,21 @@ class ResponseTarget:
         if not hasattr(self.model, "first"):
             return []
         # differences, because a residual displacement is not motion
-        steps, measurements = np.diff(self.measured, axis=1), self._likelihood.measurements
-        if isinstance(self.comparison, Comparison):
+        likelihood = self.posterior.likelihood
+        steps, measurements = np.diff(self.measured, axis=1), likelihood.measurements
+        if self.with_gaps:
             if not measurements.simultaneous:
                 return []
-            steps[self.comparison.missing[:, 1:] | self.comparison.missing[:, :-1]] = 0.0
+            missing = likelihood.measured.missing
+            steps[missing[:, 1:] | missing[:, :-1]] = 0.0
             if not steps.any():
                 return []
         parts = []
         for seconds in growing_durations(steps, measurements.dt, shares)[:-1]:
             try:
-                parts.append(self._likelihood.first(measurements.start + seconds))
+                parts.append(likelihood.first(measurements.start + seconds))
             except ValueError:
-                if not isinstance(self.comparison, Comparison):
+                if not self.with_gaps:
                     raise  # else a channel has no sample in this part
         targets = [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
         for target in targets:
@@ -363,20 +323,18 @@ class ResponseTarget:
         computed = []
 
         def compute() -> list[np.ndarray]:
-            batch = self._likelihood.simulate(thetas)
+            residuals, reasons = self._data.simulate(thetas)
             computed.append(True)
             with np.errstate(over="ignore"):
-                residuals = self._residuals(batch.response).astype(np.float32)
-            reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
-            return [residuals, self._likelihood.simulator.statistics(thetas), reasons]
+                residuals = residuals.astype(np.float32)
+            reasons = np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)
+            return [residuals, self._data.statistics(thetas), reasons]
 
-        text = f"residuals of {self.model.fingerprint}".encode()  # files of earlier versions have responses
-        if isinstance(self.comparison, Comparison):
-            text += self._likelihood.measurements.fingerprint.encode()
+        text = f"residuals of {self._data.identity}".encode()  # files of earlier versions have responses
         key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
         residuals, statistics, reasons = remember(key, compute)
         if not computed:
-            self._likelihood.simulator.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
+            self._data.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
         failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
         numbers = np.full(len(failed), -1)
         numbers[~failed] = self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
@@ -397,38 +355,29 @@ class ResponseTarget:
         thetas = self.structural_parameters(coords)
 
         def compute() -> list[np.ndarray]:
-            return [derivatives_batch(self.model, thetas, self._likelihood.simulator.pool).astype(np.float32)]
+            return [derivatives_batch(self.model, thetas, self.posterior.likelihood.simulator.pool).astype(np.float32)]
 
         text = f"derivatives of {self.model.fingerprint}".encode()
         found = remember(hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest(), compute)[0]
         moved = coords[:, None] + _MAP_STEP * np.stack([np.eye(d), -np.eye(d)])[:, None]
         ahead, behind = self.structural_parameters(moved.reshape(-1, d)).reshape(2, n, d, d)
         by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))
-        if not isinstance(self.comparison, Comparison):
+        if not self.with_gaps:
             return -by_coords
-        at_samples = [[self.comparison.at_samples(each) for each in rows] for rows in by_coords]
-        return np.where(self.comparison.missing, 0.0, -np.array(at_samples))
+        comparison = self.posterior.likelihood.measured
+        at_samples = [[comparison.at_samples(each) for each in rows] for rows in by_coords]
+        return np.where(comparison.missing, 0.0, -np.array(at_samples))
 
     def evaluation_queue(self) -> EvaluationQueue:
         """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""
         return EvaluationQueue(self.posterior.likelihood, self._prior, responses=True)
-
-    def _residuals(self, responses: np.ndarray) -> np.ndarray:
-        """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""
-        if not isinstance(self.comparison, Comparison):
-            return self.measured - responses
-        residuals = np.full((len(responses), *self.measured.shape), np.nan)
-        for row, response in zip(residuals, responses, strict=True):
-            if np.isfinite(response).all():
-                row[:] = -self.comparison.known_residuals(response)
-        return residuals
 
     # ------------------------------------------------------------------ the noise
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
         parameters = self._noise_parameters(coords) if self.n_noise else coords
-        return self.noise.log_likelihood(statistics, self.n_samples, parameters)
+        return self._data.log_likelihood(statistics, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""
