@@ -317,8 +317,7 @@ class Simulator:
         while len(results) < len(keys):
             self._check_before()
             left = keys[len(results) :]
-            smallest, largest = self._chunk_limits(len(left), full)
-            some = left[: max(smallest, min(largest, self.chunk_size))]
+            some = left[: self._chunk(len(left), full)]
             thetas, start = thetas_of(some, self.n_structural), time.perf_counter()
             with observed(self._checked.label, self.pool, self._checked.complete):
                 if self._returns_responses(full):
@@ -331,15 +330,14 @@ class Simulator:
             self.chunk_size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / seconds))
         return results
 
-    def _chunk_limits(self, n: int, full: bool) -> tuple[int, int]:
-        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes or reports."""
+    def _chunk(self, n: int, full: bool) -> int:
+        """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return n, n
-        largest = most_responses(self.model) if self._returns_responses(full) else n
-        if self.pool is None and not has_batch_method(self.model):
-            return 1, largest
+            return n
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
-        return min(_ROUNDS_PER_CHUNK * workers, largest), largest
+        one_by_one = self.pool is None and not has_batch_method(self.model)
+        smallest = 1 if one_by_one else _ROUNDS_PER_CHUNK * workers  # so that all workers are busy
+        return min(max(smallest, self.chunk_size), most_responses(self.model) if self._returns_responses(full) else n)
 
     @interrupts_end_the_run()
     def _new_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:

@@ -48,13 +48,15 @@ class SumOfParts:
         """Number of parameters."""
         return len(self.parameter_names)
 
-    def log_likelihood(self, x: Any) -> np.ndarray | float:
+    def log_likelihood(self, x: Any, inside: Any = True) -> np.ndarray | float:
         """Log-likelihood of structural parameters followed by noise parameters.
 
         Parameters
         ----------
         x : array_like (ndim,) or (n, ndim), or mapping
             A mapping has a value, or n values, for every parameter name.
+        inside : bool, or (n,) bool
+            Where the prior density is positive; nothing is simulated elsewhere, and the log-likelihood is -inf.
 
         Returns
         -------
@@ -64,7 +66,7 @@ class SumOfParts:
         """
         points = as_points(x, self.parameter_names)
         rows = points if points.ndim == 2 else points[None]
-        total = np.zeros(len(rows))
+        total = np.where(np.broadcast_to(inside, len(rows)), 0.0, -np.inf)
         for part, columns in self.parts():
             left = (total > -np.inf).nonzero()[0]
             if len(left):
