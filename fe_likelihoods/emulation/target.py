@@ -12,11 +12,10 @@ with the response R at the structural parameters, the statistics S of the residu
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..likelihood.evaluation_queue import EvaluationQueue
 from ..signals.durations import growing_durations
 from ..simulation.model import derivatives_batch, most_responses
 from .archive import Archive
@@ -50,22 +49,6 @@ def _finite(coords: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
 
 
-class _Posterior(Protocol):
-    """Part of `Posterior` that is used here."""
-
-    likelihood: Any
-    prior: Any
-    ndim: int
-
-
-class _Shortened(NamedTuple):
-    """A posterior of the first part of a record."""
-
-    likelihood: Any
-    prior: Any
-    ndim: int
-
-
 class Runs(NamedTuple):
     """Simulations at n points of the structural coordinates."""
 
@@ -95,7 +78,7 @@ class ResponseTarget:
     the measured channels [SI], 1 for a constant channel.
     """
 
-    def __init__(self, posterior: _Posterior) -> None:
+    def __init__(self, posterior: Any) -> None:
         self.posterior = posterior
         self._prior = posterior.prior
         self._data = DataSets(posterior.likelihood)
@@ -152,11 +135,11 @@ class ResponseTarget:
         parts = []
         for seconds in growing_durations(steps, measurements.dt, shares)[:-1]:
             try:
-                parts.append(likelihood.first(measurements.start + seconds))
+                parts.append(self.posterior.first(measurements.start + seconds))
             except ValueError:
                 if not self.with_gaps:
                     raise  # else a channel has no sample in this part
-        targets = [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
+        targets = [ResponseTarget(part) for part in parts]
         for target in targets:
             target.unchecked = self.unchecked
         return targets
@@ -368,9 +351,9 @@ class ResponseTarget:
         at_samples = [[comparison.at_samples(each) for each in rows] for rows in by_coords]
         return np.where(comparison.missing, 0.0, -np.array(at_samples))
 
-    def evaluation_queue(self) -> EvaluationQueue:
+    def evaluation_queue(self) -> Any:
         """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""
-        return EvaluationQueue(self.posterior.likelihood, self._prior, responses=True)
+        return self.posterior.evaluation_queue(responses=True)
 
     # ------------------------------------------------------------------ the noise
 

@@ -201,6 +201,10 @@ class Posterior:
             f"of {n}); report() has the reasons: correct the model or narrow the prior"
         )
 
+    def first(self, seconds: float) -> "Posterior":
+        """The posterior of the first part of the measurements, see `FELikelihood.first`."""
+        return Posterior(self.likelihood.first(seconds), self.prior)
+
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.
 

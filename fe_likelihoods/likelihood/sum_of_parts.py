@@ -2,15 +2,12 @@
 
 from abc import abstractmethod
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..priors.points import as_points
 from .data_identity import combined_digest
-
-if TYPE_CHECKING:
-    from .likelihood import FELikelihood
 
 __all__ = ["COUNTS", "SumOfParts"]
 
@@ -32,7 +29,7 @@ class SumOfParts:
     parameter_names: tuple[str, ...]
 
     @abstractmethod
-    def parts(self) -> list[tuple["FELikelihood", list[int]]]:
+    def parts(self) -> list[tuple[Any, list[int]]]:
         """The likelihoods in the order of their evaluation, with the indices of their parameters."""
 
     @abstractmethod
