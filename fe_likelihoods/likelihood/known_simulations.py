@@ -103,7 +103,9 @@ class KnownSimulations:
     def _fill_from_responses(self, requested: Requested, rows: list[int], run: VerifyingRun) -> None:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
         model, stored = run.model, self._checked.rows
-        found = self.responses.look_up(model.fingerprint, [requested.keys[row] for row in rows])
+        found: list[np.ndarray | str | None] = [None] * len(rows)
+        if len(self.responses):  # a fingerprint takes longer
+            found = self.responses.look_up(model.fingerprint, [requested.keys[row] for row in rows])
         outcomes = {row: outcome for row, outcome in zip(rows, found, strict=True) if outcome is not None}
         left = [row for row in rows if row not in outcomes]
         if stored is not None and left:

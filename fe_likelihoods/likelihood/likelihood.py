@@ -305,13 +305,10 @@ class FELikelihood(SumOfParts):
         """
         values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self.simulator.n_structural :])
         simulated, usable = np.isfinite(misfit).all(axis=1), values < np.inf  # neither NaN nor infinite
-        if not usable.all():
-            for row in np.flatnonzero(simulated & ~usable & self.possible(rows)):
-                theta, reason = (
-                    rows[row, : self.simulator.n_structural],
-                    f"the log-likelihood of the noise is {values[row]}",
-                )
-                self.simulator.failures.add(theta, reason)
+        if (wrong := simulated & ~usable).any():
+            for row in np.flatnonzero(wrong & self.possible(rows)):
+                reason = f"the log-likelihood of the noise is {values[row]}"
+                self.simulator.failures.add(rows[row, : self.simulator.n_structural], reason)
         return np.where(simulated & usable, values, -np.inf)
 
     def parts(self) -> list[tuple["FELikelihood", list[int]]]:
