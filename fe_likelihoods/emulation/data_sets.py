@@ -124,32 +124,28 @@ class DataSets:
             for part in self._parts
         )
 
-    def simulate(self, thetas: np.ndarray) -> tuple[np.ndarray, list[str]]:
-        """Residuals (n, n_channels, n_samples) of all models at structural parameters, and reasons of failures.
+    def simulate(self, thetas: np.ndarray) -> list[np.ndarray]:
+        """Residuals (n, n_channels, n_samples), statistics (n, n_numbers) and reasons of failures, a list in JSON.
 
-        A point that fails in one model is not simulated by the later ones. Its residuals are NaN.
+        A point that fails in one model is not simulated by the later ones; its residuals and statistics are NaN.
+        Residuals are rounded to single precision.
         """
         reasons = [""] * len(thetas)
-        residuals = np.zeros((len(thetas), *self.measured.shape))
-        for part in self._parts:
-            left = np.flatnonzero([not reason for reason in reasons])
-            residuals[:, part.channels, part.samples] = np.nan
-            if len(left) > 0:
-                batch = part.likelihood.simulate(thetas[np.ix_(left, part.structural)])
-                residuals[left, part.channels, part.samples] = part.residuals(batch.response)
-                for row, reason in zip(left, batch.reasons, strict=True):
-                    reasons[row] = reason
-        return residuals, reasons
-
-    def statistics(self, thetas: np.ndarray) -> np.ndarray:
-        """Statistics (n, n_numbers) of all data sets; NaN where a simulation failed."""
-        result = np.full((len(thetas), self._n_numbers), np.nan)
+        residuals = np.zeros((len(thetas), *self.measured.shape), np.float32)
+        statistics = np.full((len(thetas), self._n_numbers), np.nan)
         left = np.arange(len(thetas))
         for part in self._parts:
+            residuals[:, part.channels, part.samples] = np.nan
             if len(left) > 0:
-                result[left, part.numbers] = part.likelihood.simulator.statistics(thetas[np.ix_(left, part.structural)])
-                left = left[np.isfinite(result[left, part.numbers]).all(axis=1)]
-        return result
+                own, simulator = thetas[np.ix_(left, part.structural)], part.likelihood.simulator
+                batch = simulator.simulate(own)
+                with np.errstate(over="ignore"):
+                    residuals[left, part.channels, part.samples] = part.residuals(batch.response)
+                statistics[left, part.numbers] = simulator.statistics(own)
+                for row, reason in zip(left, batch.reasons, strict=True):
+                    reasons[row] = reason
+                left = left[[not reason for reason in batch.reasons]]
+        return [residuals, statistics, np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)]
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache what an earlier run has found, as `Simulator.recall`."""

@@ -12,6 +12,7 @@ with the response R at the structural parameters, the statistics S of the residu
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -295,33 +296,18 @@ class ResponseTarget:
 
         Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
         """
-        size = self._together
-        parts = [
-            self._run_together(thetas[k : k + size], coords[k : k + size], remember)
-            for k in range(0, max(len(thetas), 1), size)
-        ]
+        text, parts = f"residuals of {self._data.identity}".encode(), []  # files of earlier versions have responses
+        for k in range(0, max(len(thetas), 1), self._together):
+            some = thetas[k : k + self._together]
+            key = hashlib.blake2b(text + some.tobytes(), digest_size=16).hexdigest()
+            residuals, statistics, reasons = remember(key, partial(self._data.simulate, some))
+            self._data.recall(some, statistics, json.loads(reasons.tobytes().decode()))
+            failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
+            numbers = np.full(len(failed), -1)
+            of_success = coords[k : k + self._together][~failed], residuals[~failed], statistics[~failed]
+            numbers[~failed] = self.archive.add(*of_success)
+            parts.append(Runs(numbers, statistics, failed))
         return Runs(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def _run_together(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember) -> Runs:
-        computed = []
-
-        def compute() -> list[np.ndarray]:
-            residuals, reasons = self._data.simulate(thetas)
-            computed.append(True)
-            with np.errstate(over="ignore"):
-                residuals = residuals.astype(np.float32)
-            reasons = np.frombuffer(json.dumps(reasons).encode(), dtype=np.uint8)
-            return [residuals, self._data.statistics(thetas), reasons]
-
-        text = f"residuals of {self._data.identity}".encode()  # files of earlier versions have responses
-        key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
-        residuals, statistics, reasons = remember(key, compute)
-        if not computed:
-            self._data.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
-        failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
-        numbers = np.full(len(failed), -1)
-        numbers[~failed] = self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
-        return Runs(numbers, statistics, failed)
 
     def derivatives(self, coords: np.ndarray, remember: Remember = run_at_once) -> np.ndarray:
         """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive.
