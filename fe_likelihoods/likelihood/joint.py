@@ -210,17 +210,10 @@ class JointLikelihood(SumOfParts):
                 f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
                 f"its own with separate={shared!r}"
             )
-        # a name is shared by all likelihoods or by none, so each part needs its own priors only
-        parts = {
-            key: likelihood.marginal(
-                {
-                    name: priors[self._joint_name(key, name)]
-                    for name in _noise_names(likelihood)
-                    if self._joint_name(key, name) in priors
-                }
-            )
-            for key, likelihood in self.likelihoods.items()
-        }
+        parts = {}
+        for key, likelihood in self.likelihoods.items():
+            names = {name: self._joint_name(key, name) for name in likelihood.parameter_names}
+            parts[key] = likelihood.marginal({name: priors[joint] for name, joint in names.items() if joint in priors})
         structural = {name for likelihood in parts.values() for name in likelihood.parameter_names}
         result = JointLikelihood(parts, separate=[name for name in self.separate if name in structural])
         result.separate = self.separate  # names of the noise that `draw_noise` draws
@@ -228,11 +221,6 @@ class JointLikelihood(SumOfParts):
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        if self.fast_parameters:
-            raise ValueError(
-                f"the noise parameters {', '.join(self.parameter_names[self.fast_parameters[0] :])} are in the samples "
-                "of this posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
-            )
         points = np.atleast_2d(as_points(x, self.parameter_names))
         rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
         named = dict(zip(self.parameter_names, points.T, strict=True))
@@ -244,10 +232,6 @@ class JointLikelihood(SumOfParts):
     def _joint_name(self, key: str, name: str) -> str:
         """Name that a parameter of one likelihood has in the joint likelihood."""
         return f"{name}_{key}" if name in self.separate else name
-
-
-def _noise_names(likelihood: FELikelihood) -> tuple[str, ...]:
-    return tuple(likelihood.parameter_names[len(likelihood.model.parameter_names) :])
 
 
 def _unit(likelihood: FELikelihood, name: str) -> str | None:
