@@ -304,12 +304,15 @@ class FELikelihood(SumOfParts):
         -inf where the simulation failed, or where the noise parameters are impossible.
         """
         values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self.simulator.n_structural :])
-        simulated, usable = np.isfinite(misfit).all(axis=1), values < np.inf  # neither NaN nor infinite
+        simulated = np.isfinite(misfit).all(axis=1)
+        usable = simulated & (values < np.inf)  # neither NaN nor infinite
+        if usable.all():
+            return values
         if (wrong := simulated & ~usable).any():
             for row in np.flatnonzero(wrong & self.possible(rows)):
                 reason = f"the log-likelihood of the noise is {values[row]}"
                 self.simulator.failures.add(rows[row, : self.simulator.n_structural], reason)
-        return np.where(simulated & usable, values, -np.inf)
+        return np.where(usable, values, -np.inf)
 
     def parts(self) -> list[tuple["FELikelihood", list[int]]]:
         """This likelihood with the indices of its parameters."""

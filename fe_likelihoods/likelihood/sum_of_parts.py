@@ -63,12 +63,14 @@ class SumOfParts:
         """
         points = as_points(x, self.parameter_names)
         rows = points if points.ndim == 2 else points[None]
-        total = np.where(np.broadcast_to(inside, len(rows)), 0.0, -np.inf)
+        total = np.where(inside, np.zeros(len(rows)), -np.inf)
         for part, columns in self.parts():
             left = (total > -np.inf).nonzero()[0]
             if len(left):
-                own, possible = rows[left[:, None], columns], partial(self.possible, rows[left])
-                statistics = part.simulator.statistics(own[:, : part.simulator.n_structural], possible)
+                wanted = rows if len(left) == len(rows) else rows[left]
+                own = wanted.take(columns, axis=1)
+                simulator = part.simulator
+                statistics = simulator.statistics(own[:, : simulator.n_structural], partial(self.possible, wanted))
                 total[left] += part.of_statistics(own, statistics)
         return total if points.ndim == 2 else float(total[0])
 
