@@ -378,30 +378,29 @@ class Simulator:
         return sent
 
     def receive(self, ended: Iterable[Simulation]) -> None:
-        """Count and cache simulations that have ended in the pool, and record failures; sets `result` or `error`.
+        """Count and cache simulations of one request that have ended in the pool; sets `result` or `error` of each.
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
         running = self._running
         with running.lock:
-            for full in (False, True):
-                some, outcomes = [], []
-                for simulation in dict.fromkeys(ended):
-                    if simulation.received or simulation.full is not full:
-                        continue
-                    simulation.received = True
-                    running.simulations.discard(simulation)
-                    try:
-                        outcome, opened = unpack(simulation.future.result(), self.pool)
-                        self._checked.complete(opened)
-                        outcomes.append(outcome)
-                        some.append(simulation)
-                    except CancelledError:
-                        simulation.error = RuntimeError("the pool was closed before a simulation had finished")
-                    except BaseException as error:
-                        simulation.error = error
-                if some:
-                    self._record_outcomes(some, outcomes)
+            some, outcomes = [], []
+            for simulation in ended:
+                if simulation.received:
+                    continue
+                simulation.received = True
+                running.simulations.discard(simulation)
+                try:
+                    outcome, opened = unpack(simulation.future.result(), self.pool)
+                    self._checked.complete(opened)
+                    outcomes.append(outcome)
+                    some.append(simulation)
+                except CancelledError:
+                    simulation.error = RuntimeError("the pool was closed before a simulation had finished")
+                except BaseException as error:
+                    simulation.error = error
+            if some:
+                self._record_outcomes(some, outcomes)
 
     def leave(self, simulations: Iterable[Simulation], running: bool) -> list[Simulation]:
         """Stop waiting: ended simulations are cached, others are cancelled; with `running`, also those that have begun.
@@ -438,7 +437,7 @@ class Simulator:
         return full or (self.cache is not None and self.cache.responses)
 
     def _record_outcomes(self, ended: list[Simulation], outcomes: list[tuple]) -> None:
-        """Record simulations of one kind, which the pool has run."""
+        """Record simulations that the pool has run."""
         running, now, full = self._running, time.perf_counter(), ended[0].full
         seconds, running.counted_until = now - running.counted_until, now
         shape = (len(self.model.channels), self.model.n_steps) if self._returns_responses(full) else (self.n_numbers,)
