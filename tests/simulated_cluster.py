@@ -14,12 +14,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from fe_likelihoods.likelihood import evaluation_queue, running_simulations, simulator
+from fe_likelihoods.likelihood import evaluation_queue, simulator
 from fe_likelihoods.simulation.executors import PoolExecutor
 
 __all__ = ["SimulatedCluster", "SimulatedPool"]
 
-take_without_clock = running_simulations.take_all
+take_without_clock = simulator.take_all
 
 
 class SimulatedCluster:
@@ -138,6 +138,6 @@ class SimulatedPool(PoolExecutor):
             return take_without_clock(arrived, wait)
 
         with ExitStack() as stack:
-            for module in (simulator, evaluation_queue, running_simulations):
+            for module in (simulator, evaluation_queue):
                 stack.enter_context(patch.object(module, "take_all", take_all))
             yield

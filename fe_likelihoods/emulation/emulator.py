@@ -40,7 +40,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..signals.comparison import Comparison
 from ..simulation.model import SimulationBatch, SimulationFailed
 from .gaussian_process import GaussianProcess, fit_process, left_out_errors, predict
 from .target import ResponseTarget
@@ -231,7 +230,7 @@ class ResponseEmulator:
         mean, _ = predict(self.process, np.where(inside[:, None], self._inputs(coords), 0.0))
         average, components = self._combined[0], self._combined[1:]
         residuals = average + np.einsum("nk,kct->nct", mean, components, optimize=True)
-        if isinstance(self._target.comparison, Comparison):
+        if self._target.with_gaps:
             raise ValueError(
                 "the emulator was fitted to measurements with missing samples, or with times of their own, and "
                 "predicts the response at their samples only: predict with the posterior or the model"

@@ -38,7 +38,6 @@ from .modes import (
     unseen_share,
     with_mode,
 )
-from .stacked import is_joint
 from .target import SCALES, ResponseTarget
 
 __all__ = ["ResponseGuide"]
@@ -440,16 +439,15 @@ class ResponseGuide:
 
     def _check_memory(self) -> None:
         """Raise ValueError if the likelihood cannot cache the responses that arrive before they are used."""
-        if is_joint(self._posterior.likelihood):
-            raise ValueError("asynchronous=True is not possible with a guide of a JointLikelihood: leave it out")
-        target, memory = self._target, self._posterior.likelihood.simulator.response_memory
-        most = self._starts * max(target.n_structural, POINTS_PER_STEP)
-        needed = 8 * most * len(target.model.channels) * target.model.n_steps
-        if memory.max_bytes < needed:
-            raise ValueError(
-                f"an asynchronous run with a guide needs a likelihood with memory_bytes of {needed} or more, which "
-                f"holds the responses that arrive together, so that none is simulated twice; got {memory.max_bytes}"
-            )
+        most = self._starts * max(self._target.n_structural, POINTS_PER_STEP)
+        for part, _ in self._posterior.likelihood.parts():
+            needed = 8 * most * len(part.model.channels) * part.model.n_steps
+            if part.simulator.response_memory.max_bytes < needed:
+                raise ValueError(
+                    f"an asynchronous run with a guide needs a likelihood with memory_bytes of {needed} or more, which "
+                    "holds the responses that arrive together, so that none is simulated twice; got "
+                    f"{part.simulator.response_memory.max_bytes}"
+                )
 
     def _counted(self, search: Generator[float, None, Any]) -> Generator[None, None, Any]:
         """Result of a search; simulations are counted batch by batch, as soon as they are made."""

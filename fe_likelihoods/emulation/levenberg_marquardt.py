@@ -512,8 +512,7 @@ class Batches:
     def __init__(
         self, target: ResponseTarget, remember: Remember, fits: Callable[[float], bool], overlap: bool = False
     ) -> None:
-        self._target, self._remember, self._fits = target, remember, fits
-        self._running = target.running_requests() if overlap else None
+        self._target, self._remember, self._fits, self._overlap = target, remember, fits, overlap
 
     def complete(
         self, ascents: dict[int, Generator[np.ndarray, Runs, Any]], finished: Callable[[int, Any], None]
@@ -526,6 +525,7 @@ class Batches:
         self.interrupted = False
         waiting: dict[int, Request] = {}
         begun: set[int] = set()
+        running = _RunningRequests(self._target) if self._overlap else None
 
         def advance(index: int, answer: Runs | np.ndarray | None) -> None:
             try:
@@ -544,7 +544,7 @@ class Batches:
                         del waiting[index]
                     continue
                 begun.update(waiting)
-                ended = self._wait(waiting)
+                ended = self._wait(waiting, running)
                 requests = [waiting.pop(index) for index in ended]
                 new = self._cost(requests)
                 answers = self._answers(requests)
@@ -554,8 +554,8 @@ class Batches:
                     if not self.interrupted:
                         advance(index, answer)
         finally:
-            if self._running is not None:
-                self._running.close()
+            if running is not None:
+                running.close()
 
     def _cost(self, requests: Iterable[Request]) -> int:
         """Simulations that requests need; derivatives at a point count as one."""
@@ -577,21 +577,36 @@ class Batches:
 
         return [next(slopes) if isinstance(each, Derivatives) else rows(len(each)) for each in requests]
 
-    def _wait(self, waiting: dict[int, Request]) -> list[int]:
+    def _wait(self, waiting: dict[int, Request], running: "_RunningRequests | None") -> list[int]:
         """Numbers of the generators whose requests can be answered: in lock-step all of them."""
-        running = self._running
         if running is None:
             return list(waiting)
         if derivatives := [index for index, each in waiting.items() if isinstance(each, Derivatives)]:
             return derivatives
 
-        def wait() -> list[np.ndarray]:
-            for index, coords in waiting.items():
-                if index not in running:
-                    running.begin(index, self._target.structural_parameters(coords))
-            return [np.array(running.wait())]
+        return self._remember("ascents", lambda: [np.array(running.wait(waiting))])[0].tolist()
 
-        return self._remember("ascents", wait)[0].tolist()
+
+class _RunningRequests:
+    """Requests of generators whose points are evaluated at the same time; `run` finds their responses in the caches."""
+
+    def __init__(self, target: ResponseTarget) -> None:
+        self._target, self._queue = target, target.evaluation_queue()
+        self._left: dict[int, set[int]] = {}  # tickets of points that run, by number of the generator
+        self.close = self._queue.close
+
+    def wait(self, waiting: dict[int, np.ndarray]) -> list[int]:
+        """Numbers of the generators whose points have all been evaluated, at least one of those that are waiting."""
+        for index, coords in waiting.items():
+            if index not in self._left:
+                self._left[index] = set(self._queue.submit(self._target.at_median_noise(coords)))
+        while not (ended := [index for index, left in self._left.items() if not left]):
+            arrived = {ticket for ticket, _ in self._queue.collect()}
+            for left in self._left.values():
+                left -= arrived
+        for index in ended:
+            del self._left[index]
+        return ended
 
 
 def distinct_ends(ends: dict[int, Ascent], apart: float = np.inf) -> dict[int, int]:

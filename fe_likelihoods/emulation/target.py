@@ -12,18 +12,15 @@ with the response R at the structural parameters, the statistics S of the residu
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..noise.protocol import noise_title
-from ..noise.statistics import needs_response, sums_of_squares
-from ..signals.comparison import Comparison, measured_values
 from ..signals.durations import growing_durations
 from ..simulation.model import derivatives_batch, most_responses
 from .archive import Archive
-from .quadratic import check_quadratic
-from .stacked import TIME_SHIFTS, stack
+from .data_sets import DataSets
 
 __all__ = ["NoiseFit", "Remember", "ResponseTarget", "Runs", "run_at_once"]
 
@@ -53,35 +50,6 @@ def _finite(coords: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(coords), np.copysign(_AT_BOUND, coords), coords)
 
 
-class _Likelihood(Protocol):
-    """Part of `FELikelihood` that is used here."""
-
-    model: Any
-    measurements: Any
-    measured: Any
-    n_samples: Any
-    noise: Any
-    simulator: Any
-
-    def simulate(self, thetas: np.ndarray) -> Any: ...
-
-
-class _Posterior(Protocol):
-    """Part of `Posterior` that is used here."""
-
-    likelihood: Any
-    prior: Any
-    ndim: int
-
-
-class _Shortened(NamedTuple):
-    """A posterior of the first part of a record."""
-
-    likelihood: Any
-    prior: Any
-    ndim: int
-
-
 class Runs(NamedTuple):
     """Simulations at n points of the structural coordinates."""
 
@@ -102,49 +70,24 @@ def run_at_once(_: str, compute: Callable[[], Sequence[np.ndarray]]) -> Sequence
     return compute()
 
 
-class _WithoutMissing(NamedTuple):
-    """A statistic of residuals, which are zero where a sample is missing, for a noise that expects NaN there."""
-
-    statistic: Callable[[np.ndarray], np.ndarray]
-    missing: np.ndarray
-
-    def __call__(self, residuals: np.ndarray) -> np.ndarray:
-        return self.statistic(np.where(self.missing, np.nan, residuals))
-
-
 class ResponseTarget:
     """A posterior in standard normal coordinates, first the structural ones, and its `archive` of simulations.
 
-    ValueError if the statistics of the noise are not quadratic in the residuals, its level depends on the response, or
-    it has time shifts. `n_samples` is an int, or `SampleCounts` where some are missing; `differentiable` says whether
-    the model has a method ``jacobian``; `unchecked` is not empty until its derivatives have been compared with a
-    difference, and is shared with `shortened` targets; `scales` (n_channels,) are the standard deviations of the
-    measured channels [SI], 1 for a constant channel.
+    ValueError as for `DataSets`, whose `model`, `measured`, `statistic` and `with_gaps` these are. `differentiable`
+    says whether the model has a method ``jacobian``; `unchecked` is not empty until its derivatives have been compared
+    with a difference, and is shared with `shortened` targets; `scales` (n_channels,) are the standard deviations of
+    the measured channels [SI], 1 for a constant channel.
     """
 
-    def __init__(self, posterior: _Posterior) -> None:
+    def __init__(self, posterior: Any) -> None:
         self.posterior = posterior
-        self._likelihood: _Likelihood = stack(posterior.likelihood)
         self._prior = posterior.prior
-        self.model, self.noise = self._likelihood.model, self._likelihood.noise
+        self._data = DataSets(posterior.likelihood)
+        self.model, self.measured, self.statistic = self._data.model, self._data.measured, self._data.statistic
+        self.with_gaps = self._data.with_gaps
         self.ndim, self.n_structural = posterior.ndim, len(self.model.parameter_names)
         self.n_noise = self.ndim - self.n_structural
-        self.comparison = self._likelihood.measured
-        if isinstance(self.comparison, Comparison) and self.comparison.lags is not None:
-            raise ValueError(TIME_SHIFTS)
-        self.measured = measured_values(self.comparison)
         self.n_steps = self.measured.shape[1]
-        self.n_samples = self._likelihood.n_samples
-        self.statistic: Callable[[np.ndarray], np.ndarray] = getattr(self.noise, "statistic", None) or sums_of_squares
-        if needs_response(self.statistic):
-            raise ValueError(
-                f"the level of {noise_title(self.noise)} depends on the response, so the posterior cannot be "
-                'emulated from residuals: sample without a guide, or use GaussianNoise with level="si", with bands of '
-                "frequency or without, or AutoregressiveNoise"
-            )
-        if isinstance(self.comparison, Comparison) and self.statistic is not sums_of_squares:
-            self.statistic = _WithoutMissing(self.statistic, self.comparison.missing)
-        check_quadratic(self.statistic, self.measured)
         low, self._median, high = self._prior.from_normal(np.array([[-2.0], [0.0], [2.0]]) * np.ones(self.ndim))
         logarithmic = np.array(self._prior.logarithmic)
         factors = (low > 0.0) & (high < _LARGEST_FACTOR * low)  # the prior keeps them away from zero
@@ -181,21 +124,23 @@ class ResponseTarget:
         if not hasattr(self.model, "first"):
             return []
         # differences, because a residual displacement is not motion
-        steps, measurements = np.diff(self.measured, axis=1), self._likelihood.measurements
-        if isinstance(self.comparison, Comparison):
+        likelihood = self.posterior.likelihood
+        steps, measurements = np.diff(self.measured, axis=1), likelihood.measurements
+        if self.with_gaps:
             if not measurements.simultaneous:
                 return []
-            steps[self.comparison.missing[:, 1:] | self.comparison.missing[:, :-1]] = 0.0
+            missing = likelihood.measured.missing
+            steps[missing[:, 1:] | missing[:, :-1]] = 0.0
             if not steps.any():
                 return []
         parts = []
         for seconds in growing_durations(steps, measurements.dt, shares)[:-1]:
             try:
-                parts.append(self._likelihood.first(measurements.start + seconds))
+                parts.append(self.posterior.first(measurements.start + seconds))
             except ValueError:
-                if not isinstance(self.comparison, Comparison):
+                if not self.with_gaps:
                     raise  # else a channel has no sample in this part
-        targets = [ResponseTarget(_Shortened(part, self._prior, self.ndim)) for part in parts]
+        targets = [ResponseTarget(part) for part in parts]
         for target in targets:
             target.unchecked = self.unchecked
         return targets
@@ -231,11 +176,15 @@ class ResponseTarget:
             result[inside] += log_density(coords[inside])
         return result
 
-    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
-        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
+    def at_median_noise(self, coords: np.ndarray) -> np.ndarray:
+        """Parameters (n, ndim) at structural coordinates (n, n_structural)."""
         full = np.zeros((len(coords), self.ndim))
         full[:, : self.n_structural] = coords
-        return self._prior.from_normal(full)[:, : self.n_structural]
+        return self._prior.from_normal(full)
+
+    def structural_parameters(self, coords: np.ndarray) -> np.ndarray:
+        """Structural parameters (n, n_structural) at coordinates (n, n_structural)."""
+        return self.at_median_noise(coords)[:, : self.n_structural]
 
     def _prior_of_noise(self) -> Any:
         """Prior of the noise parameters; None without any, or if they have a joint distribution with structural ones.
@@ -347,35 +296,18 @@ class ResponseTarget:
 
         Residuals are rounded to single precision, in which they are stored, so that a resumed run is the same.
         """
-        size = self._together
-        parts = [
-            self._run_together(thetas[k : k + size], coords[k : k + size], remember)
-            for k in range(0, max(len(thetas), 1), size)
-        ]
+        text, parts = f"residuals of {self._data.identity}".encode(), []  # files of earlier versions have responses
+        for k in range(0, max(len(thetas), 1), self._together):
+            some = thetas[k : k + self._together]
+            key = hashlib.blake2b(text + some.tobytes(), digest_size=16).hexdigest()
+            residuals, statistics, reasons = remember(key, partial(self._data.simulate, some))
+            self._data.recall(some, statistics, json.loads(reasons.tobytes().decode()))
+            failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
+            numbers = np.full(len(failed), -1)
+            of_success = coords[k : k + self._together][~failed], residuals[~failed], statistics[~failed]
+            numbers[~failed] = self.archive.add(*of_success)
+            parts.append(Runs(numbers, statistics, failed))
         return Runs(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def _run_together(self, thetas: np.ndarray, coords: np.ndarray, remember: Remember) -> Runs:
-        computed = []
-
-        def compute() -> list[np.ndarray]:
-            batch = self._likelihood.simulate(thetas)
-            computed.append(True)
-            with np.errstate(over="ignore"):
-                residuals = self._residuals(batch.response).astype(np.float32)
-            reasons = np.frombuffer(json.dumps(list(batch.reasons)).encode(), dtype=np.uint8)
-            return [residuals, self._likelihood.simulator.statistics(thetas), reasons]
-
-        text = f"residuals of {self.model.fingerprint}".encode()  # files of earlier versions have responses
-        if isinstance(self.comparison, Comparison):
-            text += self._likelihood.measurements.fingerprint.encode()
-        key = hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest()
-        residuals, statistics, reasons = remember(key, compute)
-        if not computed:
-            self._likelihood.simulator.recall(thetas, statistics, json.loads(reasons.tobytes().decode()))
-        failed = ~(np.isfinite(residuals).all(axis=(1, 2)) & np.isfinite(statistics).all(axis=1))
-        numbers = np.full(len(failed), -1)
-        numbers[~failed] = self.archive.add(coords[~failed], residuals[~failed], statistics[~failed])
-        return Runs(numbers, statistics, failed)
 
     def derivatives(self, coords: np.ndarray, remember: Remember = run_at_once) -> np.ndarray:
         """Derivatives of residuals by coordinates (n, n_structural), as numbers (n, n_structural) in the archive.
@@ -392,38 +324,29 @@ class ResponseTarget:
         thetas = self.structural_parameters(coords)
 
         def compute() -> list[np.ndarray]:
-            return [derivatives_batch(self.model, thetas, self._likelihood.simulator.pool).astype(np.float32)]
+            return [derivatives_batch(self.model, thetas, self.posterior.likelihood.simulator.pool).astype(np.float32)]
 
         text = f"derivatives of {self.model.fingerprint}".encode()
         found = remember(hashlib.blake2b(text + thetas.tobytes(), digest_size=16).hexdigest(), compute)[0]
         moved = coords[:, None] + _MAP_STEP * np.stack([np.eye(d), -np.eye(d)])[:, None]
         ahead, behind = self.structural_parameters(moved.reshape(-1, d)).reshape(2, n, d, d)
         by_coords = np.einsum("nzp,npct->nzct", (ahead - behind) / (2.0 * _MAP_STEP), found.astype(float))
-        if not isinstance(self.comparison, Comparison):
+        if not self.with_gaps:
             return -by_coords
-        at_samples = [[self.comparison.at_samples(each) for each in rows] for rows in by_coords]
-        return np.where(self.comparison.missing, 0.0, -np.array(at_samples))
+        comparison = self.posterior.likelihood.measured
+        at_samples = [[comparison.at_samples(each) for each in rows] for rows in by_coords]
+        return np.where(comparison.missing, 0.0, -np.array(at_samples))
 
-    def running_requests(self) -> Any:
-        """Requests for simulations that go on while others are waited for; `run` finds their responses in the cache."""
-        return self._likelihood.simulator.running_requests()
-
-    def _residuals(self, responses: np.ndarray) -> np.ndarray:
-        """Measured minus simulated responses (n, n_channels, n_samples); zero where a sample is missing."""
-        if not isinstance(self.comparison, Comparison):
-            return self.measured - responses
-        residuals = np.full((len(responses), *self.measured.shape), np.nan)
-        for row, response in zip(residuals, responses, strict=True):
-            if np.isfinite(response).all():
-                row[:] = -self.comparison.known_residuals(response)
-        return residuals
+    def evaluation_queue(self) -> Any:
+        """Where points are evaluated while others are waited for; `run` finds their responses in the cache."""
+        return self.posterior.evaluation_queue(responses=True)
 
     # ------------------------------------------------------------------ the noise
 
     def log_likelihood(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood (n,) of statistics (n, n_numbers) at coordinates (n, n_noise) of the noise parameters."""
         parameters = self._noise_parameters(coords) if self.n_noise else coords
-        return self.noise.log_likelihood(statistics, self.n_samples, parameters)
+        return self._data.log_likelihood(statistics, parameters)
 
     def _noise_density(self, statistics: np.ndarray, coords: np.ndarray) -> np.ndarray:
         """Log-likelihood and log-prior (n,) of coordinates (n, n_noise) at the same statistics (n_numbers,)."""

@@ -8,9 +8,9 @@ posterior, and a part is not simulated where an earlier one is -inf.
 import logging
 import os
 import threading
-from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import as_completed
+from contextlib import suppress
 from queue import SimpleQueue
 from typing import Any
 
@@ -18,14 +18,12 @@ import numpy as np
 
 from samplers.interrupts import interrupts_end_the_run
 
-from ..cache.memory import distinct_keys
 from ..priors.points import as_points
 from ..priors.priors import Prior
 from ..simulation.model import has_batch_method
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
-from .running_simulations import RunningSimulation, take_all
-from .simulator import Simulator
+from .simulator import Simulation, Simulator, take_all
 
 __all__ = ["EvaluationQueue"]
 
@@ -47,16 +45,13 @@ class _Part:
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
         self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
-        self.running: dict[RunningSimulation, list[_Point]] = {}
-        self.unstarted: deque[list[_Point]] = deque()  # without a pool, or stored on disk, or after an error
+        self.running: dict[bytes, Simulation] = {}
+        self.points: dict[Simulation, list[_Point]] = {}
+        self.unstarted: list[_Point] = []  # without a pool that takes single items
 
     def thetas(self, points: Sequence[_Point]) -> np.ndarray:
         """Structural parameters (n, n_structural)."""
-        return np.concatenate([point.row[:, self.columns] for point in points])[:, : self.simulator.n_structural]
-
-    def value(self, point: _Point, misfit: np.ndarray) -> float:
-        """Log-likelihood of a point from the statistics (n_numbers,) of its simulation."""
-        return float(self.likelihood.of_statistics(point.row[:, self.columns], misfit[None])[0])
+        return np.array([point.row[self.columns] for point in points])[:, : self.simulator.n_structural]
 
 
 class EvaluationQueue:
@@ -64,14 +59,14 @@ class EvaluationQueue:
 
     Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
     is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect` runs
-    the simulations of one `submit` in parts. With `responses`, the likelihood caches these as well, for its `simulate`.
+    the next few simulations. With `responses`, the likelihood caches these as well, for its `simulate`.
     """
 
     def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior, responses: bool = False) -> None:
         self._prior, self._responses = prior, responses
         self._parts = [_Part(part, columns) for part, columns in likelihood.parts()]
         self._arrived: SimpleQueue = SimpleQueue()
-        self._taken: list[RunningSimulation] = []  # from the queue of arrivals
+        self._taken: list[Simulation] = []  # from the queue of arrivals
         self._finished: list[tuple[int, float]] = []
         self._collected: list[tuple[int, float]] = []  # last; the caller may not have received them
         self._tickets = self._pending = 0
@@ -96,8 +91,8 @@ class EvaluationQueue:
     def submit(self, coords: Any) -> list[int]:
         """Submit points (n, ndim) without waiting; returns n tickets, each of which `collect` returns once.
 
-        Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached in
-        memory, are finished at once. ValueError for another shape, RuntimeError if the queue is closed.
+        Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached, are
+        finished at once. ValueError for another shape, RuntimeError if the queue is closed.
         """
         self._require_open()
         names = self._prior.names
@@ -108,15 +103,17 @@ class EvaluationQueue:
         log_prior = [float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows]
         first, self._tickets = self._tickets, self._tickets + len(rows)
         self._pending += len(rows)
-        points = [_Point(first + place, rows[[place]], value) for place, value in enumerate(log_prior)]
+        points = [_Point(first + place, *each) for place, each in enumerate(zip(rows, log_prior, strict=True))]
         possible = np.array(log_prior) > -np.inf
         for part in self._parts:
-            if possible.any():
-                possible[possible] = part.likelihood.possible(rows[possible][:, part.columns])
-        for point, is_possible in zip(points, possible, strict=True):
-            if not is_possible:
-                self._finish(point, -np.inf)
-        self._advance(0, [point for point, is_possible in zip(points, possible, strict=True) if is_possible])
+            possible[possible] = part.likelihood.possible(rows[possible][:, part.columns])
+        for point in points:
+            if not possible[point.ticket - first]:
+                self._finished.append((point.ticket, -np.inf))
+        try:
+            self._advance(0, [point for point in points if possible[point.ticket - first]])
+        except Exception as error:  # raised by `collect`
+            self._error = self._error or error
         return [point.ticket for point in points]
 
     def collect(self) -> list[tuple[int, float]]:
@@ -133,7 +130,10 @@ class EvaluationQueue:
         while not self._finished:
             if self._error is not None:
                 raise self._error
-            if not self._begin_unstarted():
+            for part in self._parts:
+                if part.points:
+                    part.simulator.check_failures()
+            if not self._evaluate_some():
                 self._receive(wait=True)
         self._collected, self._finished = self._finished, []
         self._pending -= len(self._collected)
@@ -147,7 +147,7 @@ class EvaluationQueue:
         self._require_open()
         for part in self._parts:
             # not all of them may have announced their end
-            self._taken += [running for running in part.running if running.future and running.future.done()]
+            self._taken += [each for each in part.points if each.future.done()]
         self._receive(wait=False)
         return self._collected + self._finished
 
@@ -157,7 +157,7 @@ class EvaluationQueue:
             return
         self._closed = True
         for part in self._parts:
-            left = part.simulator.leave(list(part.running), self._arrived, running=False)
+            left = part.simulator.leave(part.points, running=False)
             if left:
                 threading.Thread(target=_cache_rest, args=(part.simulator, left), daemon=True).start()
 
@@ -165,110 +165,71 @@ class EvaluationQueue:
         if self._closed:
             raise RuntimeError("the queue is closed: make another one with posterior.evaluation_queue()")
 
-    def _finish(self, point: _Point, log_likelihood: float) -> None:
-        self._finished.append((point.ticket, point.log_prior + log_likelihood))
-
     def _advance(self, stage: int, points: list[_Point]) -> None:
-        """Evaluate points in one of the parts: at once if they are cached in memory."""
-        if not points:
-            return
+        """Evaluate points in one of the parts: at once if their simulations are cached."""
         part = self._parts[stage]
-        unknown = self._look_up(stage, points, on_disk=False)
-        if not unknown:
-            return
-        if not part.simulator.streams or self._error is not None:
-            part.unstarted.append(unknown)
-            return
-        stored = part.simulator.are_stored(part.thetas(unknown))
-        if stored.any():  # not read yet, since that may take a verification
-            part.unstarted.append([point for point, is_stored in zip(unknown, stored, strict=True) if is_stored])
-        self._start(part, [point for point, is_stored in zip(unknown, stored, strict=True) if not is_stored])
-
-    def _look_up(self, stage: int, points: list[_Point], on_disk: bool) -> list[_Point]:
-        """Pass points on whose simulations are cached; returns the others."""
-        part = self._parts[stage]
-        keys, distinct = distinct_keys(part.thetas(points))
-        misfit, cached = part.simulator.look_up(keys, distinct, on_disk)
-        for point, place in zip(points, distinct, strict=True):
-            if cached[place]:
-                self._pass_on(stage, point, misfit[place])
-        return [point for point, place in zip(points, distinct, strict=True) if not cached[place]]
-
-    def _start(self, part: _Part, points: list[_Point]) -> None:
-        """Send the simulations of points to the pool."""
-        if not points:
-            return
-        keys, distinct = distinct_keys(part.thetas(points))
-        try:
-            started = part.simulator.start(keys, self._responses, self._arrived)
-        except Exception as error:  # raised by `collect`, as in a call of the posterior
-            self._error = self._error or error
-            part.unstarted.append(points)
-            return
-        for point, place in zip(points, distinct, strict=True):
-            part.running.setdefault(started[place], []).append(point)
-
-    def _begin_unstarted(self) -> bool:
-        """Read points from the caches, or begin their simulations; returns whether there were any."""
-        for stage, part in enumerate(self._parts):
-            # those that are not in a pool are run first, since they may be the same points
-            if part.unstarted and (part.simulator.streams or not part.running):
-                try:
-                    unknown = self._look_up(stage, part.unstarted[0], on_disk=True)
-                except Exception as error:
-                    self._error = self._error or error
-                    return True
-                part.unstarted.popleft()
-                self._start(part, unknown)
-                return True
-        return False
-
-    def _receive(self, wait: bool) -> None:
-        """Take simulations that have ended; with `wait`, at least one."""
-        self._taken += take_all(self._arrived, wait=False)
-        if wait and not self._taken:
-            self._wait()
-        for stage, part in enumerate(self._parts):
-            ended = [running for running in dict.fromkeys(self._taken) if running in part.running]
-            if not ended:
-                continue
-            try:
-                part.simulator.receive(ended)
-                if any(running not in ended for running in part.running):
-                    part.simulator.check_failures()
-            except Exception as error:
-                self._error = self._error or error
-            for running in ended:
-                points = part.running.pop(running)
-                if running.result is not None:
-                    for point in points:
-                        self._pass_on(stage, point, running.result.misfit)
+        if not part.simulator.streams:
+            part.unstarted += points
+        elif points:
+            thetas = part.thetas(points) + 0.0
+            keys = [theta.tobytes() for theta in thetas]
+            new = [place for place, key in enumerate(keys) if key not in part.running]
+            found = dict(zip(new, part.simulator.request(thetas[new], self._responses, self._arrived), strict=True))
+            for place, point in enumerate(points):
+                simulation = found[place] if place in found else part.running[keys[place]]
+                if simulation.future is None:
+                    self._pass_on(stage, point, simulation.result.statistics)
                 else:
-                    self._error = self._error or running.error
-        self._taken.clear()
+                    part.running[keys[place]] = simulation
+                    part.points.setdefault(simulation, []).append(point)
+
+    def _evaluate_some(self) -> bool:
+        """Evaluate some points of a part that has no pool for single items; returns whether there were any."""
+        stage = next((stage for stage, part in enumerate(self._parts) if part.unstarted), None)
+        if stage is None:
+            return False
+        part = self._parts[stage]
+        some = part.unstarted[: self.workers]
+        thetas = part.thetas(some)
+        if self._responses:
+            part.simulator.simulate(thetas)
+        statistics = part.simulator.statistics(thetas)
+        del part.unstarted[: len(some)]
+        for point, row in zip(some, statistics, strict=True):
+            self._pass_on(stage, point, row)
+        return True
 
     @interrupts_end_the_run()
-    def _wait(self) -> None:
-        """Wait for a simulation, or run some that are not in a pool."""
-        here = [part for part in self._parts if part.running and not part.simulator.streams]
-        if not here:
-            self._taken += take_all(self._arrived, wait=True)
-            return
-        try:
-            self._taken += here[0].simulator.wait(here[0].running, self._arrived)
-        except Exception as error:
-            self._error = self._error or error
+    def _receive(self, wait: bool) -> None:
+        """Take simulations that have ended; with `wait`, at least one."""
+        self._taken += take_all(self._arrived, wait=wait and not self._taken)
+        for stage, part in enumerate(self._parts):
+            ended = [each for each in dict.fromkeys(self._taken) if each in part.points]
+            with suppress(Exception):  # which is the error of each simulation
+                part.simulator.receive(ended)
+            for simulation in ended:
+                points = part.points.pop(simulation)
+                del part.running[simulation.key]
+                try:
+                    if simulation.error is not None:
+                        raise simulation.error
+                    for point in points:
+                        self._pass_on(stage, point, simulation.result.statistics)
+                except Exception as error:
+                    self._error = self._error or error
+        self._taken.clear()
 
-    def _pass_on(self, stage: int, point: _Point, misfit: np.ndarray) -> None:
-        """Pass a point on to the next part, from the statistics of its simulation."""
-        point.log_likelihood += self._parts[stage].value(point, misfit)
+    def _pass_on(self, stage: int, point: _Point, statistics: np.ndarray) -> None:
+        """Pass a point on to the next part, from the statistics (n_numbers,) of its simulation."""
+        part = self._parts[stage]
+        point.log_likelihood += float(part.likelihood.of_statistics(point.row[None, part.columns], statistics[None])[0])
         if point.log_likelihood == -np.inf or stage + 1 == len(self._parts):
-            self._finish(point, point.log_likelihood)
+            self._finished.append((point.ticket, point.log_prior + point.log_likelihood))
         else:
             self._advance(stage + 1, [point])
 
 
-def _cache_rest(simulator: Simulator, left: list[RunningSimulation]) -> None:
+def _cache_rest(simulator: Simulator, left: list[Simulation]) -> None:
     """Cache simulations of a closed queue when they end; in a thread."""
     running = {each.future: each for each in left}
     try:

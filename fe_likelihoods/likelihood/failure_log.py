@@ -15,6 +15,7 @@ __all__ = ["FailureLog", "TooManyFailures", "reason_without_numbers"]
 logger = logging.getLogger(__name__)
 
 _MAX_RECORDS = 1000
+_MOST_KEPT = 10_000  # failures whose reason is found by their parameters
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
 _OTHER_FAULTS = "other faults of the infrastructure"
@@ -62,11 +63,19 @@ class FailureLog:
         self._reasons_of_model: set[str] = set()
         self._transient_reasons: set[str] = set()
         self._names = tuple(parameter_names)
-        self._faults: OrderedDict[bytes, str] = OrderedDict()  # the last ones, by structural parameters
+        self._latest: OrderedDict[bytes, str] = OrderedDict()  # reasons by structural parameters
+
+    def __getstate__(self) -> dict:
+        return self.__dict__ | {"_latest": OrderedDict()}
+
+    def reason(self, theta: np.ndarray) -> str:
+        """Reason of the failure at the structural parameters `theta`; empty if none of the last failures was there."""
+        return self._latest.get((theta + 0.0).tobytes(), "")
 
     def fault(self, theta: np.ndarray) -> str:
         """Reason of the failure at the structural parameters `theta` if its cause is not the model, else empty."""
-        return self._faults.get((theta + 0.0).tobytes(), "") if self._faults else ""
+        reason = self.reason(theta)
+        return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
 
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
         """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
@@ -79,6 +88,9 @@ class FailureLog:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
         parameters = dict(zip(self._names, theta.tolist(), strict=True))
         transient = isinstance(reason, TransientReason)
+        self._latest[(theta + 0.0).tobytes()] = reason
+        if len(self._latest) > _MOST_KEPT:
+            self._latest.popitem(last=False)
         reason, seconds = split_seconds(reason)
         if not self.count or (transient and not self.transient):
             logger.warning(
@@ -90,10 +102,6 @@ class FailureLog:
             )
         self.count += 1
         self.transient += transient
-        if transient:
-            self._faults[(theta + 0.0).tobytes()] = reason
-            while len(self._faults) > _MAX_RECORDS:
-                self._faults.popitem(last=False)
         if (self.transient if transient else self.count - self.transient) <= _MAX_RECORDS:
             self.records.append({"parameters": parameters, "reason": reason})
             if seconds is not None:

@@ -16,15 +16,14 @@ import numpy as np
 from ..noise.marginal import sampled_noise
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points
-from .data_identity import combined_digest
 from .likelihood import FELikelihood
 from .parameters import Parameter, channels_of_deviations
-from .simulator import COUNTS, reported
+from .sum_of_parts import COUNTS, SumOfParts
 
 __all__ = ["JointLikelihood"]
 
 
-class JointLikelihood:
+class JointLikelihood(SumOfParts):
     """Sum of log-likelihoods of several data sets over the union of their parameters.
 
     Parameters with the same name are one parameter. `Posterior` accepts the object like an `FELikelihood`. Calling it
@@ -86,40 +85,39 @@ class JointLikelihood:
                 f"separate has the unknown parameters {', '.join(unknown)}; the parameters are "
                 f"{', '.join(sorted(known))}"
             )
-        if taken := sorted({f"{name}_{key}" for name in self.separate for key in self.likelihoods} & known):
-            raise ValueError(f"separate makes the names {', '.join(taken)}, which exist already; rename likelihoods")
-        sources: dict[str, str] = {}
-        for key, likelihood in self.likelihoods.items():
-            for name in likelihood.parameter_names:
-                joint = self._joint_name(key, name)
-                if sources.setdefault(joint, name) != name:
-                    raise ValueError(
-                        f"separate makes the name {joint!r} of two parameters, {sources[joint]!r} and {name!r}; rename "
-                        "likelihoods"
-                    )
-        structural: dict[str, str] = {}
-        noise: dict[str, str] = {}
-        for key, likelihood in self.likelihoods.items():
-            n_structural = len(likelihood.model.parameter_names)
-            for place, name in enumerate(likelihood.parameter_names):
-                (structural if place < n_structural else noise).setdefault(self._joint_name(key, name), key)
-        if both := [name for name in noise if name in structural]:
-            raise ValueError(
-                f"{both[0]!r} is a structural parameter in {structural[both[0]]!r} and a noise parameter in "
-                f"{noise[both[0]]!r}; rename one of them, or put the name into separate="
-            )
-        self.parameter_names = (*structural, *noise)
-        self.fast_parameters = tuple(range(len(structural), len(self.parameter_names)))
-        index = {name: place for place, name in enumerate(self.parameter_names)}
+        first: dict[str, tuple[str, str, str]] = {}  # likelihood, name there and kind of each parameter
+        units: dict[str, tuple[str, str]] = {}  # likelihood and unit, where it is known
+        for kind in ("structural", "noise"):
+            for key, likelihood in self.likelihoods.items():
+                n_structural = len(likelihood.model.parameter_names)
+                names = likelihood.parameter_names
+                for name in names[:n_structural] if kind == "structural" else names[n_structural:]:
+                    joint, unit = self._joint_name(key, name), _unit(likelihood, name)
+                    other, source, other_kind = first.setdefault(joint, (key, name, kind))
+                    if source != name:
+                        raise ValueError(
+                            f"separate makes the name {joint!r} of two parameters, {source!r} and {name!r}; rename "
+                            "likelihoods"
+                        )
+                    if kind != other_kind:
+                        raise ValueError(
+                            f"{joint!r} is a structural parameter in {other!r} and a noise parameter in {key!r}; "
+                            "rename one of them, or put the name into separate="
+                        )
+                    other, expected = units.setdefault(joint, (key, unit)) if unit else (key, unit)
+                    if unit != expected:
+                        raise ValueError(
+                            f"the parameter {joint!r} must have one unit; it is in {expected} in {other!r} and in "
+                            f"{unit} in {key!r}: rename it in one of them, give both models one unit or nominal value, "
+                            "or put the name into separate="
+                        )
+        self.parameter_names = tuple(first)
         self._columns = {
-            key: [index[self._joint_name(key, name)] for name in likelihood.parameter_names]
+            key: [self.parameter_names.index(self._joint_name(key, name)) for name in likelihood.parameter_names]
             for key, likelihood in self.likelihoods.items()
         }
-        self._check_units()
-
-    def __call__(self, x: Any) -> np.ndarray | float:
-        """Same as `log_likelihood`."""
-        return self.log_likelihood(x)
+        kinds = [kind for *_, kind in first.values()]
+        self.fast_parameters = tuple(range(kinds.count("structural"), len(kinds)))
 
     def __getitem__(self, name: str) -> FELikelihood:
         """One of the likelihoods; ValueError for an unknown name."""
@@ -127,48 +125,9 @@ class JointLikelihood:
             raise ValueError(f"no likelihood {name!r}; the likelihoods are {', '.join(map(repr, self.likelihoods))}")
         return self.likelihoods[name]
 
-    @property
-    def ndim(self) -> int:
-        """Number of parameters."""
-        return len(self.parameter_names)
-
-    def log_likelihood(self, x: Any) -> np.ndarray | float:
-        """Sum of the log-likelihoods.
-
-        Parameters
-        ----------
-        x : array_like (ndim,) or (n, ndim), or mapping
-            A mapping has a value, or n values, for every parameter name.
-
-        Returns
-        -------
-        float or (n,) float
-            -inf where one of the terms is; never NaN. Nothing is simulated where the noise parameters are impossible
-            for one likelihood.
-        """
-        points = as_points(x, self.parameter_names)
-        rows = np.atleast_2d(points)
-        left = self.possible(rows)
-        total = np.where(left, 0.0, -np.inf)
-        for likelihood, columns in self.parts():
-            if left.any():
-                total[left] += likelihood.log_likelihood(rows[left][:, columns])
-                left = total > -np.inf
-        return total if points.ndim == 2 else float(total[0])
-
-    def possible(self, rows: np.ndarray) -> np.ndarray:
-        """Whether each of the points (n, ndim) is possible for all likelihoods, see `FELikelihood.possible`."""
-        return np.all([likelihood.possible(rows[:, columns]) for likelihood, columns in self.parts()], axis=0)
-
     def parts(self) -> list[tuple[FELikelihood, list[int]]]:
         """The likelihoods in the order of their evaluation, with the indices of their parameters."""
         return [(likelihood, self._columns[key]) for key, likelihood in self.likelihoods.items()]
-
-    def fault(self, x: Any) -> str:
-        """Reason of a failed simulation whose cause is not the model, as `FELikelihood.fault`; empty if none failed."""
-        point = as_points(x, self.parameter_names)
-        faults = (self.likelihoods[key].fault(point[columns]) for key, columns in self._columns.items())
-        return next(filter(None, faults), "")
 
     def samples_of(self, name: str, samples: Any, noise: bool = False) -> dict[str, np.ndarray]:
         """Parameter samples for one likelihood, under its own names.
@@ -204,10 +163,6 @@ class JointLikelihood:
             raise ValueError(f"the samples have no {', '.join(missing)}, which the likelihood {name!r} needs")
         return {each: np.asarray(samples[self._joint_name(name, each)]) for each in wanted}
 
-    def __getattr__(self, name: str) -> Any:
-        """An entry of the report, such as ``simulations``."""
-        return reported(self, name)
-
     def report(self) -> dict:
         """Summary of all simulations, and under ``"likelihoods"`` a summary for each, see `Posterior.report`."""
         parts = {key: likelihood.report() for key, likelihood in self.likelihoods.items()}
@@ -233,11 +188,6 @@ class JointLikelihood:
                 described.setdefault(joint, each._replace(name=joint))
         return tuple(described[name] for name in self.parameter_names)
 
-    @property
-    def data_fingerprint(self) -> str:
-        """Hex digest of all measurements, in any order: evidences for the same measurements can be compared."""
-        return combined_digest([digest for each in self.likelihoods.values() for digest in each.data_digests()])
-
     def density_parts(self) -> list[str]:
         """Texts that identify the density, as `FELikelihood.density_parts`."""
         parts: list[str] = []
@@ -260,17 +210,10 @@ class JointLikelihood:
                 f"{', '.join(shared)} belong to several likelihoods and cannot be integrated out; give each likelihood "
                 f"its own with separate={shared!r}"
             )
-        # a name is shared by all likelihoods or by none, so each part needs its own priors only
-        parts = {
-            key: likelihood.marginal(
-                {
-                    name: priors[self._joint_name(key, name)]
-                    for name in _noise_names(likelihood)
-                    if self._joint_name(key, name) in priors
-                }
-            )
-            for key, likelihood in self.likelihoods.items()
-        }
+        parts = {}
+        for key, likelihood in self.likelihoods.items():
+            names = {name: self._joint_name(key, name) for name in likelihood.parameter_names}
+            parts[key] = likelihood.marginal({name: priors[joint] for name, joint in names.items() if joint in priors})
         structural = {name for likelihood in parts.values() for name in likelihood.parameter_names}
         result = JointLikelihood(parts, separate=[name for name in self.separate if name in structural])
         result.separate = self.separate  # names of the noise that `draw_noise` draws
@@ -278,11 +221,6 @@ class JointLikelihood:
 
     def draw_noise(self, x: Any, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Complete samples (n,) of all parameters from structural ones (n, ndim), see `Posterior.draw_noise`."""
-        if self.fast_parameters:
-            raise ValueError(
-                f"the noise parameters {', '.join(self.parameter_names[self.fast_parameters[0] :])} are in the samples "
-                "of this posterior; draw_noise is for posteriors from which they are integrated out, see marginal()"
-            )
         points = np.atleast_2d(as_points(x, self.parameter_names))
         rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
         named = dict(zip(self.parameter_names, points.T, strict=True))
@@ -294,26 +232,6 @@ class JointLikelihood:
     def _joint_name(self, key: str, name: str) -> str:
         """Name that a parameter of one likelihood has in the joint likelihood."""
         return f"{name}_{key}" if name in self.separate else name
-
-    def _check_units(self) -> None:
-        """Raise ValueError if a parameter has different units, or multiples of different nominal values."""
-        seen: dict[str, tuple[str, str]] = {}
-        for key, likelihood in self.likelihoods.items():
-            for name in likelihood.parameter_names:
-                unit, joint = _unit(likelihood, name), self._joint_name(key, name)
-                if unit is None:
-                    continue
-                other, expected = seen.setdefault(joint, (key, unit))
-                if unit != expected:
-                    raise ValueError(
-                        f"the parameter {joint!r} must have one unit; it is in {expected} in {other!r} and in {unit} "
-                        f"in {key!r}: rename it in one of them, give both models one unit or nominal value, or put the "
-                        "name into separate="
-                    )
-
-
-def _noise_names(likelihood: FELikelihood) -> tuple[str, ...]:
-    return tuple(likelihood.parameter_names[len(likelihood.model.parameter_names) :])
 
 
 def _unit(likelihood: FELikelihood, name: str) -> str | None:

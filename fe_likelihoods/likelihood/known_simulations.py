@@ -4,8 +4,8 @@ Statistics are computed from a cached response, which is in double precision, wi
 simulation.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,30 +19,22 @@ from .failure_log import FailureLog
 __all__ = ["KnownSimulations", "Requested"]
 
 
-class Requested(NamedTuple):
-    """Distinct simulations that were requested, with arrays that are filled in."""
+class Requested:
+    """Distinct simulations that were requested, of which known results are filled in.
 
-    keys: list[bytes]  # n keys, see `distinct_keys`
-    thetas: np.ndarray  # structural parameters (n, n_structural)
-    misfit: np.ndarray  # statistics (n, n_numbers), NaN where not known
-    known: np.ndarray  # (n,) whether the statistics are known, including failures
-    reasons: list[str]  # of n failures
-    response: np.ndarray | None  # (n, n_channels, n_steps), if requested
-    cached: np.ndarray  # (n,) whether no simulation was needed
-    on_disk: np.ndarray  # (n,) whether the result came from the disk
+    For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
+    `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether a result is `known` (its
+    statistics), complete so that nothing is to be simulated (`done`), read from the disk (`on_disk`).
+    """
 
-    @classmethod
-    def of(
-        cls,
-        keys: list[bytes],
-        n_structural: int,
-        misfit: np.ndarray,
-        known: np.ndarray,
-        response: np.ndarray | None = None,
-    ) -> "Requested":
-        """A request whose statistics are in memory where `known`."""
-        n, thetas = len(keys), thetas_of(keys, n_structural)
-        return cls(keys, thetas, misfit, known, [""] * n, response, np.zeros(n, bool), np.zeros(n, bool))
+    def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun) -> None:
+        model = run.model
+        self.keys, self.thetas = keys, thetas_of(keys, len(model.parameter_names))
+        self.finite = np.isfinite(self.thetas).all(axis=1)
+        self.reasons = ["" if fine else "the parameters are not finite" for fine in self.finite]
+        self.responses = np.full((len(keys), len(model.channels), model.n_steps), np.nan) if full else None
+        self.statistics, self.known = np.empty(0), np.empty(0, bool)
+        self.on_disk, self.done = np.zeros((2, len(keys)), bool)
 
 
 class KnownSimulations:
@@ -69,100 +61,95 @@ class KnownSimulations:
         statistics, _ = self.memory.look_up([theta.tobytes() for theta in thetas], run.n_numbers)
         return list(zip(thetas, statistics, strict=True))
 
-    def fill(self, requested: Requested, run: VerifyingRun) -> None:
-        """Fill in what is known; some rows of the disk may be simulated again for verification."""
-        self._fill_statistics(requested, run)
-        if requested.response is None and requested.known.all():  # the usual case, and the fastest
-            requested.cached[:] = True
-            return
-        failed = requested.known & ~np.isfinite(requested.misfit).all(axis=1)
-        # a failure needs no response
-        requested.cached[:] = requested.known if requested.response is None else failed
-        self._name_failures(requested, np.flatnonzero(failed), run)
-        left = np.flatnonzero(~requested.cached)
-        size = most_responses(run.model)
-        for start in range(0, len(left), size):
-            self._fill_responses(requested, left[start : start + size], run)
+    def look_up(self, keys: list[bytes], full: bool, run: VerifyingRun) -> Requested:
+        """What is known of distinct keys, with responses if `full`; rows of the disk may be simulated to verify them.
 
-    def _fill_statistics(self, requested: Requested, run: VerifyingRun) -> None:
-        """Fill in statistics from the cache on disk; they are then cached in memory, and failures recorded."""
-        new = np.flatnonzero(~requested.known)
-        if self._checked.rows is None or not len(new):
-            return
-        stored = self._verified(self._checked.rows.look_up, self._key, requested.thetas[new], run)
-        known = stored.known
-        rows = new[known]
-        requested.misfit[rows] = stored.values[known]
-        requested.known[rows] = requested.on_disk[rows] = True
-        for row, reason in zip(new, stored.reasons, strict=True):
-            requested.reasons[row] = reason
-        self._note(requested, rows, run)
-
-    def _verified(self, look_up: Callable, *arguments: Any) -> Any:
-        """Rows from the disk. Some are simulated again; if they differ, the caches in memory are emptied."""
+        A point whose statistics are known without its response is not done in a `full` request, unless it failed.
+        """
+        requested = Requested(keys, full, run)
+        requested.statistics, known = self.memory.look_up(keys, run.n_numbers)
+        requested.known = np.array(known, dtype=bool) | ~requested.finite
         try:
-            return look_up(*arguments)
+            self._fill(requested, run)
         except StaleCache:
             self.clear()
             raise
+        return requested
 
-    def _fill_responses(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
+    def _fill(self, requested: Requested, run: VerifyingRun) -> None:
+        stored, full = self._checked.rows, requested.responses is not None
+        new = np.flatnonzero(~requested.known)
+        if stored is not None and len(new):
+            rows = stored.look_up(self._key, requested.thetas[new], run)
+            reasons = [rows.reasons[place] for place in np.flatnonzero(rows.known)]
+            self._enter(requested, new[rows.known], rows.values[rows.known], reasons, run, on_disk=True)
+        requested.done = requested.known.copy()
+        if full:  # a failure needs no response
+            requested.done[np.isfinite(requested.statistics).all(axis=1)] = False
+            for row in np.flatnonzero(requested.done):
+                reason = requested.reasons[row] or self._failures.reason(requested.thetas[row])
+                requested.reasons[row] = reason or "the simulation failed before"
+        left, size = np.flatnonzero(~requested.done), most_responses(run.model)
+        if stored is not None or len(self.responses):
+            for start in range(0, len(left), size):
+                self._fill_from_responses(requested, left[start : start + size].tolist(), run)
+
+    def _fill_from_responses(self, requested: Requested, rows: list[int], run: VerifyingRun) -> None:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
-        model, stored_rows = run.model, self._checked.rows
-        outcomes: list[np.ndarray | str | None] = [None] * len(rows)
-        keys = [requested.keys[row] for row in rows]
-        if len(self.responses):
-            outcomes = self.responses.look_up(model.fingerprint, keys)
-        left = [place for place, outcome in enumerate(outcomes) if outcome is None]
-        if stored_rows is not None and left:
-            stored = self._verified(stored_rows.look_up_responses, requested.thetas[rows[left]], run)
-            found = [(place, response) for place, response in zip(left, stored, strict=True) if response is not None]
-            for place, response in found:
-                outcomes[place] = response
-                requested.on_disk[rows[place]] = True
-            if requested.response is not None and found:
-                found_keys = [keys[place] for place, _ in found]
-                self.responses.store(model.fingerprint, found_keys, [response for _, response in found])
-        places = [place for place, outcome in enumerate(outcomes) if outcome is not None]
-        if not places:
+        model, stored = run.model, self._checked.rows
+        found: list[np.ndarray | str | None] = [None] * len(rows)
+        if len(self.responses):  # a fingerprint takes longer
+            found = self.responses.look_up(model.fingerprint, [requested.keys[row] for row in rows])
+        outcomes = {row: outcome for row, outcome in zip(rows, found, strict=True) if outcome is not None}
+        left = [row for row in rows if row not in outcomes]
+        if stored is not None and left:
+            read = zip(left, stored.look_up_responses(requested.thetas[left], run), strict=True)
+            from_disk = {row: response for row, response in read if response is not None}
+            requested.on_disk[list(from_disk)] = True
+            outcomes |= from_disk
+            if requested.responses is not None and from_disk:
+                keys = [requested.keys[row] for row in from_disk]
+                self.responses.store(model.fingerprint, keys, list(from_disk.values()))
+        if not outcomes:
             return
-        rows, outcomes = rows[places], [outcomes[place] for place in places]
-        nothing = np.full((len(model.channels), model.n_steps), np.nan)
-        reasons = [outcome if isinstance(outcome, str) else "" for outcome in outcomes]
-        response = np.array([nothing if isinstance(outcome, str) else outcome for outcome in outcomes])
-        if requested.response is not None:
-            requested.response[rows] = response
-        new = np.flatnonzero(~requested.known[rows])
-        if len(new):
-            batch = SimulationBatch(response[new], [reasons[place] for place in new])
-            misfit, reasons_of_new = misfit_of_responses(model, batch, run.measured, run.statistic)
-            requested.misfit[rows[new]], requested.known[rows[new]] = misfit, True
-            for row, reason in zip(rows[new], reasons_of_new, strict=True):
-                requested.reasons[row] = reason
-                if reason and requested.response is not None:
-                    requested.response[row] = np.nan
-            self._note(requested, rows[new], run)
-            if stored_rows is not None:
-                stored_rows.store(self._key, requested.thetas[rows[new]], misfit, reasons_of_new, None, 0.0, run)
-        requested.cached[rows] = True
+        requested.done[list(outcomes)] = True
+        new = [row for row in outcomes if not requested.known[row]]
+        if requested.responses is not None:
+            for row, outcome in outcomes.items():
+                requested.responses[row] = np.nan if isinstance(outcome, str) else outcome
+        if new:
+            responses = np.full((len(new), len(model.channels), model.n_steps), np.nan)
+            reasons = [outcomes[row] if isinstance(outcomes[row], str) else "" for row in new]
+            for response, row in zip(responses, new, strict=True):
+                response[:] = np.nan if isinstance(outcomes[row], str) else outcomes[row]
+            batch = SimulationBatch(responses, reasons)
+            statistics, reasons = misfit_of_responses(model, batch, run.measured, run.statistic)
+            self._enter(requested, new, statistics, reasons, run)
+            if stored is not None:
+                stored.store(self._key, requested.thetas[new], statistics, reasons, None, 0.0, run)
 
-    def _note(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
-        """Count simulations whose statistics came from the disk or from a response, and cache these in memory."""
+    def _enter(
+        self,
+        requested: Requested,
+        rows: Sequence[int] | np.ndarray,
+        statistics: np.ndarray,
+        reasons: list[str],
+        run: VerifyingRun,
+        on_disk: Any = False,
+    ) -> None:
+        """Fill in statistics (n, n_numbers) that were not known in memory, cache them there, and count failures."""
         if not len(rows):
             return
+        requested.statistics[rows], requested.known[rows] = statistics, True
+        requested.on_disk[rows] |= on_disk
+        for row, reason in zip(rows, reasons, strict=True):
+            requested.reasons[row] = reason
+            if reason and requested.responses is not None:
+                requested.responses[row] = np.nan
         self._checked.has_results = True
         if not self._has_repeated_remark:
             self._has_repeated_remark = True
             if self._checked.rows is not None:
                 self._checked.rows.cache.repeat_remark(run.model)
-        self._failures.count_outcomes(requested.thetas[rows], [requested.reasons[row] for row in rows])
-        self.memory.store([requested.keys[row] for row in rows], requested.misfit[rows])
-
-    def _name_failures(self, requested: Requested, rows: np.ndarray, run: VerifyingRun) -> None:
-        """Fill in failure reasons where only the statistics were cached."""
-        rows = [row for row in rows if not requested.reasons[row]]
-        if not rows or requested.response is None:
-            return
-        outcomes = self.responses.look_up(run.model.fingerprint, [requested.keys[row] for row in rows])
-        for row, outcome in zip(rows, outcomes, strict=True):
-            requested.reasons[row] = outcome if isinstance(outcome, str) else "the simulation failed before"
+        self._failures.count_outcomes(requested.thetas[rows], reasons)
+        self.memory.store([requested.keys[row] for row in rows], statistics)

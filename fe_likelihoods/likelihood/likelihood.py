@@ -29,15 +29,16 @@ from ..signals.comparison import Comparison
 from ..signals.events import join_measurements
 from ..signals.sampling import same_step
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, first_part, simulate_batch
-from .data_identity import combined_digest, data_digests
+from .data_identity import data_digests
 from .inputs import check_model, check_noise, match_measurements
 from .parameters import Parameter, describe_parameters
-from .simulator import Simulator, reported
+from .simulator import Simulator
+from .sum_of_parts import SumOfParts
 
 __all__ = ["FELikelihood"]
 
 
-class FELikelihood:
+class FELikelihood(SumOfParts):
     """Log-likelihood of structural parameters and noise parameters, given measurements.
 
     Calling the object is `log_likelihood`.
@@ -170,44 +171,15 @@ class FELikelihood:
         """What responses are compared with: values (n_channels, n_steps), or a `Comparison` if samples are missing."""
         return self.simulator.measured
 
-    def __getattr__(self, name: str) -> Any:
-        """An entry of the report, such as ``simulations`` or ``failures``."""
-        return reported(self, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; AttributeError for those of the simulator, such as ``pool``, which have no effect here."""
-        if name in vars(vars(self).get("simulator", object)):
-            raise AttributeError(f"{name!r} belongs to the simulator: set likelihood.simulator.{name}")
-        super().__setattr__(name, value)
-
     @property
     def fingerprint(self) -> str:
         """Hex digest of everything the statistics are known to depend on, see `Simulator.fingerprint`."""
         return self.simulator.fingerprint
 
-    def __call__(self, x: Any) -> np.ndarray | float:
-        """Same as `log_likelihood`."""
-        return self.log_likelihood(x)
-
-    @property
-    def ndim(self) -> int:
-        """Number of parameters."""
-        return len(self.parameter_names)
-
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Units, nominal values and labels of the parameters."""
         return describe_parameters(self.model, self.noise)
-
-    @property
-    def data_fingerprint(self) -> str:
-        """Hex digest of the samples that are compared: equal for likelihoods of the same data.
-
-        The order of the channels has no effect. Times count from the start of each event and missing samples do not
-        count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared. A noise with unknown
-        time shifts leaves out samples near the ends of the response, so its digest depends on the largest shift.
-        """
-        return combined_digest(self.data_digests())
 
     def data_digests(self) -> list[str]:
         """Digests of the compared samples, one for each event; one digest if there are no events."""
@@ -273,11 +245,11 @@ class FELikelihood:
                 f"expected one point, of shape ({n_structural},), or ({self.ndim},) with the noise parameters; "
                 f"got shape {theta.shape}"
             )
-        shifts = self._shifts_of(theta)
+        self._shifts_of(theta)
         response, (reason,) = simulate_batch(self.model, theta[None, :n_structural])
         if reason:
             raise SimulationFailed(reason)
-        return self._residuals(response[0], shifts)
+        return self.residuals_of(response[0], theta)
 
     def residuals_of(self, response: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Measured minus simulated response, as `residuals`, from a response that is known: nothing is simulated.
@@ -294,9 +266,7 @@ class FELikelihood:
         (n_channels, n_steps) float
             [SI]; NaN where a sample is missing.
         """
-        return self._residuals(np.asarray(response, dtype=float), self._shifts_of(np.asarray(theta, dtype=float)))
-
-    def _residuals(self, response: np.ndarray, shifts: Mapping[str, float]) -> np.ndarray:
+        response, shifts = np.asarray(response, dtype=float), self._shifts_of(np.asarray(theta, dtype=float))
         if shifts:
             times = {name: self.measurements.times(name) - shift for name, shift in shifts.items()}
             return -self.measured.residuals_at(response, self.model.dt, self.measurements.channels, times)
@@ -320,37 +290,6 @@ class FELikelihood:
             raise ValueError(f"the time shifts of {', '.join(beyond)} are beyond the largest ones, {dict(largest)} s")
         return shifts
 
-    def log_likelihood(self, x: Any) -> np.ndarray | float:
-        """Log-likelihood of structural parameters followed by noise parameters.
-
-        Parameters
-        ----------
-        x : array_like (ndim,) or (n, ndim), or mapping
-            A mapping has a value, or n values, for every parameter name.
-
-        Returns
-        -------
-        float or (n,) float
-            -inf where a simulation fails, where the noise parameters are impossible (nothing is simulated there) and
-            where x is not finite; never NaN.
-        """
-        points, n = as_points(x, self.parameter_names), self.simulator.n_structural
-        if points.ndim == 2:
-            possible = self.possible(points)
-            result = np.full(len(points), -np.inf)
-            if possible.any():
-                misfit = self.simulator.statistics(points[possible, :n])
-                result[possible] = self.of_statistics(points[possible], misfit)
-            return result
-        # most calls of many samplers: whether one point is possible is asked only if its simulation is not cached
-        row, misfit = points[None], self.simulator.in_memory(points[:n])
-        if misfit is None:
-            misfit = self.simulator.statistics(row[:, :n], lambda: bool(self.possible(row)[0]))
-        (value,) = self.noise.log_likelihood(misfit, self.n_samples, row[:, n:])
-        if not abs(value) < np.inf:
-            value = self.of_statistics(row, misfit)[0] if self.possible(row)[0] else -np.inf
-        return float(value)
-
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""
         return self.simulator.misfit(thetas)
@@ -360,32 +299,24 @@ class FELikelihood:
         return self.simulator.simulate(thetas)
 
     def of_statistics(self, rows: np.ndarray, misfit: np.ndarray) -> np.ndarray:
-        """Log-likelihood of points with possible noise parameters, from the statistics of their simulations.
+        """Log-likelihood (n,) of points (n, ndim) from the statistics (n, n_numbers) of their simulations.
 
-        Parameters
-        ----------
-        rows : (n, ndim) float
-            Structural parameters, then noise parameters.
-        misfit : (n, n_numbers) float
-            What `Simulator.statistics` returns for them.
-
-        Returns
-        -------
-        (n,) float
-            -inf where the simulation failed.
+        -inf where the simulation failed, or where the noise parameters are impossible.
         """
         values = self.noise.log_likelihood(misfit, self.n_samples, rows[:, self.simulator.n_structural :])
-        usable = values < np.inf  # neither NaN nor infinite
         simulated = np.isfinite(misfit).all(axis=1)
-        for row in np.flatnonzero(simulated & ~usable):
-            self.simulator.failures.add(
-                rows[row, : self.simulator.n_structural], f"the log-likelihood of the noise is {values[row]}"
-            )
-        return np.where(simulated & usable, values, -np.inf)
+        usable = simulated & (values < np.inf)  # neither NaN nor infinite
+        if usable.all():
+            return values
+        if (wrong := simulated & ~usable).any():
+            for row in np.flatnonzero(wrong & self.possible(rows)):
+                reason = f"the log-likelihood of the noise is {values[row]}"
+                self.simulator.failures.add(rows[row, : self.simulator.n_structural], reason)
+        return np.where(usable, values, -np.inf)
 
     def parts(self) -> list[tuple["FELikelihood", list[int]]]:
-        """This likelihood with the indices of its parameters, as `JointLikelihood.parts`."""
-        return [(self, list(range(self.ndim)))]
+        """This likelihood with the indices of its parameters."""
+        return [(self, list(range(len(self.parameter_names))))]
 
     def possible(self, rows: np.ndarray) -> np.ndarray:
         """Whether each of the points (n, ndim) is finite and has possible noise parameters; nothing is simulated."""
@@ -451,21 +382,6 @@ class FELikelihood:
         sigmas = self.noise.draw(self.simulator.misfit(points), self.n_samples, uniform)
         names = (*self.parameter_names, *drawn)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
-
-    def fault(self, x: Any) -> str:
-        """Reason of a failed simulation whose cause is not the model, such as a worker that was killed.
-
-        Parameters
-        ----------
-        x : array_like (ndim,), or mapping
-            A point whose log-likelihood was computed in this process.
-
-        Returns
-        -------
-        str
-            Empty where the simulation succeeded, or its failure is an answer of the model.
-        """
-        return self.simulator.failures.fault(as_points(x, self.parameter_names)[: self.simulator.n_structural])
 
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.

@@ -113,15 +113,13 @@ class Posterior:
         """Hex digest of the measurements: evidences of posteriors with the same digest can be compared."""
         return self.likelihood.data_fingerprint
 
-    def __call__(self, x: Any) -> np.ndarray | float:
-        """Same as `log_prob`."""
-        log_prior, log_likelihood = self._evaluate(x)
-        return log_prior + log_likelihood
-
     def log_prob(self, x: Any) -> np.ndarray | float:
         """Log-prior plus log-likelihood: the posterior density up to the evidence."""
-        log_prior, log_likelihood = self._evaluate(x)
-        return log_prior + log_likelihood
+        points = as_points(x, self.prior.names)
+        log_prior = self.prior.logpdf(points)
+        return log_prior + self.likelihood.log_likelihood(points, log_prior > -np.inf)
+
+    __call__ = log_prob
 
     def log_prior(self, x: Any) -> np.ndarray | float:
         """Normalised log-density of the prior: -inf outside its support and where x is NaN."""
@@ -129,7 +127,8 @@ class Posterior:
 
     def log_likelihood(self, x: Any) -> np.ndarray | float:
         """Log-likelihood; -inf outside the support of the prior, where nothing is simulated."""
-        return self._evaluate(x)[1]
+        points = as_points(x, self.prior.names)
+        return self.likelihood.log_likelihood(points, self.prior.logpdf(points) > -np.inf)
 
     def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
         """`log_likelihood` with -1e100 instead of -inf, for clients that reject infinite values.
@@ -206,6 +205,10 @@ class Posterior:
             f"of {n}); report() has the reasons: correct the model or narrow the prior"
         )
 
+    def first(self, seconds: float) -> "Posterior":
+        """The posterior of the first part of the measurements, see `FELikelihood.first`."""
+        return Posterior(self.likelihood.first(seconds), self.prior)
+
     def marginal(self) -> "Posterior":
         """The same posterior with the standard deviations of its white noise integrated out.
 
@@ -268,8 +271,7 @@ class Posterior:
         ------
         ValueError
             If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, the
-            noise uses statistics that are not quadratic in the residuals, or a data set of a `JointLikelihood` has
-            missing samples or times of its own.
+            noise uses statistics that are not quadratic in the residuals, or channels have unknown time shifts.
 
         Notes
         -----
@@ -403,18 +405,6 @@ class Posterior:
             of the simulations). For a `JointLikelihood` also ``likelihoods``, the report of each part.
         """
         return self.likelihood.report()
-
-    def _evaluate(self, x: Any) -> tuple[np.ndarray | float, np.ndarray | float]:
-        """Log-prior and log-likelihood of one point, or (n,) of n points; nothing is simulated outside the support."""
-        points = as_points(x, self.prior.names)
-        log_prior = self.prior.logpdf(points)
-        if points.ndim == 1:
-            return log_prior, self.likelihood.log_likelihood(points) if log_prior > -np.inf else -np.inf
-        log_likelihood = np.full(len(points), -np.inf)
-        inside = log_prior > -np.inf
-        if inside.any():
-            log_likelihood[inside] = self.likelihood.log_likelihood(points[inside])
-        return log_prior, log_likelihood
 
 
 def _family(distribution: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..noise.draws import SampleNoise, sample_noise
 from ..noise.marginal import MarginalNoise
-from ..noise.protocol import noise_time_shifts, noise_title
+from ..noise.protocol import noise_title
 from ..noise.time_shifts import ShiftedNoise
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
@@ -184,16 +184,8 @@ def _responses(likelihood: FELikelihood, rows: np.ndarray) -> np.ndarray:
 
 def _residuals(likelihood: FELikelihood, rows: np.ndarray, responses: np.ndarray) -> np.ndarray:
     """Simulated minus measured response of each row, (n, n_channels, n_samples) [SI], NaN where a sample is missing."""
-    if not isinstance(likelihood.measured, Comparison):
-        return responses - likelihood.measured
-    if not (shifted := noise_time_shifts(likelihood.noise)):
-        return np.stack([likelihood.measured.residuals(response) for response in responses])
-    measurements, found = likelihood.measurements, []
-    for response, row in zip(responses, rows, strict=True):
-        values = dict(zip(likelihood.parameter_names, row, strict=True))
-        times = {name: measurements.times(name) - values[f"time_shift_{name}"] for name in shifted}
-        found.append(likelihood.measured.residuals_at(response, likelihood.model.dt, measurements.channels, times))
-    return np.stack(found)
+    pairs = zip(responses, rows, strict=True)
+    return -np.stack([likelihood.residuals_of(response, row) for response, row in pairs])
 
 
 def _errors(

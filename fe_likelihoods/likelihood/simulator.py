@@ -1,21 +1,20 @@
 """Simulations of a model and their statistics against measurements: each is run once, counted, cached and verified.
 
-A request first takes what is known (`fe_likelihoods.likelihood.known_simulations`). The other simulations are run in a
-pool to which single items can be submitted, where each is cached when it arrives and nothing waits for a batch.
-Otherwise they are run in parts, and each part is cached when it has ended: in this process (compiled models on
-threads), or by the ``map`` of a pool. Callers use the same methods for both: `start`, `wait`, `leave`.
+A request first takes what is known (`fe_likelihoods.likelihood.known_simulations`). The other simulations are sent to
+a pool to which single items can be submitted, and each is cached when it arrives, so that nothing waits for a batch.
+Without such a pool they are run in parts, and each part is cached when it has ended: in this process (compiled models
+on threads), or by the ``map`` of a pool.
 """
 
 import hashlib
 import os
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future
 from functools import partial
-from queue import SimpleQueue
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,54 +44,67 @@ from .checked_model import CheckedModel
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
 from .known_simulations import KnownSimulations, Requested
-from .running_simulations import RunningRequests, RunningSimulation, Simulated, take_all
 
-__all__ = ["COUNTS", "Simulator", "reported"]
-
-COUNTS = (  # numbers of the report, which are added for several simulators
-    "simulations",
-    "verifications",
-    "unverified",
-    "cache_hits",
-    "disk_hits",
-    "failure_count",
-    "transient_failures",
-    "seconds",
-)
+__all__ = ["Simulated", "Simulation", "Simulator", "take_all"]
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
 
 
-def reported(likelihood: Any, name: str) -> Any:
-    """An entry of the report that is read as an attribute of a likelihood; AttributeError for any other name."""
-    if name not in (*COUNTS, "failures", "failure_reasons"):
-        moved = name[0] != "_" and hasattr(vars(likelihood).get("simulator"), name)
-        hint = f": it belongs to the simulator, as likelihood.simulator.{name}" if moved else ""
-        raise AttributeError(f"{type(likelihood).__name__!r} object has no attribute {name!r}{hint}")
-    return likelihood.report()[name]
+class Simulated(NamedTuple):
+    """Result of one simulation: its statistics, the reason of a failure, and its response if it was requested."""
+
+    statistics: np.ndarray
+    reason: str
+    response: np.ndarray | None
 
 
-class _Pool:
+class Simulation:
+    """A simulation that was requested of a `Simulator`, by the key of its parameters (see `distinct_keys`).
+
+    A known one has a `result` at once. One that was sent to a pool has a `future`; it is `received` when it has ended
+    or was cancelled, and then has a `result`, or an `error` for which the model is not to blame. `full` ones return
+    their response.
+    """
+
+    __slots__ = ("error", "full", "future", "key", "received", "result")
+
+    def __init__(self, key: bytes, full: bool, future: Future | None = None, result: Simulated | None = None) -> None:
+        self.key, self.full, self.future, self.result = key, full, future, result
+        self.error: BaseException | None = None
+        self.received = False
+
+
+def take_all(arrived: SimpleQueue, wait: bool) -> list[Simulation]:
+    """All items of a queue; with `wait`, at least one."""
+    items = [arrived.get()] if wait else []
+    try:
+        while True:
+            items.append(arrived.get_nowait())
+    except Empty:
+        return items
+
+
+class _Running:
     """What runs in a pool for one simulator, in one process."""
 
     def __init__(self) -> None:
         self.owner, self.lock = os.getpid(), threading.RLock()
-        self.running: dict[tuple[bytes, bool], RunningSimulation] = {}
-        self.function: tuple[Any, bool, Callable] | None = None  # model, whether responses are returned, what is sent
-        self.counted_until = self.compared_at = 0.0  # of the wall time [s]
+        self.simulations: set[Simulation] = set()
+        self.functions: dict[bool, tuple[Model, Callable]] = {}  # that are sent, so that each is pickled once
+        self.since = self.counted_until = 0.0  # wall time of the first of them, and of the last arrival [s]
 
 
 class Simulator:
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
-    `statistics` and, where responses are needed, `simulate` are the only places where a likelihood requests
-    simulations; samplers without barriers and guides use `start`, `wait` and `leave`. Options are those of
-    `FELikelihood`; the statistic is the sums of squares by default, and `time_shifts` are the largest unknown ones [s].
-    `measured` are values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`,
-    `cache_hits` and `disk_hits` count simulations run by this object in this process, cached rows, and rows from the
-    disk; `failures` include known ones from the disk. `chunk_size` simulations are run between two writes to the disk,
-    adapted to their duration; `when_simulated` is called with the number that have ended, in this process only.
+    `statistics` and, where responses are needed, `simulate` wait for their simulations. `request`, `receive` and
+    `leave` are for those who go on meanwhile, and need a pool that `streams`. Options are those of `FELikelihood`; the
+    statistic is the sums of squares by default, and `time_shifts` are the largest unknown ones [s]. `measured` are
+    values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and
+    `disk_hits` count simulations run by this object in this process, cached rows, and rows from the disk; `failures`
+    include known ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their
+    duration; `when_simulated` is called with the number that have ended, in this process only.
     """
 
     def __init__(
@@ -124,7 +136,7 @@ class Simulator:
         self.simulations = self.cache_hits = self.disk_hits = 0
         self._seconds = 0.0
         self.when_simulated: Callable[[int], None] | None = None
-        self._in_pool: _Pool | None = None
+        self._in_pool: _Running | None = None
 
     def __getstate__(self) -> dict:
         return self.__dict__ | {"pool": None, "when_simulated": None, "_in_pool": None}
@@ -192,27 +204,30 @@ class Simulator:
         """Sums of squared residuals (n, n_channels) [SI unit squared], without time shifts; NaN for failures."""
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
-    def statistics(self, thetas: np.ndarray, is_possible: Callable[[], bool] | None = None) -> np.ndarray:
+    def statistics(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None) -> np.ndarray:
         """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural); NaN if failed.
 
-        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. If `is_possible`, called
-        before simulations, returns False, nothing is simulated, and rows that are not cached are NaN. Raises
+        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. Where `possible`, called
+        unless all rows are in memory, is False (n,), nothing is simulated and rows may be NaN. Raises
         `TooManyFailures`, `ChangedModel` or `StaleCache`; simulations that have ended are cached, except after the
         model has changed.
         """
-        thetas = as_rows(thetas, self.model.parameter_names)
-        if not np.isfinite(thetas).all():
-            result = np.full((len(thetas), self.n_numbers), np.nan)
-            finite = np.isfinite(thetas).all(axis=1)
-            if finite.any():
-                result[finite] = self.statistics(thetas[finite], is_possible)
-            return result
-        keys, distinct = distinct_keys(thetas)
-        misfit, cached = self.look_up(keys, distinct, on_disk=True)
-        left = np.flatnonzero(~cached)
-        if len(left) and (is_possible is None or is_possible()):
-            misfit[left] = [new.misfit for new in self._results([keys[row] for row in left], responses=False)]
-        return misfit if len(keys) == len(thetas) else misfit[distinct]
+        keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
+        statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
+        if all(known):
+            self.cache_hits += len(which)
+        elif possible is not None and not (wanted := possible()).all():
+            statistics = np.full((len(which), self.n_numbers), np.nan)
+            if wanted.any():
+                statistics[wanted] = self.statistics(thetas[wanted])
+            return statistics
+        else:
+            requested = self._look_up(keys, which, False)
+            left = np.flatnonzero(~requested.done)
+            statistics = requested.statistics
+            if len(left):
+                statistics[left] = [new.statistics for new in self._new([keys[row] for row in left], False)]
+        return statistics if len(keys) == len(which) else statistics[which]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) [SI] at structural parameters (n, n_structural); NaN and reason if failed.
@@ -221,73 +236,40 @@ class Simulator:
         whose statistics are cached without its response is simulated again, unless it failed. Raises the errors of
         `statistics`.
         """
-        thetas = as_rows(thetas, self.model.parameter_names)
-        finite = np.flatnonzero(np.isfinite(thetas).all(axis=1))
-        keys, distinct = distinct_keys(thetas[finite])
-        requested = self._requested_responses(keys)
-        self._known.fill(requested, self._run)
-        left = np.flatnonzero(~requested.cached)
-        for row, new in zip(left, self._results([keys[row] for row in left], responses=True), strict=True):
-            requested.reasons[row], requested.response[row] = new.reason, new.response
-        counts = np.bincount(distinct, minlength=len(keys))
-        self.disk_hits += int(counts[requested.on_disk].sum())
-        self.cache_hits += int(counts[requested.cached].sum())
-        batch = SimulationBatch(requested.response, requested.reasons)
-        if len(keys) == len(thetas):
-            return batch
-        response = np.full((len(thetas), *batch.response.shape[1:]), np.nan)
-        reasons = ["the parameters are not finite"] * len(thetas)
-        for row, place in zip(finite, distinct, strict=True):
-            response[row], reasons[row] = batch.response[place], batch.reasons[place]
-        return SimulationBatch(response, reasons)
+        keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
+        requested = self._look_up(keys, which, True)
+        left = np.flatnonzero(~requested.done)
+        for row, new in zip(left, self._new([keys[row] for row in left], True), strict=True):
+            requested.responses[row], requested.reasons[row] = new.response, new.reason
+        if len(keys) == len(which):
+            return SimulationBatch(requested.responses, requested.reasons)
+        return SimulationBatch(requested.responses[which], [requested.reasons[row] for row in which])
 
-    def has_responses(self, keys: list[bytes]) -> np.ndarray:
-        """Whether `simulate` needs no simulation for each distinct key (n,); responses on disk are read into memory.
+    def request(self, thetas: np.ndarray, full: bool, arrived: SimpleQueue) -> list[Simulation]:
+        """Simulations at n structural parameters, sent to the pool unless they are known; duplicates are one object.
 
-        Some may be simulated again for verification.
+        Those that have a `future` will come through the queue `arrived` when they have ended: pass them to `receive`,
+        or to `leave` if they are not needed any more. Raises the errors of `statistics`.
         """
-        requested = self._requested_responses(keys)
-        self._known.fill(requested, self._run)
-        return requested.cached
+        keys, which = distinct_keys(thetas)
+        requested = self._look_up(keys, which, full)
+        found: dict[int, Simulation] = {}
+        for row in np.flatnonzero(requested.done).tolist():
+            response = requested.responses[row] if full else None
+            result = Simulated(requested.statistics[row], requested.reasons[row], response)
+            found[row] = Simulation(keys[row], full, result=result)
+        left = np.flatnonzero(~requested.done).tolist()
+        found |= dict(zip(left, self._send([keys[row] for row in left], full, arrived), strict=True))
+        return [found[row] for row in which]
 
     def are_stored(self, thetas: np.ndarray) -> np.ndarray:
         """Whether a response in memory or any result on disk exists (n,); it is neither read nor verified."""
-        stored = np.zeros(len(thetas), dtype=bool)
-        if len(self.response_memory):
-            keys = [row.tobytes() for row in thetas + 0.0]
-            outcomes = self.response_memory.look_up(self.model.fingerprint, keys)
-            stored |= [outcome is not None for outcome in outcomes]
+        keys = [row.tobytes() for row in thetas + 0.0]
+        outcomes = self.response_memory.look_up(self.model.fingerprint, keys)
+        stored = np.array([outcome is not None for outcome in outcomes], dtype=bool)
         if self._checked.rows is not None:
             stored |= self._checked.rows.are_stored(self.cache_keys, thetas, self.model)
         return stored
-
-    def in_memory(self, theta: np.ndarray) -> np.ndarray | None:
-        """Statistics (1, n_numbers) at one point (n_structural,), if a successful simulation is cached in memory."""
-        misfit, (known,) = self.memory_cache.look_up([(theta + 0.0).tobytes()], self.n_numbers)
-        if not known or misfit[0, 0] != misfit[0, 0]:  # NaN
-            return None
-        self.cache_hits += 1
-        return misfit
-
-    def look_up(self, keys: list[bytes], distinct: list[int], on_disk: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Cached statistics (n, n_numbers) of distinct keys, and whether they are cached (n,), without new simulations.
-
-        `distinct` has the index of the key of every requested row, for the counts. With `on_disk`, some rows of the
-        cache may be simulated again for verification.
-        """
-        misfit, known = self.memory_cache.look_up(keys, self.n_numbers)
-        if all(known):
-            self.cache_hits += len(distinct)
-            return misfit, np.ones(len(keys), dtype=bool)
-        known, counts = np.array(known), np.bincount(distinct, minlength=len(keys))
-        if on_disk:
-            left = [key for key, is_known in zip(keys, known, strict=True) if not is_known]
-            requested = Requested.of(left, self.n_structural, misfit[~known], np.zeros(len(left), dtype=bool))
-            self._known.fill(requested, self._run)
-            self.disk_hits += int(counts[~known][requested.on_disk].sum())
-            misfit[~known], known[~known] = requested.misfit, requested.cached
-        self.cache_hits += int(counts[known].sum())
-        return misfit, known
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
         """Cache statistics (n, n_numbers) of an earlier run in memory, unsimulated; ValueError for another shape.
@@ -301,36 +283,20 @@ class Simulator:
                 f"recall: expected statistics of shape ({len(thetas)}, {self.n_numbers}) and {len(thetas)} reasons; "
                 f"got {statistics.shape} and {len(reasons)}. Pass what statistics() returned for the same noise"
             )
-        keys, distinct = distinct_keys(thetas)
+        keys, which = distinct_keys(thetas)
         known = self.memory_cache.look_up(keys, self.n_numbers)[1]
-        for place, row in dict(zip(distinct, range(len(thetas)), strict=True)).items():
+        for place, row in dict(zip(which, range(len(thetas)), strict=True)).items():
             if not known[place] and np.isfinite(thetas[row]).all():
                 self.memory_cache.store([keys[place]], statistics[[row]])
                 self.failures.count_outcomes(thetas[[row]], [reasons[row]])
 
-    def _requested_responses(self, keys: list[bytes]) -> Requested:
-        misfit, known = self.memory_cache.look_up(keys, self.n_numbers)
-        response = np.full((len(keys), len(self.model.channels), self.model.n_steps), np.nan)
-        return Requested.of(keys, self.n_structural, misfit, np.array(known, dtype=bool), response)
-
-    @interrupts_end_the_run()
-    def _results(self, keys: list[bytes], responses: bool) -> list[Simulated]:
-        """Results of new simulations."""
-        arrived: SimpleQueue = SimpleQueue()
-        started = self.start(keys, responses, arrived) if keys else []
-        waiting = dict.fromkeys(started)
-        try:
-            while waiting:
-                for running in self.wait(waiting, arrived):
-                    if running.error is not None:
-                        raise running.error
-                    del waiting[running]
-                if waiting:
-                    self.check_failures()
-        except BaseException:
-            self.leave(list(waiting), arrived, running=True)
-            raise
-        return [running.result for running in started]
+    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> Requested:
+        """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
+        requested = self._known.look_up(keys, full, self._run)
+        counts = np.bincount(which, minlength=len(keys))
+        self.cache_hits += int(counts[requested.done & requested.finite].sum())
+        self.disk_hits += int(counts[requested.on_disk].sum())
+        return requested
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -341,191 +307,164 @@ class Simulator:
 
     def check_failures(self) -> None:
         """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""
-        self.failures.check(len(self._submitted.running))
+        self.failures.check(len(self._running.simulations))
 
-    def running_requests(self) -> RunningRequests:
-        """Requests for responses, several at once; `simulate` then finds the responses in the cache."""
-        return RunningRequests(self)
+    def _new(self, keys: list[bytes], full: bool) -> list[Simulated]:
+        """Results of new simulations of distinct keys: one by one as they arrive from the pool, or in parts."""
+        if self.streams and keys:
+            return self._new_in_pool(keys, full)
+        results: list[Simulated] = []
+        while len(results) < len(keys):
+            self._check_before()
+            left = keys[len(results) :]
+            some = left[: self._chunk(len(left), full)]
+            thetas, start = thetas_of(some, self.n_structural), time.perf_counter()
+            with observed(self._checked.label, self.pool, self._checked.complete):
+                if self._returns_responses(full):
+                    values, reasons = simulate_batch(self.model, thetas, self.pool)
+                else:
+                    values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
+            results += self._record(some, thetas, full, values, reasons, time.perf_counter() - start)
+            # the size grows by steps: the first simulations may be failures that took no time
+            seconds = time.perf_counter() - start
+            self.chunk_size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / seconds))
+        return results
 
-    def start(self, keys: Sequence[bytes], responses: bool, arrived: SimpleQueue) -> list[RunningSimulation]:
-        """Submit simulations of n distinct keys to the pool, unless they run already; returns without waiting for them.
+    def _chunk(self, n: int, full: bool) -> int:
+        """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
+        if self.cache is None and (self.when_simulated is None or self.pool is not None):
+            return n
+        workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
+        one_by_one = self.pool is None and not has_batch_method(self.model)
+        smallest = 1 if one_by_one else _ROUNDS_PER_CHUNK * workers  # so that all workers are busy
+        return min(max(smallest, self.chunk_size), most_responses(self.model) if self._returns_responses(full) else n)
 
-        Without a pool that takes single items, they are run by `wait`. `arrived` receives each simulation that has
-        ended in the pool, for `wait` or `receive`; pass those that are no longer needed to `leave`. Raises
-        `TooManyFailures` and `ChangedModel`.
-        """
-        thetas = thetas_of(keys, self.n_structural)
-        if not self.streams:
-            return [RunningSimulation(key, theta, responses) for key, theta in zip(keys, thetas, strict=True)]
+    @interrupts_end_the_run()
+    def _new_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:
+        arrived: SimpleQueue = SimpleQueue()
+        simulations = self._send(keys, full, arrived)
+        left = dict.fromkeys(simulations)
+        try:
+            while left:
+                ended = take_all(arrived, wait=True)
+                self.receive(ended)
+                for simulation in ended:
+                    if simulation.error is not None:
+                        raise simulation.error
+                    del left[simulation]
+                if left:
+                    self.check_failures()
+        except BaseException:
+            self.leave(left, running=True)
+            raise
+        return [simulation.result for simulation in simulations]
+
+    def _send(self, keys: list[bytes], full: bool, arrived: SimpleQueue) -> list[Simulation]:
+        """Submit simulations of n distinct keys to the pool."""
+        if not keys:
+            return []
         self._check_before()
-        pool = self._submitted
-        with pool.lock:
-            if not pool.running:
-                pool.function = None
-                pool.counted_until = pool.compared_at = time.perf_counter()
-            wanted, new = [], []
-            for key, theta in zip(keys, thetas, strict=True):
-                running = pool.running.get((key, responses))
-                if running is None:
-                    running = pool.running[key, responses] = RunningSimulation(key, theta, responses)
-                    new.append(running)
-                wanted.append(running)
-            if new:
-                try:
-                    futures = self.pool.submit_all(self._sent_function(responses), [running.theta for running in new])
-                except BaseException:
-                    for running in new:
-                        del pool.running[running.key, responses]
-                    raise
-                for running, future in zip(new, futures, strict=True):
-                    running.future = future
-            for running in wanted:  # with the lock: another thread that leaves must not cancel what is wanted here
-                if arrived not in running.users:
-                    running.users.add(arrived)
-                    running.future.add_done_callback(partial(_arrive, arrived, running))
-        return wanted
+        running = self._running
+        with running.lock:
+            if not running.simulations:
+                running.functions.clear()
+                running.since = running.counted_until = time.perf_counter()
+            thetas = list(thetas_of(keys, self.n_structural))
+            futures = self.pool.submit_all(self._sent_function(full), thetas)
+            sent = [Simulation(key, full, future) for key, future in zip(keys, futures, strict=True)]
+            running.simulations.update(sent)
+        for simulation in sent:
+            simulation.future.add_done_callback(partial(_arrive, arrived, simulation))
+        return sent
 
-    def wait(self, waiting: Collection[RunningSimulation], arrived: SimpleQueue) -> list[RunningSimulation]:
-        """Wait until some simulations have ended, which are then counted and cached; each has a `result` or an `error`.
-
-        Unless they run in a pool, a first part of `waiting`, all simulations of one `start`, is run here, with its
-        errors.
-        """
-        if self.streams:
-            ended = take_all(arrived, wait=True)
-            self.receive(ended)
-            return ended
-        self._check_before()
-        waiting = list(waiting)
-        smallest, largest = self._chunk_limits(len(waiting), waiting[0].responses)
-        chosen = waiting[: max(smallest, min(largest, self.chunk_size))]
-        thetas, start = np.array([each.theta for each in chosen]), time.perf_counter()
-        with observed(self._checked.label, self.pool, self._checked.complete):
-            if self._runs_responses(chosen[0].responses):
-                values, reasons = simulate_batch(self.model, thetas, self.pool)
-            else:
-                values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
-        self._record(chosen, thetas, values, reasons, time.perf_counter() - start)
-        # the size grows by steps: the first simulations may be failures that took no time
-        seconds = time.perf_counter() - start
-        self.chunk_size = min(4 * len(chosen), 1 + int(_SECONDS_PER_CHUNK * len(chosen) / seconds))
-        return chosen
-
-    def receive(self, ended: Sequence[RunningSimulation]) -> None:
-        """Count and cache simulations that have ended in the pool, and record failures; sets `result` or `error`.
+    def receive(self, ended: Iterable[Simulation]) -> None:
+        """Count and cache simulations of one request that have ended in the pool; sets `result` or `error` of each.
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
-        pool = self._submitted
-        with pool.lock:
-            new = [running for running in dict.fromkeys(ended) if not running.received]
-            for responses in (False, True):
-                some, outcomes = [], []
-                for running in new:
-                    if running.responses is not responses:
-                        continue
-                    running.received = True
-                    pool.running.pop((running.key, responses), None)
-                    try:
-                        outcome, opened = unpack(running.future.result(), self.pool)
-                        self._checked.complete(opened)
-                        outcomes.append(outcome)
-                        some.append(running)
-                    except CancelledError:
-                        running.error = RuntimeError("the pool was closed before a simulation had finished")
-                    except BaseException as error:
-                        running.error = error
-                if some:
-                    self._record_outcomes(some, outcomes)
+        running = self._running
+        with running.lock:
+            some, outcomes = [], []
+            for simulation in ended:
+                if simulation.received:
+                    continue
+                simulation.received = True
+                running.simulations.discard(simulation)
+                try:
+                    outcome, opened = unpack(simulation.future.result(), self.pool)
+                    self._checked.complete(opened)
+                    outcomes.append(outcome)
+                    some.append(simulation)
+                except CancelledError:
+                    simulation.error = RuntimeError("the pool was closed before a simulation had finished")
+                except BaseException as error:
+                    simulation.error = error
+            if some:
+                self._record_outcomes(some, outcomes)
 
-    def leave(
-        self, waiting: Sequence[RunningSimulation], arrived: SimpleQueue, running: bool
-    ) -> list[RunningSimulation]:
-        """Stop waiting: ended simulations are cached, others are cancelled if nobody else waits for them.
+    def leave(self, simulations: Iterable[Simulation], running: bool) -> list[Simulation]:
+        """Stop waiting: ended simulations are cached, others are cancelled; with `running`, also those that have begun.
 
-        With `running`, started simulations are cancelled too. Returns the simulations that go on.
+        Returns the simulations that go on.
         """
-        pool = self._submitted
-        with pool.lock:
-            left = [each for each in waiting if not each.received and each.future is not None]
-            unused = []
+        in_pool = self._running
+        with in_pool.lock:
+            left = [each for each in simulations if not each.received]
+            if unended := [each.future for each in left if not each.future.done()]:
+                self.pool.give_up(unended, running)
             for each in left:
-                each.users.discard(arrived)
-                if not each.users and not each.future.done():
-                    unused.append(each)
-            if unused:
-                self.pool.give_up([each.future for each in unused], running)
-            for each in unused:
                 if each.future.cancelled():
                     each.received = True
-                    pool.running.pop((each.key, each.responses), None)
+                    in_pool.simulations.discard(each)
             self.receive([each for each in left if each.future.done()])
             return [each for each in left if not each.received]
 
     @property
-    def _submitted(self) -> _Pool:
+    def _running(self) -> _Running:
         if self._in_pool is None or self._in_pool.owner != os.getpid():  # or in a process that was forked
-            self._in_pool = _Pool()
+            self._in_pool = _Running()
         return self._in_pool
 
-    def _sent_function(self, responses: bool) -> Callable:
+    def _sent_function(self, full: bool) -> Callable:
         """What is sent to the workers: the same object while simulations run, so that it is pickled once."""
-        pool, full = self._submitted, self._runs_responses(responses)
-        if pool.function is None or pool.function[0] is not self.model or pool.function[1] != full:
-            sent = sent_simulation(self.model, *(() if full else (self.measured, self.statistic)))
-            pool.function = self.model, full, Observed(sent)
-        return pool.function[2]
+        functions, with_response = self._running.functions, self._returns_responses(full)
+        if with_response not in functions or functions[with_response][0] is not self.model:
+            measured = () if with_response else (self.measured, self.statistic)
+            functions[with_response] = self.model, Observed(sent_simulation(self.model, *measured))
+        return functions[with_response][1]
 
-    def _runs_responses(self, responses: bool) -> bool:
-        return responses or (self.cache is not None and self.cache.responses)
+    def _returns_responses(self, full: bool) -> bool:
+        return full or (self.cache is not None and self.cache.responses)
 
-    def _chunk_limits(self, n: int, responses: bool) -> tuple[int, int]:
-        """Smallest (all workers are busy) and largest number of simulations, of n, between two writes or reports."""
-        if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return n, n
-        largest = most_responses(self.model) if self._runs_responses(responses) else n
-        if self.pool is not None:
-            workers = self.pool.n_workers or n
-        elif has_batch_method(self.model):
-            workers = os.cpu_count() or 1
-        else:
-            return 1, largest
-        return min(_ROUNDS_PER_CHUNK * workers, largest), largest
-
-    def _record_outcomes(self, ended: list[RunningSimulation], outcomes: list[tuple]) -> None:
-        """Record simulations of one kind, which the pool has run."""
-        pool, now = self._submitted, time.perf_counter()
-        seconds, pool.counted_until = now - pool.counted_until, now
-        full = self._runs_responses(ended[0].responses)
-        shape = (len(self.model.channels), self.model.n_steps) if full else (self.n_numbers,)
+    def _record_outcomes(self, ended: list[Simulation], outcomes: list[tuple]) -> None:
+        """Record simulations that the pool has run."""
+        running, now, full = self._running, time.perf_counter(), ended[0].full
+        seconds, running.counted_until = now - running.counted_until, now
+        shape = (len(self.model.channels), self.model.n_steps) if self._returns_responses(full) else (self.n_numbers,)
         values = np.full((len(ended), *shape), np.nan)
         for row, (result, _) in zip(values, outcomes, strict=True):
             if result is not None:
                 row[...] = result
-        thetas = np.array([each.theta for each in ended])
+        keys, reasons = [each.key for each in ended], [reason for _, reason in outcomes]
         try:
-            self._record(ended, thetas, values, [reason for _, reason in outcomes], seconds)
+            results = self._record(keys, thetas_of(keys, self.n_structural), full, values, reasons, seconds)
         except BaseException as error:
             for each in ended:
                 each.error = error
             raise
+        for each, result in zip(ended, results, strict=True):
+            each.result = result
 
     def _record(
-        self,
-        ended: list[RunningSimulation],
-        thetas: np.ndarray,
-        values: np.ndarray,
-        reasons: list[str],
-        seconds: float,
-    ) -> None:
+        self, keys: list[bytes], thetas: np.ndarray, full: bool, values: np.ndarray, reasons: list[str], seconds: float
+    ) -> list[Simulated]:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
         The values are responses if these were requested or are stored on disk, else statistics.
         """
-        responses = ended[0].responses
-        batch = SimulationBatch(values, reasons) if self._runs_responses(responses) else None
-        misfit = values
-        if batch is not None:
+        batch, misfit = None, values
+        if self._returns_responses(full):
+            batch = SimulationBatch(values, reasons)
             misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
         self._seconds += seconds
         self.simulations += len(thetas)
@@ -534,20 +473,18 @@ class Simulator:
             self.when_simulated(len(thetas))
         self._check_after(thetas, misfit, reasons, seconds)
         self._checked.has_results = True
-        keys = [each.key for each in ended]
         self.memory_cache.store(keys, misfit)
-        if responses:
+        if full:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
             self.response_memory.store(self.model.fingerprint, keys, outcomes)
         if self.cache is not None:
             response = None if batch is None else batch.response
             self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, self._run)
             self.cache.store_remark(self.model)
-        for row, each in enumerate(ended):
-            if responses and reasons[row]:
-                batch.response[row] = np.nan
-            each.received = True
-            each.result = Simulated(misfit[row], reasons[row], batch.response[row] if responses else None)
+        if not full:
+            return [Simulated(row, reason, None) for row, reason in zip(misfit, reasons, strict=True)]
+        batch.response[[bool(reason) for reason in reasons]] = np.nan
+        return [Simulated(*each) for each in zip(misfit, reasons, batch.response, strict=True)]
 
     # the model ----------------------------------------------------------------------------------------------------
 
@@ -559,30 +496,30 @@ class Simulator:
     def _check_before(self) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
-        with self._dropping_rows_of_a_changed_model():
+        try:
             self._checked.before(self._run, lambda: self._known.earlier_points(self._run))
+        except ChangedModel:
+            self._drop_unchecked()
+            raise
 
     def _check_after(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float) -> None:
         """Compare the model after simulations, if that is due."""
-        pool = self._submitted
         if self.streams:
-            seconds = time.perf_counter() - pool.compared_at
-        with self._dropping_rows_of_a_changed_model():
-            if self._checked.after(self._run, thetas, misfit, reasons, seconds, last=not pool.running):
-                pool.compared_at = time.perf_counter()
-
-    @contextmanager
-    def _dropping_rows_of_a_changed_model(self) -> Iterator[None]:
-        """Where `ChangedModel` is raised, drop the simulations since the last comparison."""
+            seconds = time.perf_counter() - self._running.since
+        last = not self._running.simulations
         try:
-            yield
+            self._checked.after(self._run, thetas, misfit, reasons, seconds, last)
         except ChangedModel:
-            self._known.clear()
-            if self.cache is not None and self._checked.unchecked:
-                unchecked = np.concatenate(self._checked.unchecked)
-                self._checked.rows.discard(unchecked, self._key, self.model.fingerprint)
+            self._drop_unchecked()
             raise
 
+    def _drop_unchecked(self) -> None:
+        """Drop the simulations since the last comparison, which may be from before or after a change of the model."""
+        self._known.clear()
+        if self.cache is not None and self._checked.unchecked:
+            unchecked = np.concatenate(self._checked.unchecked)
+            self._checked.rows.discard(unchecked, self._key, self.model.fingerprint)
 
-def _arrive(arrived: SimpleQueue, running: RunningSimulation, _: Any) -> None:
-    arrived.put(running)
+
+def _arrive(arrived: SimpleQueue, simulation: Simulation, _: Any) -> None:
+    arrived.put(simulation)

@@ -2,8 +2,6 @@
 
 import pickle
 import signal
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
 import numpy as np
@@ -398,67 +396,24 @@ def test_a_simulator_stands_on_its_own(thetas):
     assert simulator.report()["simulations"] == model.runs == len(thetas)
 
 
-@pytest.mark.parametrize("kind", ["no pool", "pool", "map only"])
-def test_start_and_wait_are_one_way_with_and_without_a_pool(kind, thetas, path, shared_pool):
-    with shared_pool(2) as pool:
-        chosen = {"no pool": None, "pool": pool, "map only": MapOnly()}[kind]
-        simulator = likelihood_of(Line(), pool=chosen, cache=path).simulator
-    arrived = SimpleQueue()
-    waiting = simulator.start([theta.tobytes() for theta in thetas], True, arrived)
-    results = {}
-    while waiting:
-        for ended in simulator.wait(waiting, arrived):
-            waiting.remove(ended)
-            results[ended.key] = ended.result
+def test_what_is_requested_comes_through_a_queue_and_is_known_after_it(thetas, path, shared_pool):
     expected = simulate_batch(Line(), thetas)
-    for theta, response, reason in zip(thetas, *expected, strict=True):
-        found = results[theta.tobytes()]
-        np.testing.assert_array_equal(found.response, response)
-        assert bool(found.reason) == bool(reason)
-    assert simulator.simulations == simulator.cache.info().simulations == len(thetas)
+    with shared_pool(2) as pool:
+        simulator, arrived = likelihood_of(Line(), pool=pool, cache=path).simulator, SimpleQueue()
+        for left in (len(thetas), 0):
+            requested = simulator.request(thetas, True, arrived)
+            assert sum(each.future is not None for each in requested) == left
+            for _ in range(left):
+                simulator.receive([arrived.get(timeout=60.0)])
+            for each, response, reason in zip(requested, *expected, strict=True):
+                np.testing.assert_array_equal(each.result.response, response)
+                assert each.result.reason == reason
+    assert arrived.empty() and simulator.simulations == simulator.cache.info().simulations == len(thetas)
     simulator.simulate(thetas)
     assert simulator.simulations == len(thetas)
 
 
-def test_simulations_that_are_left_before_they_ran_cost_nothing(thetas):
-    model = Line()
-    simulator, arrived = likelihood_of(model).simulator, SimpleQueue()
-    waiting = simulator.start([theta.tobytes() for theta in thetas], False, arrived)
-    assert simulator.leave(waiting, arrived, running=True) == []
-    assert model.runs == simulator.simulations == 0
-
-
-def test_a_thread_that_leaves_does_not_cancel_what_another_has_just_requested(thetas):
-    """Its simulation would have no result, and the other thread would wait for ever."""
-    mine, other, gate = SimpleQueue(), SimpleQueue(), threading.Event()
-
-    class Leaving:
-        """The lock, which is given to the thread that leaves as soon as the other one releases it."""
-
-        def __init__(self, lock):
-            self.lock = lock
-
-        def __enter__(self):
-            return self.lock.__enter__()
-
-        def __exit__(self, *exception):
-            self.lock.__exit__(*exception)
-            simulator._submitted.lock = self.lock
-            simulator.leave(started, mine, running=False)
-
-    with ThreadPoolExecutor(1) as pool:
-        simulator = likelihood_of(Line(), pool=pool).simulator
-        pool.submit(gate.wait)
-        keys = [thetas[0].tobytes()]
-        started = simulator.start(keys, False, mine)
-        simulator._submitted.lock = Leaving(simulator._submitted.lock)
-        (running,) = simulator.start(keys, False, other)
-        gate.set()
-        assert simulator.wait([running], other) == [running]
-    assert running.result is not None
-
-
-def test_one_point_that_is_cached_takes_the_short_way_with_the_same_value(thetas):
+def test_one_point_has_the_value_of_a_batch(thetas):
     likelihood = likelihood_of(Line())
     points = np.hstack([thetas, np.full((len(thetas), 2), 0.3)])
     points[:3, 2] = -1.0, np.nan, 0.0  # impossible noise parameters
@@ -469,17 +424,3 @@ def test_one_point_that_is_cached_takes_the_short_way_with_the_same_value(thetas
     known = likelihood.simulator.cache_hits
     assert [likelihood(point) for point in points] == single
     assert likelihood.simulator.cache_hits - known == len(points) - 3 and likelihood.simulations <= len(thetas)
-
-
-def test_what_belongs_to_the_simulator_is_not_set_beside_it():
-    likelihood = likelihood_of(Line())
-    with pytest.raises(AttributeError):
-        likelihood.model = Line()
-    with pytest.raises(AttributeError, match=r"set likelihood\.simulator\.pool"):
-        likelihood.pool = None
-    with pytest.raises(AttributeError, match=r"as likelihood\.simulator\.cache_keys"):
-        likelihood.cache_keys  # noqa: B018
-    with pytest.raises(AttributeError, match="no attribute 'cash'$"):
-        likelihood.cash  # noqa: B018
-    likelihood.simulator.pool = None
-    likelihood.note = "of the user"

@@ -2,6 +2,7 @@
 
 import warnings
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 
 import emcee
 import numpy as np
@@ -43,7 +44,7 @@ class Vibration:
         return [self.amplitude * np.exp(-0.05 * theta[1] * omega * self.time) * np.cos(omega * self.time + self.phase)]
 
 
-def likelihoods(truth=TRUTH, sd=(SD, SD), seed=1, limits=(np.inf, np.inf), noises=(None, None)):
+def likelihoods(truth=TRUTH, sd=(SD, SD), seed=1, limits=(np.inf, np.inf), noises=(None, None), pool=None):
     """One likelihood per event, with synthetic measurements."""
     random, found = np.random.default_rng(seed), {}
     for (name, event), own, limit, noise in zip(EVENTS.items(), sd, limits, noises, strict=True):
@@ -52,7 +53,7 @@ def likelihoods(truth=TRUTH, sd=(SD, SD), seed=1, limits=(np.inf, np.inf), noise
         model = FunctionModel(function, ["stiffness", "damping"], CHANNEL, DT, n, version=f"{name} {limit}")
         exact = np.array(Vibration(*event)(truth))
         measured = Measurements(CHANNEL, DT, exact + own * random.standard_normal((1, n)))
-        found[name] = FELikelihood(model, measured) if noise is None else FELikelihood(model, measured, noise)
+        found[name] = FELikelihood(model, measured, noise, pool)
     return found
 
 
@@ -88,8 +89,21 @@ def joint_of_one():
     return Posterior(JointLikelihood({"first": likelihoods()["first"]}, separate=["sigma_top"]), prior)
 
 
-@pytest.mark.parametrize("make", [joint, lambda: joint(marginal=False), with_other_parameters, joint_of_one])
-def test_the_stacked_likelihood_is_that_of_all_data_sets(make):
+def with_gaps():
+    """The first event has a missing sample, and the second a longer step and correlated noise."""
+    first, second = likelihoods(noises=(None, AutoregressiveNoise(CHANNEL))).values()
+    values = first.measurements.values.copy()
+    values[0, 7] = np.nan
+    first = FELikelihood(first.model, Measurements(CHANNEL, DT, values))
+    coarse = Measurements(CHANNEL, 2 * DT, second.measurements.values[:, ::2].copy())
+    second = FELikelihood(second.model, coarse, AutoregressiveNoise(CHANNEL))
+    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")}
+    prior |= {"sigma_top": HalfNormal(0.01), "rho_top": Uniform(-0.5, 0.9)}
+    return Posterior(JointLikelihood({"first": first, "second": second}), prior)
+
+
+@pytest.mark.parametrize("make", [joint, lambda: joint(marginal=False), with_other_parameters, joint_of_one, with_gaps])
+def test_the_likelihood_of_the_target_is_that_of_all_data_sets(make):
     posterior = make()
     target = ResponseTarget(posterior)
     points = posterior.sample_prior(6, 1)
@@ -184,11 +198,17 @@ def test_a_joint_likelihood_of_one_event_is_guided_as_the_event_itself():
     assert np.array_equal(*(run.get_chain() for run in runs)) and runs[0].log_evidence == runs[1].log_evidence
 
 
-def test_an_asynchronous_run_with_a_guide_of_a_joint_likelihood_is_refused():
-    for posterior in (joint(), joint_of_one()):
-        with pytest.raises(ValueError, match="asynchronous=True is not possible with a guide of a JointLikelihood"):
-            guided(posterior, asynchronous=True)
-        assert posterior.likelihood.simulations == 0
+@pytest.mark.slow
+def test_an_asynchronous_run_gives_the_result_of_quadrature():
+    log_evidence, mean, sd = exact(joint())
+    with ThreadPoolExecutor(2) as pool:
+        posterior = joint(pool=pool)
+        sampler = guided(posterior, limit=3000, asynchronous=True)
+    assert sampler.verdict.status == "converged" and sampler.simulations <= 700
+    assert posterior.likelihood.simulations <= 2 * sampler.simulations
+    assert abs(sampler.log_evidence - log_evidence) < 4.0 * sampler.log_evidence_error < 0.4
+    n = 1.0 / sampler.verdict.effective_sample_size + 1.0 / N
+    assert np.all(np.abs(sampler.get_chain(flat=True).mean(axis=0) - mean) < 4.0 * sd * np.sqrt(n))
 
 
 def test_control_one_event_alone_has_another_posterior():
@@ -239,15 +259,9 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     assert whole.simulations < sampler.simulations < whole.simulations + 50
 
 
-def test_data_sets_that_cannot_be_stacked():
-    found = likelihoods()
-    first, second = found.values()
-    values = second.measurements.values.copy()
-    values[0, 5] = np.nan
-    gaps = FELikelihood(second.model, Measurements(CHANNEL, DT, values))
+def test_data_sets_that_cannot_be_emulated():
+    first, second = likelihoods().values()
     prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
-    with pytest.raises(ValueError, match="data sets that have all samples"):
-        Posterior(JointLikelihood({"first": first, "second": gaps}), prior).guide()
     shifted = FELikelihood(second.model, second.measurements, time_shifts={"top": 0.05})
     prior |= {shifted.parameter_names[-1]: Uniform(-0.05, 0.05)}
     with pytest.raises(ValueError, match=r"cannot emulate time shifts of channels.*Measurements\.shift"):
