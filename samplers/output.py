@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import zlib
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from emcee.backends import Backend, HDFBackend
 from .blobs import converted
 from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
+from .finding import Finding
 from .judgement.verdict import Verdict
 from .output_file import FileHeld, open_file, patient_open, read_object, replace_file
 from .record import Record
@@ -130,7 +132,7 @@ class Output:
             "ladder": result.ladder,
             "check": result.check,
             "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
-            "verdict": self.verdict,
+            "verdict": None if self.verdict is None else [*self.verdict[:6], list(map(astuple, self.verdict.findings))],
             "first_step": self.first_step,
             "provisional": self.provisional,
         }
@@ -228,7 +230,10 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
         None if check is None else EvidenceCheck(*check),
         None if founders is None else np.array(founders),
     )
-    return result, None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
+    if verdict is None:
+        return result, None
+    status, reasons, *others = verdict[:6]  # version 0.2 stored no findings
+    return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in sum(verdict[6:], [])))
 
 
 def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:

@@ -619,8 +619,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             recording.result = recording.result._replace(ladder=stored)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
         said = check_likelihood(log_prob, self._evaluator.log_prior(coords))
-        for concern in said:
-            warn(concern.message)
+        for finding in said:
+            warn(finding.message)
         self._result = recording.result._replace(
             findings=(*recording.result.findings, *said),
             concerns=() if guidance is None else guidance.guide.concerns,

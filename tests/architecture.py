@@ -62,7 +62,7 @@ ORDER = {
         ("presets", "reports"),
         ("budget", "estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("blobs", "emcee_internals", "interrupts", "resampling"),
+        ("blobs", "emcee_internals", "finding", "interrupts", "resampling"),
     ),
 }
 
