@@ -1,5 +1,8 @@
 from . import problems
 from .cache.simulation_cache import SimulationCache
+from .checks.fit import check_fit
+from .checks.rehearsal import rehearse
+from .checks.result import check_result
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
@@ -51,9 +54,6 @@ from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Unifor
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
-from .reporting.advice import check_result
-from .reporting.fit_gate import check_fit
-from .reporting.rehearsal import rehearse
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements

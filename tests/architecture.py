@@ -37,6 +37,7 @@ ORDER = {
         ("reporting",),
         ("problems",),
         ("adapters",),
+        ("checks",),
         ("plots",),
         ("column_damage", "information"),
         ("prediction",),

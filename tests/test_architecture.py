@@ -28,7 +28,7 @@ WORKERS = {"faults", "interrupts", "folder", "shared_files", "by_value", "user_c
     "programs",
 }
 # a thing and its figure, section of the command, report or other package
-SAME_NAME = {"comparison", "damage", "events", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
+SAME_NAME = {"comparison", "damage", "events", "finding", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
     "interrupts",
     "sampling",
     "scores",

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..checks.finding import NOTE
+from ..checks.rehearsal import Rehearsal, rehearse
 from ..likelihood.posterior import Posterior
-from ..reporting.rehearsal import Rehearsal, rehearse
-from ..signals.data_faults import REMARK
 from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import Event, read_events
@@ -124,7 +124,7 @@ def _say_simulation(
     say(f"One simulation takes {rehearsal.seconds:.2g} s")
     say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for finding in rehearsal.findings:
-        say(f"{'Note' if finding.weight == REMARK else 'CAUTION'}: {finding}")
+        say(f"{'Note' if finding.severity == NOTE else 'CAUTION'}: {finding}")
     if rehearsal.identifiability is not None:
         say(f"{rehearsal.identifiability}")
     return rehearsal

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..checks.finding import NOTE
+from ..checks.rehearsal import refuse_chance
+from ..checks.result import judge_run
+from ..checks.run import read_run
 from ..prediction.prediction import Prediction
-from ..reporting.advice import judge_run
-from ..reporting.rehearsal import refuse_chance
-from ..reporting.run import read_run
-from ..signals.data_faults import REMARK
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -202,7 +202,7 @@ def _write(
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
     tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
-    cautions = [str(finding) for finding in judgement.findings if finding.weight != REMARK]
+    cautions = [str(finding) for finding in judgement.findings if finding.severity != NOTE]
     cautions += [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
     for each in described:
         cautions += [f"event {each.name}: {remark}" for remark in each.remarks]

@@ -6,14 +6,15 @@ import numpy as np
 
 from samplers.estimates.pareto import LARGEST_SHAPE
 
+from ..checks.finding import Judgement
+from ..checks.fit import SAME_AS_PRIOR
+from ..checks.fit_results import Fits
+from ..checks.result import residual_sentence
+from ..checks.run import FinishedRun
+from ..checks.table import ParameterRow
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
-from .advice import Judgement, residual_sentence
-from .fit_gate import SAME_AS_PRIOR
-from .fit_results import Fits
-from .run import FinishedRun
-from .table import ParameterRow
 
 __all__ = [
     "DataSet",

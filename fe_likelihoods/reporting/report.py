@@ -9,14 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks.failed_simulations import Failures
+from ..checks.finding import Finding
+from ..checks.fit_results import Fits
+from ..checks.result import JudgedRun, judge_run
+from ..checks.run import FinishedRun, read_run
+from ..checks.table import ParameterRow
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
-from ..signals.data_faults import Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
-from .advice import JudgedRun, judge_run
 from .contents import (
     DataSet,
     PredictedValue,
@@ -28,8 +32,6 @@ from .contents import (
     summary_sentences,
     verdict_sentences,
 )
-from .failed_simulations import Failures
-from .fit_results import Fits
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (
@@ -43,8 +45,6 @@ from .pictures import (
     draw_scores,
     draw_scores_of_events,
 )
-from .run import FinishedRun, read_run
-from .table import ParameterRow
 
 __all__ = ["Contents", "Predicted", "report", "write_page"]
 

@@ -15,10 +15,10 @@ from fe_likelihoods import (
     Posterior,
     TruncatedNormal,
 )
+from fe_likelihoods.checks.fit_results import fit_data_sets
+from fe_likelihoods.checks.run import read_run
 from fe_likelihoods.noise.draws import sample_noise
 from fe_likelihoods.reporting.contents import residual_sentences
-from fe_likelihoods.reporting.fit_results import fit_data_sets
-from fe_likelihoods.reporting.run import read_run
 from samplers import SMCSampler, compare_models, to_arviz
 
 N, DT, TOP = 400, 0.02, (Channel("top", "acceleration", "m/s2"),)

@@ -13,21 +13,17 @@ geometric mean, of the errors of the best response, and to less than 0.7 if the 
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..signals.channels import Measurements
 from ..units import DIMENSIONS, UNITS
-from .channels import Measurements
 
-__all__ = ["CARE", "LARGE_ERROR", "REMARK", "WRONG", "Fault", "Finding", "by_weight", "describe_unit", "find_faults"]
-
-REMARK = "remark"
-CARE = "care"
-WRONG = "wrong"
+__all__ = ["LARGE_ERROR", "Fault", "describe_unit", "find_faults"]
 
 LARGE_ERROR = 0.5  # RRMSE above which a channel is hardly reproduced
 _BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
@@ -43,23 +39,6 @@ _MOST_FAULTS = 4
 _SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
 _SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
 _EQUALLY_NEAR, _NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
-
-
-class Finding(NamedTuple):
-    """What was found about a result, how much it weighs, what it means, and what to do (may be empty)."""
-
-    name: str
-    weight: str  # "remark" is good to know, "care" limits the result, "wrong" speaks against it
-    sentence: str
-    action: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.sentence} {self.action}".rstrip()
-
-
-def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings with the most severe first, otherwise in their order."""
-    return tuple(sorted(findings, key=lambda each: (WRONG, CARE, REMARK).index(each.weight)))
 
 
 class Fault(NamedTuple):

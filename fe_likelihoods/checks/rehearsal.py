@@ -21,13 +21,13 @@ from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import HalfNormal
 from ..signals.channels import Measurements
-from ..signals.data_faults import CARE, REMARK, WRONG, Finding, by_weight
 from ..signals.events import Events
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..units import from_si
-from .fit_gate import Compared, compare, draws_to_compare, fit_gate
-from .model_checks import (
+from .finding import CARE, NOTE, WRONG, Finding, by_severity
+from .fit import Compared, compare, draws_to_compare, fit_gate
+from .steps import (
     NOTHING,
     UNREAD,
     find_discretisation_error,
@@ -109,7 +109,7 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
     Examples
     --------
     >>> for finding in rehearse(posterior).findings:
-    ...     print(finding.weight, finding)
+    ...     print(finding.severity, finding)
     """
     found: list[Finding] = []
     single = isinstance(posterior.likelihood, FELikelihood)
@@ -142,14 +142,14 @@ def rehearse(posterior: Posterior, events: Mapping[str, Any] | None = None, *, p
             found += chance or _of_motions(stage, model, theta, response, events or {})
             found += _of_sizes(likelihood.measurements, model)
             seconds += stage.seconds
-        if single and not any(each.weight == WRONG for each in found):
+        if single and not any(each.severity == WRONG for each in found):
             refined, searched, told = _at_best_fit(stage, posterior, seconds)
             found += refined
         of_fit = fit_gate(compared)
         told = None if of_fit else told  # what the data tell is not known where they are wrong or out of reach
         found += of_fit
         simulations = stage.made + _made(posterior) - before
-    return Rehearsal(by_weight(found), simulations, seconds, searched, told)
+    return Rehearsal(by_severity(found), simulations, seconds, searched, told)
 
 
 def _made(posterior: Posterior) -> int:
@@ -217,7 +217,7 @@ def _of_motions(
     if not motions:
         return []
     found = find_unread_motion(model, theta, response, stage.simulate)
-    if any(each.weight == WRONG for each in found):
+    if any(each.severity == WRONG for each in found):
         return found
     dt = motions[0].dt
     every = max(1, round(model.dt / dt))
@@ -278,13 +278,13 @@ def _at_best_fit(
     if limit < 10 * (n + 1):
         text = f"The test takes about {15 * (n + 1)} simulations of {seconds:.2g} s."
         action = "The run makes it at its end. It costs less to know now: halve the step and the mesh at one point."
-        return [Finding("Step and mesh were not tested", REMARK, text, action)], np.nan, None
+        return [Finding("Step and mesh were not tested", NOTE, text, action)], np.nan, None
     try:
         target, mode, searched = _search(stage, posterior, limit)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return [Finding("Step and mesh were not tested", REMARK, f"No fit was found: {error}.")], np.nan, None
+        return [Finding("Step and mesh were not tested", NOTE, f"No fit was found: {error}.")], np.nan, None
     if mode is None:
-        return [Finding("Step and mesh were not tested", REMARK, "No fit was found.")], searched, None
+        return [Finding("Step and mesh were not tested", NOTE, "No fit was found.")], searched, None
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
     found = find_discretisation_error(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)

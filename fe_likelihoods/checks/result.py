@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
-from ..signals.data_faults import CARE, REMARK, WRONG, Finding, by_weight
 from ..simulation.model import SimulationBatch, simulate_batch
 from ..text_tables import listed
 from .failed_simulations import Failures, failures
-from .fit_gate import fit_gate
+from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
+from .fit import fit_gate
 from .fit_results import SMALL_PROBABILITY, ChannelFit, Fit, Fits, fit_data_sets
-from .model_checks import find_discretisation_error, find_unread_motion, simulations_of_the_test
 from .run import LONGEST_AUTOCORRELATION, FinishedRun, read_run
+from .steps import find_discretisation_error, find_unread_motion, simulations_of_the_test
 from .table import ParameterRow, parameter_rows
 
-__all__ = ["JudgedRun", "Judgement", "advise", "check_result", "judge", "judge_run", "residual_sentence"]
+__all__ = ["JudgedRun", "advise", "check_result", "judge_run", "residual_sentence"]
 
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
 LARGE_MEAN_ERROR = 0.2  # of the standard deviation
@@ -24,19 +24,6 @@ LARGE_FAILURE_SHARE = 0.05
 LARGEST_TEST = 0.05  # of step and mesh, as a share of the simulations of the run
 TEST_SECONDS = 10.0
 STRONG_CORRELATION = 0.2  # lag-one correlation of residuals that changes the width of the posterior
-STATUS = {WRONG: "do not use", CARE: "use with care", REMARK: "use"}
-
-
-class Judgement(NamedTuple):
-    """Whether a result can be used, from all that was found; ``str`` gives it in one sentence."""
-
-    status: str  # "use", "use with care" or "do not use"
-    findings: tuple[Finding, ...]  # reasons, the most severe first, and remarks
-
-    def __str__(self) -> str:
-        reasons = [each.name for each in self.findings if STATUS[each.weight] == self.status != "use"]
-        text = f"{self.status[0].upper()}{self.status[1:]}"
-        return f"{text}: {'; '.join(f'{name[0].lower()}{name[1:]}' for name in reasons)}." if reasons else f"{text}."
 
 
 class JudgedRun(NamedTuple):
@@ -46,12 +33,6 @@ class JudgedRun(NamedTuple):
     fits: Fits
     failures: Failures
     judgement: Judgement
-
-
-def judge(findings: list[Finding]) -> Judgement:
-    """The judgement that follows from findings: the most severe one decides."""
-    ordered = by_weight(findings)
-    return Judgement(STATUS[ordered[0].weight] if ordered else "use", ordered)
 
 
 def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Judgement:
@@ -122,7 +103,7 @@ def check_model(run: FinishedRun) -> tuple[list[Finding], int]:
         batch = likelihood.simulate(theta[None])
         if not batch.reasons[0]:
             unread = find_unread_motion(likelihood.model, theta, batch.response[0], simulate)
-            found += [each for each in unread if each.weight == WRONG]  # failures are said where they are predicted
+            found += [each for each in unread if each.severity == WRONG]  # failures are said where they are predicted
     if not found and not run.is_inconclusive:
         found = _of_discretisation(run, simulate)
     return found, run.likelihood.simulations - before + others
@@ -132,13 +113,13 @@ def _of_discretisation(run: FinishedRun, simulate: Any) -> list[Finding]:
     """The error of step and mesh, or why it was not tested."""
     if run.n_modes > 1:
         text = "The samples have several modes, which have no common standard deviation."
-        return [Finding("Step and mesh were not tested", REMARK, text, "Halve them, and run again.")]
+        return [Finding("Step and mesh were not tested", NOTE, text, "Halve them, and run again.")]
     needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
     seconds = report["seconds"] / max(report["simulations"], 1)
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
         text = f"The test takes {needed} simulations of {seconds:.2g} s."
         action = "Halve the step and the mesh at the posterior mean, and compare the responses with the noise."
-        return [Finding("Step and mesh were not tested", REMARK, text, action)]
+        return [Finding("Step and mesh were not tested", NOTE, text, action)]
     return find_discretisation_error(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
 
@@ -162,7 +143,7 @@ def advise(
         *_of_the_model(run),
         *_of_the_data(fits),
     ]
-    if not run.is_inconclusive and all(each.weight != WRONG for each in found):  # a fault explains the residuals
+    if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
         found += _of_the_noise(fits)
     return judge(found)
 
@@ -254,7 +235,7 @@ def _of_failures(failed: Failures, inconclusive: bool) -> list[Finding]:
         "not, a narrower prior saves these simulations."
     )
     largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
-    found.append(Finding("Simulations failed", CARE if largest > LARGE_FAILURE_SHARE else REMARK, text, action))
+    found.append(Finding("Simulations failed", CARE if largest > LARGE_FAILURE_SHARE else NOTE, text, action))
     if failed.near.borders and failed.near.known and not inconclusive:
         text = (
             f"In the region of the samples, {failed.near.failed} of {failed.near.evaluated} simulated points failed. "
@@ -311,7 +292,7 @@ def _of_the_noise(fits: Fits) -> list[Finding]:
     if strange:
         text = f"The residuals of {listed(strange)} have heavier tails, or are more skew, than a normal distribution."
         action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
-        found.append(Finding("The errors are not normal", REMARK, text, action))
+        found.append(Finding("The errors are not normal", NOTE, text, action))
     return found
 
 
@@ -341,7 +322,7 @@ def _of_the_data(fits: Fits) -> list[Finding]:
     if not any("synthetic" in fit.measurements.description.lower() for fit in fits.fits):
         return []
     text = "The measurements were computed with a model, not measured. The result shows how the method works."
-    return [Finding("Synthetic data", REMARK, text, "Say so wherever you show the numbers.")]
+    return [Finding("Synthetic data", NOTE, text, "Say so wherever you show the numbers.")]
 
 
 def residual_sentence(fit: Fit, each: ChannelFit) -> str:

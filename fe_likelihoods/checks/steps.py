@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from ..likelihood.posterior import Posterior
-from ..signals.data_faults import CARE, REMARK, WRONG, Finding
 from ..signals.events import motions_of
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch
+from .finding import CARE, NOTE, WRONG, Finding
 
 __all__ = [
     "find_discretisation_error",
@@ -54,7 +54,7 @@ def find_discretisation_error(
         theta, at = point[columns], columns[:n]
         batch = simulate(likelihood.model, theta[:n] + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return [Finding("Step and mesh were not tested", REMARK, f"A simulation failed: {reason}.")]
+            return [Finding("Step and mesh were not tested", NOTE, f"A simulation failed: {reason}.")]
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
         residuals = likelihood.residuals_of(response, theta)
         sigma = np.sqrt(np.nanmean(np.square(residuals), axis=1))
@@ -67,7 +67,7 @@ def find_discretisation_error(
             changes.setdefault(what, {})[len(parts) - 1] = fine.response[0][:, ::every] - response
     if not changes:
         text = "The model takes neither a motion nor a step that could be halved."
-        return [Finding("The time step was not tested", REMARK, text, "Halve it in the model, and compare.")]
+        return [Finding("The time step was not tested", NOTE, text, "Halve it in the model, and compare.")]
     found = [_compare(what, change, parts, sd, prior_sd, posterior.parameter_names) for what, change in changes.items()]
     return [each for each in found if each is not None]
 

@@ -18,11 +18,12 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..priors.points import as_points
 from ..signals.channels import Measurements
-from ..signals.data_faults import CARE, LARGE_ERROR, REMARK, WRONG, Fault, Finding, describe_unit, find_faults
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
+from .data_faults import LARGE_ERROR, Fault, describe_unit, find_faults
+from .finding import CARE, NOTE, WRONG, Finding
 from .table import Moments, ParameterRow, rows_of
 
 __all__ = ["Compared", "Window", "check_fit", "compare", "draws_to_compare", "fit_gate", "windows_of"]
@@ -208,7 +209,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     Examples
     --------
     >>> for finding in check_fit(posterior, sampler.get_chain(flat=True)):
-    ...     print(finding.weight, finding)
+    ...     print(finding.severity, finding)
     """
     points, rows = draws_to_compare(posterior), []
     if samples is not None:
@@ -338,7 +339,7 @@ def _of_the_prior(rows: Sequence[ParameterRow]) -> list[Finding]:
         names = listed([row.label for row in flat])
         text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
-        found.append(Finding("Not informed by the data", REMARK, text, action))
+        found.append(Finding("Not informed by the data", NOTE, text, action))
     far = [row.label for row in rows if abs(row.mean - row.prior_mean) > FAR_FROM_PRIOR * row.prior_sd]
     if far:
         text = (

@@ -18,8 +18,8 @@ from fe_likelihoods import (
     check_result,
     rehearse,
 )
+from fe_likelihoods.checks.rehearsal import refuse_chance
 from fe_likelihoods.problems import table_motion
-from fe_likelihoods.reporting.rehearsal import refuse_chance
 from samplers import SMCSampler
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
@@ -50,7 +50,7 @@ def posterior_of(function, noise=0.02):
 
 
 def names(rehearsal):
-    return [finding.name for finding in rehearsal.findings if finding.weight != "remark"]
+    return [finding.kind for finding in rehearsal.findings if finding.severity != "note"]
 
 
 def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
@@ -69,10 +69,10 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
 @pytest.mark.parametrize(("noise", "weight"), [(0.003, "care"), pytest.param(1.5, None, marks=pytest.mark.slow)])
 def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise, weight):
     """The same step is too coarse for precise data, and fine enough for noisy ones."""
-    found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.name]
-    assert [each.weight for each in found] == ([weight] if weight else [])
+    found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.kind]
+    assert [each.severity for each in found] == ([weight] if weight else [])
     if found:
-        assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
+        assert "stiffness by" in found[0].text and "the time step" in found[0].text
 
 
 @pytest.mark.slow
@@ -94,10 +94,10 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
 
     judgement, made = judged(central_differences)
     assert judgement.status == "use with care"
-    found = next(each for each in judgement.findings if each.name == "The model is too coarse for its data")
-    assert "stiffness by" in found.sentence and made <= 2 * (100 + 2 + 4)
+    found = next(each for each in judgement.findings if each.kind == "The model is too coarse for its data")
+    assert "stiffness by" in found.text and made <= 2 * (100 + 2 + 4)
     fine, _ = judged(lambda theta, record: central_differences(theta, record, 6))
-    assert not [each for each in fine.findings if "coarse" in each.name or "tested" in each.name], str(fine)
+    assert not [each for each in fine.findings if "coarse" in each.kind or "tested" in each.kind], str(fine)
 
 
 @pytest.mark.slow
@@ -107,8 +107,8 @@ def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
     sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
     sampler.run_mcmc(None, 1)
     judgement = check_result(sampler)
-    assert judgement.status == "do not use" and judgement.findings[0].name == "The motion changes nothing"
-    assert not [each for each in judgement.findings if "finer" in each.name or "tested" in each.name]
+    assert judgement.status == "do not use" and judgement.findings[0].kind == "The motion changes nothing"
+    assert not [each for each in judgement.findings if "finer" in each.kind or "tested" in each.kind]
 
 
 def test_a_model_without_a_step_that_could_be_halved_is_told():
@@ -118,7 +118,7 @@ def test_a_model_without_a_step_that_could_be_halved_is_told():
     fitted = posterior_of(lambda theta, record: central_differences(theta, record, 8))
     posterior = Posterior(FELikelihood(model, fitted.likelihood.measurements), fitted.prior)
     found = rehearse(posterior).findings
-    assert [(each.name, each.weight) for each in found] == [("The time step was not tested", "remark")]
+    assert [(each.kind, each.severity) for each in found] == [("The time step was not tested", "note")]
 
 
 def test_a_random_model_is_named_and_a_run_refuses_it():

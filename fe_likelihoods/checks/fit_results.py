@@ -12,7 +12,7 @@ from ..noise.autoregressive import AutoregressiveNoise
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
-from .fit_gate import Compared, compare, draws_to_compare, windows_of
+from .fit import Compared, compare, draws_to_compare, windows_of
 from .run import FinishedRun
 
 __all__ = ["SMALL_PROBABILITY", "ChannelFit", "Fit", "Fits", "fit_data_sets"]
