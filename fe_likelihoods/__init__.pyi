@@ -1,8 +1,9 @@
 from . import problems
 from .cache.simulation_cache import SimulationCache
 from .checks.fit import check_fit
-from .checks.rehearsal import rehearse
+from .checks.rehearsal import check_model
 from .checks.result import check_result
+from .checks.screening import check_data
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
@@ -114,7 +115,9 @@ __all__ = [
     "align",
     "arias_intensity",
     "average_predictions",
+    "check_data",
     "check_fit",
+    "check_model",
     "check_result",
     "damage",
     "damage_measures",
@@ -161,7 +164,6 @@ __all__ = [
     "read_columns",
     "read_imposed_test",
     "read_record",
-    "rehearse",
     "report",
     "residual_checks",
     "rms",

@@ -9,7 +9,8 @@ errors relative to y are, with the correlation rho of y and r about zero, ::
     e = |y - r| / |y|,    e(factor) = sqrt(1 - rho^2),    e(sign) = |y + r| / |y|,    e(lag) = |y(t) - r(t - lag)| / |y|
 
 and a hypothesis is named where it reduces the errors of the channels that it concerns to less than 0.6, in their
-geometric mean, of the errors of the best response, and to less than 0.7 if the fit is among the responses.
+geometric mean, of the errors of the best response, and to less than 0.7 if the fit is among the responses. Study
+``fit_gate`` of docs/results.rst, on synthetic structures and real events, has chosen the limits.
 """
 
 import math
@@ -18,27 +19,26 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..signals.channels import Measurements
+from ..signals.error_measures import relative_errors
 from ..units import DIMENSIONS, UNITS
 
-__all__ = ["LARGE_ERROR", "Fault", "describe_unit", "find_faults"]
+__all__ = ["BETTER_THAN_A_FIT", "Fault", "describe_unit", "find_faults"]
 
-LARGE_ERROR = 0.5  # RRMSE above which a channel is hardly reproduced
-_BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
-_BETTER_THAN_A_FIT = 0.7  # the same, where one of the responses is the fit
-_EXPLAINED = 0.85  # error above which a response explains nothing
-_FLOOR = 0.02  # error below which smaller ones count as equal
-_FACTOR = 1.5  # from which a factor may be one between units
-_LONGEST_LAG, _LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
-_FEWEST_STEPS = 1.5  # a lag below this many steps is not named
-_MOST_VALUES = 2**24  # of responses that are compared at once
-_MOST_FAULTS = 4
+BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
+BETTER_THAN_A_FIT = 0.7  # the same, where one of the responses is the fit
+EXPLAINED = 0.85  # error above which a response explains nothing: a correlation of a half
+FLOOR = 0.02  # error below which smaller ones count as equal
+FACTOR = 1.5  # from which a factor may be one between units
+LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
+FEWEST_STEPS = 1.5  # a lag below this many steps is not named
+MOST_VALUES = 2**24  # of responses that are compared at once
+MOST_FAULTS = 4
 # share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
-_SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
-_SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
-_EQUALLY_NEAR, _NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
+SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
+SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
+EQUALLY_NEAR, NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
 
 
 class Fault(NamedTuple):
@@ -56,9 +56,9 @@ class _Hypothesis(NamedTuple):
 
     kind: str
     channels: tuple[int, ...]
-    errors: NDArray[np.float64]  # (n, n_channels) of each response
-    value: NDArray[np.float64]  # (n,) factor or lag that gives these errors
-    names: tuple[str, ...] = ()
+    errors: np.ndarray  # (n, n of these channels), logarithms, of each response
+    value: np.ndarray  # (n,) factor or lag that gives these errors
+    names: tuple[str, ...] = ()  # of supports
 
 
 def find_faults(
@@ -76,55 +76,53 @@ def find_faults(
     """
     values = np.asarray(measurements.values, dtype=float)
     there = np.isfinite(values)
-    measured = np.where(there, values, 0.0)
-    usable = np.flatnonzero(np.square(measured).sum(axis=1) > 0.0)
+    usable = np.flatnonzero(np.nan_to_num(values).any(axis=1))
     responses = np.asarray(responses, dtype=float)
     kept = np.isfinite(responses[:, there]).all(axis=1)
     if not kept.any() or not len(usable):
         return ()
-    names = [measurements.channels[row].name for row in usable]
-    kinds = [measurements.channels[row].dimension for row in usable]
-    steps = np.array([measurements.steps[row] for row in usable])
-    starts = [measurements.starts[row] for row in usable]
-    measured = measured[usable]
-
-    def of_channels(given: np.ndarray) -> np.ndarray:
-        return np.where(there[usable], given[kept][:, usable], 0.0)
-
-    current = of_channels(responses)
-    pieces = {name: of_channels(np.asarray(each, dtype=float)) for name, each in (parts or {}).items()}
-    chosen = _closest(measured, current)
-    current, pieces = current[chosen], {name: each[chosen] for name, each in pieces.items()}
-    better = _BETTER_THAN_A_FIT if fitted else _BETTER
-    found: list[Fault] = []
-    while len(found) < _MOST_FAULTS:
-        errors = _errors(measured, current)
-        best = int(np.argmin(_score(errors)))
-        most, explained = 0.0, None
-        alike = [(kinds[c], steps[c], starts[c]) for c in range(len(names))]
-        for each in _hypotheses(measured, current, pieces, kinds, steps, alike, errors):
-            row = int(np.argmin(_score(each.errors)))
-            channels = list(each.channels)
-            before, after = (
-                float(np.exp(np.mean(np.log(np.maximum(e[channels], _FLOOR)))))
-                for e in (errors[best], each.errors[row])
-            )
-            gain = float(_score(errors)[best] - _score(each.errors)[row])
-            clear = after < min(better * before, _EXPLAINED) and gain > -math.log(better) * len(channels)
-            if clear and _SIMPLE[each.kind] * gain > most and _is_large(each, row, steps):
-                most, explained = _SIMPLE[each.kind] * gain, (each, row, before, after)
+    channels = [measurements.channels[row] for row in usable]
+    steps, starts = (np.array(each)[usable] for each in (measurements.steps, measurements.starts))
+    alike = [(channel.dimension, *when) for channel, *when in zip(channels, steps, starts, strict=True)]
+    y = np.where(there, values, 0.0)[usable]
+    r = np.where(there[usable], responses[kept][:, usable], 0.0)
+    chosen = _closest(y, r)
+    pieces = {
+        name: np.where(there[usable], np.asarray(each, dtype=float)[kept][:, usable], 0.0)[chosen]
+        for name, each in (parts or {}).items()
+    }
+    r, better, found = r[chosen], BETTER_THAN_A_FIT if fitted else BETTER, []
+    while len(found) < MOST_FAULTS:
+        errors = _log_errors(y, r)
+        best, most, explained = int(np.argmin(errors.sum(axis=1))), 0.0, None
+        for each in _hypotheses(y, r, pieces, alike, steps, errors):
+            c = list(each.channels)
+            total = errors.sum(axis=1) + (each.errors - errors[:, c]).sum(axis=1)
+            row = int(np.argmin(total))
+            gain, before, after = errors[best].sum() - total[row], errors[best, c].mean(), each.errors[row].mean()
+            value = float(each.value[row])
+            is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
+            if "lag" in each.kind:
+                is_large = abs(value) > FEWEST_STEPS * steps[c].max()
+            clear = after < min(math.log(better) + before, math.log(EXPLAINED)) and gain > -math.log(better) * len(c)
+            if is_large and clear and SIMPLE[each.kind] * gain > most:
+                most, explained = SIMPLE[each.kind] * gain, (each, value, math.exp(before), math.exp(after))
         if explained is None:
             break
-        each, row, before, after = explained
-        value = float(each.value[row])
-        concerned = each.names or tuple(names[c] for c in each.channels)
+        each, value, *change = explained
+        names = each.names or tuple(channels[c].name for c in each.channels)
         if each.kind == "factor" and value < 0.0:
-            found.append(Fault("sign", concerned, math.nan, before, after))
+            found.append(Fault("sign", names, math.nan, *change))
         if each.kind != "factor" or _is_factor(abs(value)):
             # a motion that is recorded late causes a response that must be earlier
             stated = {"factor": abs(value), "input lag": -value}.get(each.kind, value)
-            found.append(Fault(each.kind, concerned, stated, before, after))
-        current, pieces = _corrected(each, value, current, pieces, steps)
+            found.append(Fault(each.kind, names, stated, *change))
+        if each.kind == "input lag":
+            pieces |= {name: _corrected(each, value, pieces[name], steps) for name in names}
+            r = np.sum(list(pieces.values()), axis=0)
+        else:
+            r = _corrected(each, value, r, steps)
+            pieces = {name: _corrected(each, value, one, steps) for name, one in pieces.items()}
     return tuple(found)
 
 
@@ -142,10 +140,10 @@ def describe_unit(factor: float, dimension: str) -> str:
     )
     if dimension != "acceleration":
         own |= {f"{names} of the base motion": value for names, value in of_motion.items()}
-    for ratios, near in ((firsts, _EQUALLY_NEAR), (own, _NEAR_ENOUGH)):
+    for ratios, near in ((firsts, EQUALLY_NEAR), (own, NEAR_ENOUGH)):
         apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in ratios.items()}
         least = min(apart.values(), default=math.inf)
-        if least < math.log(_SAME_UNITS):
+        if least < math.log(SAME_UNITS):
             return " or ".join(names for names, value in apart.items() if value < least + near)
     return ""
 
@@ -158,156 +156,94 @@ def _ratios(dimension: str) -> dict[str, float]:
 
 
 def _is_factor(value: float) -> bool:
-    return max(value, 1.0 / value) > _FACTOR
+    return max(value, 1.0 / value) > FACTOR
 
 
-def _is_large(each: _Hypothesis, row: int, steps: np.ndarray) -> bool:
-    """Whether a factor or a lag is far enough from one, or zero, to be a fault."""
-    value = float(each.value[row])
-    if each.kind == "factor":
-        return value < 0.0 or _is_factor(value)
-    if "lag" in each.kind:
-        return abs(value) > _FEWEST_STEPS * float(steps[list(each.channels)].max())
-    return True
+def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Logarithms of the RRMSE (n, n_channels)."""
+    return np.log(np.maximum(relative_errors(y - r, y), FLOOR))
 
 
-def _errors(measured: np.ndarray, responses: np.ndarray) -> np.ndarray:
-    """RRMSE (n, n_channels)."""
-    return np.sqrt(np.square(measured - responses).sum(axis=-1) / np.square(measured).sum(axis=-1))
-
-
-def _score(errors: np.ndarray) -> np.ndarray:
-    """Sum of the logarithms of the errors of all channels (n,)."""
-    return np.log(np.maximum(errors, _FLOOR)).sum(axis=-1)
-
-
-def _closest(measured: np.ndarray, responses: np.ndarray) -> np.ndarray:
+def _closest(y: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Rows of the responses that are compared: all, or those with the best fit and the best correlation."""
-    most = max(8, _MOST_VALUES // measured.size)
-    if len(responses) <= most:
-        return np.arange(len(responses))
-    by_fit, by_shape = (np.argsort(_score(each)) for each in (_errors(measured, responses), _free(measured, responses)))
+    most = max(8, MOST_VALUES // y.size)
+    if len(r) <= most:
+        return np.arange(len(r))
+    factor = (y * r).sum(axis=-1, keepdims=True) / np.maximum(np.square(r).sum(axis=-1, keepdims=True), 1e-300)
+    by_fit, by_shape = (np.argsort(_log_errors(y, each).sum(axis=1)) for each in (r, factor * r))
     return np.unique(np.concatenate([by_fit[: most // 2], by_shape[: most // 2]]))
 
 
-def _free(measured: np.ndarray, responses: np.ndarray) -> np.ndarray:
-    """Errors (n, n_channels) with the best factor of either sign."""
-    power = np.square(responses).sum(axis=-1) * np.square(measured).sum(axis=-1)
-    product = (measured * responses).sum(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(power > 0.0, np.square(product) / power, 0.0)
-    return np.sqrt(np.maximum(1.0 - share, 0.0))
-
-
 def _hypotheses(
-    measured: np.ndarray,
-    responses: np.ndarray,
+    y: np.ndarray,
+    r: np.ndarray,
     parts: Mapping[str, np.ndarray],
-    kinds: Sequence[str],
-    steps: np.ndarray,
     alike: Sequence[tuple],
+    steps: np.ndarray,
     errors: np.ndarray,
 ) -> Iterator[_Hypothesis]:
-    """Every fault of one round, simple ones first."""
-    n_channels, every = len(measured), tuple(range(len(measured)))
-    groups = dict.fromkeys([(c,) for c in every])
-    groups |= dict.fromkeys(tuple(c for c in every if kinds[c] == kind) for kind in dict.fromkeys(kinds))
-    groups |= {every: None}
-    power, own = np.square(responses).sum(axis=-1), np.square(measured).sum(axis=-1)
-    product = (measured * responses).sum(axis=-1)
-    none = np.full(len(responses), np.nan)
-
-    def changed(channels: Sequence[int], new: np.ndarray) -> np.ndarray:
-        out = errors.copy()
-        out[:, list(channels)] = new
-        return out
-
-    for group in groups:
+    """Every fault of one round, simple ones first; only channels of one quantity and the same times can be swapped."""
+    every = tuple(range(len(y)))
+    power, own, product = np.square(r).sum(axis=-1), np.square(y).sum(axis=-1), (y * r).sum(axis=-1)
+    single = [(c,) for c in every]
+    of_kind = [tuple(c for c in every if alike[c][0] == kind) for kind in dict.fromkeys(each[0] for each in alike)]
+    for group in dict.fromkeys([*single, *of_kind, every]):
         c = list(group)
         # least squares of relative errors, so that no channel outweighs the others
         weight, along = (power[:, c] / own[c]).sum(axis=1), (product[:, c] / own[c]).sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factor = np.where(weight > 0.0, along / weight, 0.0)
-        scaled = np.sqrt(
-            np.maximum(own[c] - 2.0 * factor[:, None] * product[:, c] + np.square(factor)[:, None] * power[:, c], 0.0)
-            / own[c]
-        )
-        yield _Hypothesis("factor", group, changed(c, np.where(factor[:, None] == 0.0, np.inf, scaled)), factor)
-    if n_channels > 1:
-        yield from _swaps(measured, responses, alike, errors, none)
-    shifts, by_lag = _lag_errors(measured, responses, steps)
-    if len(shifts) > 1:
-        for group in dict.fromkeys([*((c,) for c in every), every]):
-            yield _best_lag("lag", group, by_lag, shifts, errors)
-    for names, moving in _late_supports(parts):
-        shifts, by_lag = _lag_errors(measured, moving, steps, responses - moving)
-        if len(shifts) > 1:
-            yield _best_lag("input lag", every, by_lag, shifts, errors)._replace(names=names)
+        factor = np.where(weight > 0.0, along / np.where(weight > 0.0, weight, 1.0), 0.0)[:, None]
+        squares = 1.0 + (np.square(factor) * power[:, c] - 2.0 * factor * product[:, c]) / own[c]
+        squares = np.where(factor == 0.0, np.inf, np.maximum(squares, FLOOR**2))
+        yield _Hypothesis("factor", group, 0.5 * np.log(squares), factor[:, 0])
+    cross = (power[:, :, None] + own - 2.0 * np.einsum("nit,jt->nij", r, y)) / own  # of response i for channel j
+    cross = 0.5 * np.log(np.maximum(cross, FLOOR**2))
+    for j, i in combinations(every, 2):
+        swapped = np.stack([cross[:, i, j], cross[:, j, i]], axis=1)
+        if alike[i] == alike[j] and (swapped < errors[:, [j, i]]).all(axis=1).any():
+            yield _Hypothesis("swap", (j, i), swapped, np.full(len(r), np.nan))
+    lags, by_lag = _lag_errors(y, r, steps)
+    if len(lags) < 2:
+        return
+    for group in dict.fromkeys([*single, every]):
+        yield _best_lag("lag", group, by_lag, lags)
+    names = list(parts) if len(parts) > 1 else []
+    late = [(name,) for name in names] + [tuple(n for n in names if n != name) for name in names if len(names) > 2]
+    for supports in late:  # each one, and all but one
+        moving = np.sum([parts[name] for name in supports], axis=0)
+        yield _best_lag("input lag", every, _lag_errors(y, moving, steps, r - moving)[1], lags, supports)
 
 
 def _best_lag(
-    kind: str, group: tuple[int, ...], by_lag: np.ndarray, shifts: np.ndarray, errors: np.ndarray
+    kind: str, group: tuple[int, ...], by_lag: np.ndarray, lags: np.ndarray, names: tuple[str, ...] = ()
 ) -> _Hypothesis:
     """A lag of some channels, the best one of each response; `by_lag` is (n, n_channels, n_lags)."""
-    c = list(group)
-    best = np.argmin(np.log(np.maximum(by_lag[:, c], _FLOOR)).sum(axis=1), axis=1)
-    new = errors.copy()
-    new[:, c] = np.take_along_axis(by_lag[:, c], best[:, None, None], axis=2)[..., 0]
-    return _Hypothesis(kind, group, new, shifts[best])
-
-
-def _late_supports(parts: Mapping[str, np.ndarray]) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
-    """Supports that may be late, and the parts of the responses that they cause: each one, and all but one."""
-    names = list(parts)
-    for name in names if len(names) > 1 else ():
-        yield (name,), parts[name]
-        others = tuple(other for other in names if other != name)
-        if len(others) > 1:
-            yield others, np.sum([parts[other] for other in others], axis=0)
-
-
-def _swaps(
-    measured: np.ndarray, responses: np.ndarray, alike: Sequence[tuple], errors: np.ndarray, none: np.ndarray
-) -> Iterator[_Hypothesis]:
-    """Pairs of channels of one quantity and the same times that are exchanged, where both errors fall."""
-    own = np.square(measured).sum(axis=-1)
-    # squared error of response i taken for channel j, (n, i, j)
-    cross = np.square(responses).sum(axis=-1)[:, :, None] + own - 2.0 * np.einsum("nit,jt->nij", responses, measured)
-    cross = np.sqrt(np.maximum(cross, 0.0) / own)
-    for i in range(len(measured)):
-        for j in range(i):
-            if alike[i] == alike[j] and (cross[:, [i, j], [j, i]] < cross[:, [i, j], [i, j]]).all(axis=1).any():
-                new = errors.copy()
-                new[:, j], new[:, i] = cross[:, i, j], cross[:, j, i]
-                yield _Hypothesis("swap", (j, i), new, none)
+    chosen = by_lag[:, list(group)]
+    best = np.argmin(chosen.sum(axis=1), axis=1)
+    return _Hypothesis(kind, group, np.take_along_axis(chosen, best[:, None, None], axis=2)[..., 0], lags[best], names)
 
 
 def _lag_errors(
-    measured: np.ndarray, moving: np.ndarray, steps: np.ndarray, fixed: np.ndarray | float = 0.0
+    y: np.ndarray, moving: np.ndarray, steps: np.ndarray, fixed: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lags (n_lags,) [s], and errors (n, n_channels, n_lags) of ``fixed + moving(t - lag)``.
+    """Lags (n_lags,) [s], and logarithms of the errors (n, n_channels, n_lags) of ``fixed + moving(t - lag)``.
 
     Before its first sample a response is at rest; where a shifted response has ended, nothing is compared.
     """
-    n_samples = measured.shape[1]
-    coarse = float(steps.max())
-    longest = min(_LONGEST_LAG, _LONGEST_SHARE * n_samples * float(steps.min()))
-    count = int(longest / coarse)
+    n, coarse = y.shape[1], float(steps.max())
+    count = int(min(LONGEST_LAG, LONGEST_SHARE * n * float(steps.min())) / coarse)
     lags = coarse * np.arange(-count, count + 1)
-    found = np.empty((*moving.shape[:2], len(lags)))
-    size = 2 ** (2 * n_samples - 1).bit_length()
-    target = measured - fixed
+    found, size = np.empty((*moving.shape[:2], len(lags))), 2 ** (2 * n - 1).bit_length()
     for c, step in enumerate(steps):
         k = np.rint(lags / step).astype(int)
-        one = np.broadcast_to(target[..., c, :], (len(moving), n_samples)) if np.ndim(fixed) else target[None, c]
-        products = np.fft.irfft(np.fft.rfft(one, size) * np.fft.rfft(moving[:, c], size).conj(), size)[:, k % size]
-        ends = n_samples - np.maximum(k, 0), n_samples - np.maximum(-k, 0)
-        power = _sums(moving[:, c])
-        squares = _sums(one)[:, ends[1]] + power[:, ends[0]] - power[:, np.maximum(-k, 0)] - 2.0 * products
-        own = _sums(measured[None, c])[:, ends[1]]
-        found[:, c] = np.sqrt(np.maximum(squares, 0.0) / np.where(own > 0.0, own, np.inf))
-        found[:, c][:, own[0] < 0.5 * own[0].max()] = np.inf
-    return lags, found
+        target = np.broadcast_to(y[c] if fixed is None else y[c] - fixed[:, c], (len(moving), n))
+        products = np.fft.irfft(np.fft.rfft(target, size) * np.fft.rfft(moving[:, c], size).conj(), size)[:, k % size]
+        ends, power, own = n - np.maximum(-k, 0), _sums(moving[:, c]), _sums(y[None, c])[0]
+        squares = _sums(target)[:, ends] + power[:, n - np.maximum(k, 0)] - power[:, np.maximum(-k, 0)] - 2.0 * products
+        own = np.where(own[ends] < 0.5 * own[-1], 0.0, own[ends])  # too little is left to compare
+        with np.errstate(divide="ignore"):
+            shares = np.maximum(squares, 0.0) / np.where(own > 0.0, own, 1.0)
+            found[:, c] = 0.5 * np.log(np.where(own > 0.0, shares, np.inf))
+    return lags, np.maximum(found, math.log(FLOOR))
 
 
 def _sums(values: np.ndarray) -> np.ndarray:
@@ -315,28 +251,16 @@ def _sums(values: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((len(values), 1)), np.cumsum(np.square(values), axis=1)], axis=1)
 
 
-def _corrected(
-    fault: _Hypothesis, value: float, responses: np.ndarray, parts: dict[str, np.ndarray], steps: np.ndarray
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Responses, and their parts, as they would be compared with measurements that have the fault."""
-    channels = list(fault.channels)
-
-    def moved(given: np.ndarray) -> np.ndarray:
-        out = given.copy()
-        if fault.kind == "swap":
-            out[:, channels] = given[:, channels[::-1]]
-        elif "lag" in fault.kind:
-            for c in channels:
-                k = round(value / steps[c])
-                out[:, c] = 0.0
-                out[:, c, max(k, 0) : given.shape[-1] + min(k, 0)] = given[
-                    :, c, max(-k, 0) : given.shape[-1] - max(k, 0)
-                ]
-        else:
-            out[:, channels] *= value
-        return out
-
-    if fault.kind == "input lag":
-        parts = {name: moved(each) if name in fault.names else each for name, each in parts.items()}
-        return np.sum(list(parts.values()), axis=0), parts
-    return moved(responses), {name: moved(each) for name, each in parts.items()}
+def _corrected(fault: _Hypothesis, value: float, given: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Responses (n, n_channels, n_samples) as they would be compared with measurements that have the fault."""
+    out, c = given.copy(), list(fault.channels)
+    if fault.kind == "factor":
+        out[:, c] *= value
+    elif fault.kind == "swap":
+        out[:, c] = given[:, c[::-1]]
+    else:
+        for row in c:
+            k, n = round(value / steps[row]), given.shape[-1]
+            out[:, row] = 0.0
+            out[:, row, max(k, 0) : n + min(k, 0)] = given[:, row, max(-k, 0) : n - max(k, 0)]
+    return out

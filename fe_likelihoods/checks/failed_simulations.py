@@ -40,7 +40,7 @@ class Failures(NamedTuple):
     rows: tuple[Failure, ...]  # by reason, the most frequent first
     count: int
     attempts: int
-    remark: str = ""  # what is not known about them
+    unknown: str = ""  # what is not known about them
     prior_failed: int = 0  # of the prior draws with which the run began; 0 if not known
     prior_draws: int = 0
     near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
@@ -48,7 +48,7 @@ class Failures(NamedTuple):
     @property
     def sentence(self) -> str:
         """The sentence for a report without a table of failures."""
-        return self.remark or "No simulation failed."
+        return self.unknown or "No simulation failed."
 
 
 class _Source(NamedTuple):

@@ -6,8 +6,21 @@ from typing import NamedTuple
 
 from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
 
-__all__ = ["CARE", "NOTE", "STATUS", "WRONG", "Finding", "Judgement", "by_severity", "judge", "percent", "warn"]
+__all__ = [
+    "CARE",
+    "CORRELATED",
+    "NOTE",
+    "WRONG",
+    "Finding",
+    "Judgement",
+    "by_severity",
+    "judge",
+    "labelled",
+    "percent",
+    "warn",
+]
 
+CORRELATED = "The errors are correlated"
 STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
 
 
@@ -20,8 +33,15 @@ class Judgement(NamedTuple):
 
     def __str__(self) -> str:
         reasons = [each.kind for each in self.findings if STATUS[each.severity] == self.status != "use"]
+        if self.width_factor > 1.0:
+            reasons.append(f"standard deviations count {self.width_factor:.2g} times, because errors are correlated")
         text = f"{self.status[0].upper()}{self.status[1:]}"
         return f"{text}: {'; '.join(f'{kind[0].lower()}{kind[1:]}' for kind in reasons)}." if reasons else f"{text}."
+
+    @property
+    def width_factor(self) -> float:
+        """Factor of standard deviations from the data, for the effective number of samples; 1 for white errors."""
+        return next((each.numbers["factor"] for each in self.findings if each.kind == CORRELATED), 1.0)
 
 
 def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) -> Judgement:
@@ -35,6 +55,11 @@ def warn(findings: Iterable[Finding], stacklevel: int = 2) -> None:
     for each in findings:
         if each.severity != NOTE:
             warnings.warn(each.message, stacklevel=stacklevel + 1)
+
+
+def labelled(findings: Iterable[Finding]) -> list[str]:
+    """Findings as lines of a text, which begin with CAUTION unless they are notes."""
+    return [f"{'Note' if each.severity == NOTE else 'CAUTION'}: {each}" for each in findings]
 
 
 def percent(share: float) -> str:

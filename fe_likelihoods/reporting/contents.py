@@ -6,10 +6,9 @@ import numpy as np
 
 from samplers.estimates.pareto import LARGEST_SHAPE
 
+from ..checks.compared import Fits
 from ..checks.finding import Judgement
-from ..checks.fit import SAME_AS_PRIOR
-from ..checks.fit_results import Fits
-from ..checks.result import residual_sentence
+from ..checks.fit import SAME_AS_PRIOR, residual_sentence
 from ..checks.run import FinishedRun
 from ..checks.table import ParameterRow
 from ..likelihood.likelihood import FELikelihood

@@ -10,7 +10,7 @@ import numpy as np
 
 from samplers import plot_corner, plot_marginals, plot_run
 
-from ..checks.fit_results import Fit
+from ..checks.compared import Fit
 from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
 from ..prediction.prediction import Prediction

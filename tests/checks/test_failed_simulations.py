@@ -15,8 +15,8 @@ from fe_likelihoods import (
     TruncatedNormal,
     report,
 )
+from fe_likelihoods.checks.compared import fit_data_sets
 from fe_likelihoods.checks.failed_simulations import failures
-from fe_likelihoods.checks.fit_results import fit_data_sets
 from fe_likelihoods.checks.run import read_run
 from fe_likelihoods.checks.table import parameter_rows
 from fe_likelihoods.reporting.contents import summary_sentences
@@ -51,7 +51,7 @@ def run(posterior, walkers=60, steps=4, **options):
 
 
 def notes_of(contents):
-    return {note.kind: note for note in contents.advice}
+    return {note.kind: note for note in contents.findings}
 
 
 def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
@@ -66,7 +66,7 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
     assert (
-        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} simulated points failed"
+        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points failed"
         in note.text
     )
     assert contents.summary[0].startswith("Do not use: ") and "failures border on the samples" in contents.summary[0]
@@ -149,7 +149,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     contents = gather(finished, {})
     titles = notes_of(contents).keys()
     assert titles.isdisjoint(
-        {"True values are missed", "Not informed by the data", "The errors are not white noise", "Far from the prior"}
+        {"True values are missed", "Not informed by the data", "The errors are correlated", "Far from the prior"}
     )
     assert "Nothing can be said about the parameters yet" in contents.summary[2] and not contents.residuals
     assert "The chain is short" in titles

@@ -21,7 +21,8 @@ from fe_likelihoods import (
     Uniform,
     check_fit,
 )
-from fe_likelihoods.checks.fit import compare, draws_to_compare, fit_gate
+from fe_likelihoods.checks.compared import compare, draws_to_compare
+from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
 from samplers import SMCSampler
@@ -113,10 +114,10 @@ def test_a_fit_that_another_response_beats_is_named():
     points = draws_to_compare(posterior)[:20]
     good = np.array([1.05, 1.0, *points[0, 2:]])
     (compared,) = compare(posterior.likelihood, np.stack([good, *points]), True)
-    assert fit_gate([compared]) == ()
+    assert check_responses([compared]) == []
     poor = np.array([1.9, 0.4, *points[0, 2:]])
     (compared,) = compare(posterior.likelihood, np.stack([poor, good, *points]), True)
-    found = {each.kind: each for each in fit_gate([compared])}
+    found = {each.kind: each for each in check_responses([compared])}
     assert "its error (RRMSE) is 5" in found["The fit is not the best one known"].text
     assert "The model does not follow the measurements" in found and not {
         "A unit may be wrong",
@@ -135,7 +136,7 @@ def test_what_a_guide_has_simulated_is_compared_as_well():
     (of_supports,) = compare(posterior.likelihood, draws_to_compare(posterior)[:3], False)
     assert set(of_supports.parts) == {"column", "south", "north"}
     np.testing.assert_allclose(sum(of_supports.parts.values()), of_supports.responses, atol=1e-12)
-    assert fit_gate((of_supports, compared)) == ()
+    assert check_responses((of_supports, compared)) == []
 
 
 def _oscillation():
