@@ -29,7 +29,7 @@ __all__ = ["ChannelFit", "Compared", "Fit", "Fits", "compare", "data_sets_of", "
 
 logger = logging.getLogger(__name__)
 
-MOST_DRAWS, FEWEST_DRAWS = 100, 5
+MOST_DRAWS, FEWEST_DRAWS = 100, 5  # of the prior
 SECONDS = 10.0  # of simulations of these draws
 MOST_STORED = 100  # responses of a guide that are compared in addition
 

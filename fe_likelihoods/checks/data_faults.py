@@ -24,7 +24,7 @@ from ..signals.channels import Measurements
 from ..signals.error_measures import relative_errors
 from ..units import DIMENSIONS, UNITS
 
-__all__ = ["BETTER_THAN_A_FIT", "Fault", "describe_unit", "find_faults"]
+__all__ = ["BETTER_THAN_A_FIT", "EXPLAINED", "Fault", "describe_unit", "find_faults"]
 
 BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
 BETTER_THAN_A_FIT = 0.7  # the same, where one of the responses is the fit
@@ -34,7 +34,7 @@ FACTOR = 1.5  # from which a factor may be one between units
 LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
 FEWEST_STEPS = 1.5  # a lag below this many steps is not named
 MOST_VALUES = 2**24  # of responses that are compared at once
-MOST_FAULTS = 4
+MOST_FAULTS = 4  # that are found one after the other
 # share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
 SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
 SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them

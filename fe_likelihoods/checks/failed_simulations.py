@@ -14,14 +14,12 @@ from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.likelihood import FELikelihood
+from .finding import SMALL_PROBABILITY
 from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
 KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as signal numbers
-FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
-CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
-UNLIKELY = 0.01  # probability of such a distance by chance
 
 
 class Failure(NamedTuple):
@@ -172,12 +170,10 @@ def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
 def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
     """The parameter whose values tell these failures from the successes best, by the Kolmogorov-Smirnov distance."""
     succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
-    if len(failed) < FEWEST_TO_COMPARE:
-        return "too few to see a pattern"
     tests = [ks_2samp(failed[:, i], succeeded[:, i]) for i in range(failed.shape[1])]
     i = int(np.argmax([test.statistic for test in tests]))
     test, name = tests[i], run.names[source.columns[i]]
-    if test.statistic < CLEAR_SEPARATION or test.pvalue > UNLIKELY:
+    if test.pvalue > SMALL_PROBABILITY:
         return "no single parameter tells them from the successful ones"
     place = test.statistic_location
     low = test.statistic_sign > 0  # the failures have the smaller values

@@ -10,6 +10,7 @@ __all__ = [
     "CARE",
     "CORRELATED",
     "NOTE",
+    "SMALL_PROBABILITY",
     "WRONG",
     "Finding",
     "Judgement",
@@ -20,6 +21,7 @@ __all__ = [
     "warn",
 ]
 
+SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
 CORRELATED = "The errors are correlated"
 STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
 

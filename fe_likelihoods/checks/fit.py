@@ -12,8 +12,8 @@ from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
 from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
-from .data_faults import BETTER_THAN_A_FIT, Fault, describe_unit, find_faults
-from .finding import CARE, CORRELATED, NOTE, WRONG, Finding, percent
+from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
+from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .table import Moments, ParameterRow, rows_of
 
 __all__ = [
@@ -29,10 +29,9 @@ __all__ = [
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
-SMALL_PROBABILITY = 0.01  # of white or normal residuals, and of so many true values outside of their intervals
 # RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of a response that is clearly worse
-# than zero; of the best of several draws of the prior from which it does not reach the data
-LARGE_ERROR, USELESS_ERROR, FAR_ERROR = 0.5, 1.2, 0.9
+# than zero
+LARGE_ERROR, USELESS_ERROR = 0.5, 1.2
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
 # Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
@@ -180,7 +179,7 @@ def _check_errors(compared: Sequence[Compared], far_matters: bool) -> list[Findi
         for channel, error in zip(each.measurements.channels, best.tolist(), strict=True):
             place = _where([channel.name], each)
             if not each.fitted:
-                far |= {place: error} if error > FAR_ERROR else {}
+                far |= {place: error} if error > EXPLAINED else {}
             elif error > LARGE_ERROR:
                 (useless if error > USELESS_ERROR else poor)[place] = error
 

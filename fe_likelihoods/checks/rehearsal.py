@@ -135,7 +135,7 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
             best = _check_best_fit(stage, posterior, seconds)
         of_fit = check_responses(compared)
         simulations = stage.made + _made(posterior) - before
-    found += [*best.test.findings, *of_fit]
+    found += [*best.test.findings, *of_fit, *_check_failures(posterior)]
     # what the data tell is not known where they are wrong or out of reach
     known = None if of_fit else best.found
     return ModelCheck(by_severity(found), best.test.tests, simulations, seconds, best.searched, known)
@@ -191,6 +191,17 @@ def _check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]
         "Set the seeds of the model, give each simulation a folder of its own, and read no results of earlier runs."
     )
     return [Finding("The model is not repeatable", WRONG, text, action)] if text else []
+
+
+def _check_failures(posterior: Posterior) -> list[Finding]:
+    """The most frequent reason of failed simulations, most of which are draws of the prior."""
+    report = posterior.report()
+    if not report["failure_count"]:
+        return []
+    often, count = max(report["failure_reasons"].items(), key=lambda each: each[1])
+    text = f"{report['failure_count']} of the simulations of this check failed, {count} of them: {often}."
+    action = "A failed simulation counts as impossible: mend the model where its parameters are plausible."
+    return [Finding("Simulations failed", CARE, text, action, {"count": report["failure_count"]})]
 
 
 def _later(record: Record, steps: int) -> Record:

@@ -28,7 +28,6 @@ from .table import ParameterRow, parameter_rows
 __all__ = ["JudgedRun", "check_result", "check_run", "judge_run"]
 
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
-LARGE_MEAN_ERROR = 0.2  # of the standard deviation, of which it is 2 %
 LARGE_FAILURE_SHARE = 0.05  # as much as a tail of a 90 % interval
 LARGEST_TEST, TEST_SECONDS = 0.05, 10.0  # of step and mesh: share of the simulations of the run, below which it is made
 
@@ -93,7 +92,7 @@ def check_run(
     A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
     """
     model = StepTest([], {}) if model is None else model
-    found = _check_sampling(run) + _check_chain(run, rows) + _check_failures(run, failed)
+    found = _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
     for text in fits.failures:
         found.append(Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model."))
     found += check_responses(fits.compared) + ([] if run.is_inconclusive else check_parameters(rows)) + model.findings
@@ -187,7 +186,7 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
     return found
 
 
-def _check_chain(run: FinishedRun, rows: Sequence[ParameterRow]) -> list[Finding]:
+def _check_chain(run: FinishedRun) -> list[Finding]:
     """Whether the samples are many enough, for a Markov chain too, and have one mode."""
     found = [] if run.tempered else _check_markov_chain(run)
     size = run.effective_sample_size
@@ -199,10 +198,6 @@ def _check_chain(run: FinishedRun, rows: Sequence[ParameterRow]) -> list[Finding
         if not np.isfinite(size):
             text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
         found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
-    rough = [row.label for row in rows if row.mean_error > LARGE_MEAN_ERROR * row.sd]
-    if rough and size >= FEW_SAMPLES:
-        text = f"The error of the mean exceeds a fifth of the standard deviation for {', '.join(rough)}."
-        found.append(Finding("Rough means", CARE, text, "Make more iterations, or use more walkers."))
     if run.n_modes > 1 and not run.is_inconclusive:
         shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
         text = (

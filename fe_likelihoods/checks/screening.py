@@ -1,6 +1,6 @@
 """Findings about measurements and motions, before any simulation."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,12 @@ from ..signals.records import Record
 from ..units import from_si
 from .finding import CARE, NOTE, Finding, by_severity
 
-__all__ = ["check_data", "check_gaps"]
+__all__ = ["check_data", "check_gaps", "check_noise_prior", "check_steps_of_mass"]
 
 # No horizontal ground acceleration above 2.8 g was recorded (Tsukidate 2011); responses leave room for impacts.
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
 SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
+SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
@@ -92,3 +93,24 @@ def check_gaps(noise: Any) -> list[Finding]:
         "motion is missing, the share is too large and predictions of whole motions too wide."
     )
     return [Finding("Gaps in the data", CARE, text, "Use local=1, whose level is taken from samples near by.", large)]
+
+
+def check_noise_prior(channel: str, unit: str, expected: float, largest: float) -> list[Finding]:
+    """Whether the noise that a prior expects exceeds every measured value of a channel [SI]."""
+    if not expected > largest:
+        return []
+    text = f"The prior expects a noise that is larger than every measured value of {channel}."
+    action = f'A number without a unit is in SI units; give one, such as "half-normal(5 {unit})".'
+    return [Finding("A prior of the noise is large", CARE, text, action, {"ratio": expected / largest})]
+
+
+def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:
+    """Accelerations below the top of a column, whose own mass vibrates above 20 Hz, by integration steps [s]."""
+    if not names or step <= SHORT_STEP:
+        return []
+    text = (
+        f"{', '.join(names)}: accelerations below the top contain vibrations above 20 Hz, which a step of {step:.2g} s "
+        "does not resolve (with 1/256 s, they are wrong by 48 %)."
+    )
+    action = f"Give substeps= so that a step is {SHORT_STEP:.2g} s or shorter, and compare different n_elements."
+    return [Finding("The steps are long for an acceleration", CARE, text, action, {"step": step})]

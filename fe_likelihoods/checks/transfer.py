@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from ..signals.channels import Channel
+from ..units import DIMENSIONS, to_si
 from .finding import CARE, WRONG, Finding
 from .steps import NOTHING, UNREAD
 
@@ -13,11 +15,11 @@ __all__ = [
     "check_emulated",
     "check_failed_samples",
     "check_final_values",
-    "check_impossible_draws",
     "check_interval_samples",
     "check_peaks",
     "check_same_response",
     "check_scores",
+    "check_unit_of_threshold",
     "check_widening",
     "is_narrow",
     "note_assumed_noise",
@@ -28,9 +30,10 @@ PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
 NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
-HALF = 0.5  # of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands
-ROUGH = 0.5  # variance that an emulator leaves: it then saves less than half of the simulations
-IMPOSSIBLE = 0.01  # of the draws left out, which may be a fifth of a tail of 5 %
+# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands; and of the
+# variance that an emulator leaves, which then saves less than half of the simulations
+HALF = 0.5
+FAR = 10.0  # factor beyond all values: no reader asks for a probability so close to 0 or 1
 
 
 def check_peaks(
@@ -172,7 +175,7 @@ def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: i
         )
         action = "Use more simulations, or propagate with the chain."
         found.append(Finding("A standard deviation is not determined", CARE, text, action))
-    if unexplained > ROUGH:
+    if unexplained > HALF:
         text = (
             f"The emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "
             "more than as many draws."
@@ -180,22 +183,6 @@ def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: i
         action = "Use more simulations, or propagate with the chain."
         found.append(Finding("The emulator is rough", CARE, text, action, {"unexplained": unexplained}))
     return found
-
-
-def check_impossible_draws(possible: np.ndarray) -> list[Finding]:
-    """Draws (n,) bool of a new event whose noise is impossible, and which are left out."""
-    share = 1.0 - float(np.mean(possible))
-    if share <= IMPOSSIBLE:
-        return []
-    text = (
-        f"{share:.0%} of the draws have an impossible noise, such as a share of the measured signal of 1 or more, and "
-        "are left out."
-    )
-    action = (
-        "Use level='response', whose shares have no upper bound, let shares vary with Varying(..., scale=\"logit\"), "
-        "or state a narrower prior of their spread between events."
-    )
-    return [Finding("Impossible draws", CARE, text, action, {"share": share})]
 
 
 def check_interval_samples(n_samples: int, needed: int, level: float) -> list[Finding]:
@@ -219,3 +206,17 @@ def check_failed_samples(reasons: Mapping[str, int], nothing: str = "") -> list[
 def check_scores(texts: Iterable[str]) -> list[Finding]:
     """What was said while a prediction was scored, or why it has no scores."""
     return [Finding("Scores of the prediction", CARE, text) for text in texts]
+
+
+def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
+    """Thresholds that are far from all values [SI], and among them in the unit of the channel."""
+    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
+    low, high = np.abs(values).min() / FAR, np.abs(values).max() * FAR
+    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
+    if not np.all(inside & outside):
+        return []
+    text = (
+        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all predicted "
+        f"values (up to {np.abs(values).max():.3g}): is it in {channel.unit}?"
+    )
+    return [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]

@@ -10,6 +10,7 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import labelled
 from ..checks.rehearsal import ModelCheck, check_model
+from ..checks.screening import check_noise_prior
 from ..information.identifiability import of_mode
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
@@ -81,11 +82,10 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         note = " (assumed: not in the file)" if parameter.name in problem.assumed else ""
         say(f"  {parameter.label:<{width}}  prior mean {mean:.3g}, standard deviation {sd:.3g}{note}")
         channel = channels.get(parameter.name)
-        if channel is not None and prior.moments[0] > np.nanmax(np.abs(measured.channel(channel.name))):
-            say(
-                f"  CAUTION: this noise is expected to be larger than every measured value of {channel.name}. A number "
-                f'without a unit is in SI units; give one, such as "half-normal(5 {channel.unit})"'
-            )
+        if channel is not None:
+            largest = float(np.nanmax(np.abs(measured.channel(channel.name))))
+            for line in labelled(check_noise_prior(channel.name, channel.unit, float(prior.moments[0]), largest)):
+                say(f"  {line}")
 
 
 def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
@@ -113,13 +113,6 @@ def _say_simulation(
             "check [model] and [priors]"
         )
     checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
-    report = posterior.report()
-    if report["failure_count"]:
-        often, count = max(report["failure_reasons"].items(), key=lambda each: each[1])
-        say(
-            f"CAUTION: {report['failure_count']} of the simulations of this check failed, {count} of them: {often}. A "
-            "failed simulation counts as impossible: mend the model where its parameters are plausible"
-        )
     response = likelihood.simulate(mean[None, :n]).response[0]
     errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
