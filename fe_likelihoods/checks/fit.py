@@ -268,8 +268,8 @@ def check_residuals(fits: Fits) -> list[Finding]:
     independent = [min(each.checks.n_effective[0], each.assumed) for _, each in checked if _is_coloured(each)]
     worth = sum(independent) + sum(each.assumed for _, each in checked if not _is_coloured(each))
     found = []
-    if coloured and assumed > worth:
-        factor = float(np.sqrt(assumed / worth))
+    factor = float(np.sqrt(assumed / worth)) if coloured else 1.0
+    if round(factor, 1) > 1.0:
         text = (
             f"The errors of {listed(coloured)} are correlated: where the noise takes {assumed:.0f} samples for "
             f"independent, they are worth {worth:.0f}, so that standard deviations from the data are too small by a "

@@ -70,9 +70,11 @@ class ParameterRow(NamedTuple):
 
         The precision of the data, which is the precision beyond the prior's, is divided by the square.
         """
+        if not self.sd > 0.0:
+            return self.sd
         prior = 1.0 / self.prior_sd**2 if self.prior_sd > 0.0 else 0.0
-        data = max(1.0 / self.sd**2 - prior, 0.0) if self.sd > 0.0 else 0.0
-        return max(self.sd, (prior + data / factor**2) ** -0.5) if prior + data > 0.0 else self.sd
+        data = max(1.0 / self.sd**2 - prior, 0.0)
+        return max(self.sd, (prior + data / factor**2) ** -0.5)
 
 
 def parameter_rows(run: FinishedRun) -> list[ParameterRow]:

@@ -19,8 +19,10 @@ from fe_likelihoods import (
     check_result,
 )
 from fe_likelihoods.checks.rehearsal import refuse_chance
+from fe_likelihoods.checks.steps import halve_steps
 from fe_likelihoods.information.identifiability import of_mode
 from fe_likelihoods.problems import table_motion
+from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
@@ -164,3 +166,25 @@ def test_failures_and_sizes_are_named():
     failing = posterior_of(lambda theta, record: 1 / 0)
     with pytest.raises(ValueError, match="mean of the prior has failed"):
         check_model(failing)
+
+
+def test_a_model_that_keeps_its_own_step_is_not_tested_which_is_a_note():
+    """It returns as many samples as before under half the step, or integrates with steps of its own."""
+
+    def own_samples(theta, record):
+        return central_differences(theta, MOTION, 8)[:, : MOTION.n_steps] * (np.abs(record.acceleration).max() / PEAK)
+
+    def own_steps(theta, record):
+        fine = record.resample(0.00125) if record.dt > 0.002 else record
+        found = central_differences(theta, fine)
+        return found[:, :: round(record.dt / 0.00125)][:, : record.n_steps]
+
+    PEAK = np.abs(MOTION.acceleration).max()
+    for function in (own_samples, own_steps):
+        posterior = posterior_of(function)
+        point, sd = np.array([1.1, 0.9, 0.001]), np.array([0.01, 0.01, 1e-4])
+        test = halve_steps(posterior, point, sd, simulate_batch)
+        assert [(each.kind, each.severity) for each in test.findings] == [("Step and mesh were not tested", "note")]
+        assert test.tests["Time step"].startswith("not tested: ")
+    tested = halve_steps(posterior_of(central_differences), point, sd, simulate_batch)
+    assert tested.tests == {"Time step": "the time step was halved at the fit"}
