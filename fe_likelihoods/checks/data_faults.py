@@ -32,7 +32,6 @@ EXPLAINED = 0.85  # error above which a response explains nothing: a correlation
 FLOOR = 0.02  # error below which smaller ones count as equal
 FACTOR = 1.5  # from which a factor may be one between units
 LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
-FEWEST_STEPS = 1.5  # a lag below this many steps is not named
 MOST_VALUES = 2**24  # of responses that are compared at once
 MOST_FAULTS = 4  # that are found one after the other
 # share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
@@ -103,7 +102,7 @@ def find_faults(
             value = float(each.value[row])
             is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
             if "lag" in each.kind:
-                is_large = abs(value) > FEWEST_STEPS * steps[c].max()
+                is_large = round(abs(value) / steps[c].max()) > 1  # one step is a convention of files
             clear = after < min(math.log(better) + before, math.log(EXPLAINED)) and gain > -math.log(better) * len(c)
             if is_large and clear and SIMPLE[each.kind] * gain > most:
                 most, explained = SIMPLE[each.kind] * gain, (each, value, math.exp(before), math.exp(after))
