@@ -160,7 +160,7 @@ def check_widening(widening: Mapping[str, float]) -> list[Finding]:
 
 
 def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: int) -> list[Finding]:
-    """What few simulations cannot show: numbers that are all `equal`, or whose variances are `unknown` or unexplained."""
+    """What few simulations cannot show: equal numbers, and variances that are unknown or unexplained."""
     found = []
     if equal:
         text = (
@@ -170,8 +170,8 @@ def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: i
         found.append(Finding("No scatter was seen", CARE, text, "Use more simulations."))
     if unknown:
         text = (
-            f"The signed sample does not determine the standard deviation of {unknown} numbers, whose variance by it is "
-            "negative."
+            f"The signed sample does not determine the standard deviation of {unknown} numbers, whose variance by it "
+            "is negative."
         )
         action = "Use more simulations, or propagate with the chain."
         found.append(Finding("A standard deviation is not determined", CARE, text, action))
