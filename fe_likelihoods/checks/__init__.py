@@ -1,1 +1,1 @@
-"""Doubts about data, models, results and predictions: functions that take numbers and return findings."""
+"""What speaks against data, models, results and predictions: functions that take numbers and return findings."""

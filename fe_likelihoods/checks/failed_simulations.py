@@ -66,13 +66,13 @@ def failures(run: FinishedRun) -> Failures:
     found = [(part, _of_likelihood(run, part, columns)) for part, columns in run.likelihood.parts()]
     sources = [source for _, source in found]
     attempts = sum(each.simulations for part, _ in found for each in (part, *part.shortened))
-    remark = ""
+    unknown = ""
     if not all(_was_here(run, part, source) for part, source in found):
-        remark = (
+        unknown = (
             "Not known: the simulations of this run were made in another process, or are no longer in memory, and "
             "failures are counted in the process that simulates."
         )
-    return _joined(run, sources, attempts, remark)
+    return _joined(run, sources, attempts, unknown)
 
 
 def _of_likelihood(run: FinishedRun, likelihood: FELikelihood, columns: np.ndarray) -> _Source:
@@ -98,14 +98,16 @@ def _of_function(run: FinishedRun) -> Failures:
     draws = np.empty((0, ndim)) if sampler.prior_draws is None else sampler.prior_draws
     draws = draws[~_are_among(draws, failed)]
     source = _Source(np.arange(ndim), failed, reasons, np.concatenate([draws, run.samples]), counts)
-    remark = (
+    unknown = (
         "No evaluation raised an exception or returned NaN. Whether a value of -inf stands for a failed simulation is "
         "not known."
     )
-    return _joined(run, [source], sampler.evaluations, remark, sampler.failure_count)
+    return _joined(run, [source], sampler.evaluations, unknown, sampler.failure_count)
 
 
-def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str, count: int | None = None) -> Failures:
+def _joined(
+    run: FinishedRun, sources: list[_Source], attempts: int, unknown: str, count: int | None = None
+) -> Failures:
     rows = [row for source in sources for row in _by_reason(run, source)]
     rows.sort(key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
@@ -115,7 +117,7 @@ def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str
     if draws is not None and (count <= sum(len(source.failed) for source in sources)):
         bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
         prior = (int(bad.sum()), len(draws))
-    return Failures(tuple(rows), count, max(attempts, count), remark, *prior, _near_the_samples(run, sources))
+    return Failures(tuple(rows), count, max(attempts, count), unknown, *prior, _near_the_samples(run, sources))
 
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
