@@ -50,7 +50,7 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
         in page.text
     )
     assert "There are no measurements to compare with" in page.text
-    assert "less than half of the strong part of top" in page.notes["The measurements are outside of the band"]
+    assert "less than half of the strong part of top" in page.notes["larger: The measurements are outside of the band"]
     histories = next(table for table in page.tables if table[0][-1] == "In its strong part")[1:]
     scores = events["larger"]["histories"].score(measured["larger"])
     assert [row[0] for row in histories] == ["same", "larger"]
@@ -90,7 +90,7 @@ def test_what_is_not_known_of_an_event_is_said_in_words(vibrating, tmp_path, mon
     assert "nan" not in told.sentence and "In the strong part, no sample of top can be compared." in told.sentence
     failed = SimulationFailed("nothing to predict from, all 3 samples failed (3: unstable)")
     page = read_page(report(sampler, posterior, out=tmp_path / "report.html", events={"strong": failed}))
-    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["No prediction"]
+    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["strong: No prediction"]
 
 
 def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):
