@@ -1,7 +1,7 @@
 """A finding: what a check of data, model, run or prediction has found, for both packages."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from typing import NamedTuple
 
 __all__ = ["CARE", "NOTE", "WRONG", "Finding", "by_severity"]
 
@@ -10,8 +10,7 @@ CARE = "care"  # limits the result
 WRONG = "wrong"  # speaks against the result
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """What a check has found; ``str`` gives it in sentences.
 
     Attributes
@@ -24,7 +23,7 @@ class Finding:
         What was found, with its numbers.
     action : str
         What to do about it; may be empty.
-    numbers : mapping of str to float
+    numbers : dict of str to float
         The numbers that it was judged by.
     """
 
@@ -32,12 +31,15 @@ class Finding:
     severity: str
     text: str
     action: str = ""
-    numbers: Mapping[str, float] = field(default_factory=dict, hash=False)
+    numbers: dict[str, float] = {}
 
     @property
     def message(self) -> str:
         """Text and action, without the title."""
         return f"{self.text} {self.action}".rstrip()
+
+    def __hash__(self) -> int:
+        return hash(self[:4])
 
     def __str__(self) -> str:
         return f"{self.kind}: {self.message}"

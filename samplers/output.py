@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import zlib
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +131,7 @@ class Output:
             "ladder": result.ladder,
             "check": result.check,
             "founders": None if result.founders is None else np.asarray(result.founders).tolist(),
-            "verdict": None if self.verdict is None else [*self.verdict[:6], list(map(astuple, self.verdict.findings))],
+            "verdict": self.verdict,
             "first_step": self.first_step,
             "provisional": self.provisional,
         }
@@ -232,8 +231,9 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
     )
     if verdict is None:
         return result, None
-    status, reasons, *others = verdict[:6]  # version 0.2 stored no findings
-    return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in sum(verdict[6:], [])))
+    status, reasons, *others = verdict[:6]
+    findings = verdict[6] if len(verdict) > 6 else ()  # version 0.2 stored none
+    return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
 
 
 def _checksums(backend: HDFBackend, known: int = 0, checksum: int = 0) -> tuple[int, int, int]:
