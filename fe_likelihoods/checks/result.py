@@ -117,7 +117,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
             "Units, signs, clocks, swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
-        ("Residuals", f"{len(checked)} channels" if checked else "not tested: there are none"),
+        ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 
 
