@@ -1,6 +1,6 @@
 """Findings about measurements and motions, before any simulation."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,13 @@ SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 
 LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
-def check_data(measurements: Measurements, record: Record | Iterable[Record] | None = None) -> tuple[Finding, ...]:
+def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
     """Look for faults that measurements and motions show by themselves; nothing is simulated.
 
     Parameters
     ----------
     measurements : Measurements
-    record : Record, or several, optional
+    record : Record, Events, or a list of records, optional
         The base motions.
 
     Returns
@@ -39,7 +39,7 @@ def check_data(measurements: Measurements, record: Record | Iterable[Record] | N
     >>> for finding in check_data(measurements, record):
     ...     print(finding.severity, finding)
     """
-    motions = [record] if isinstance(record, Record) else list(record or ())
+    motions = record if isinstance(record, list | tuple) else [] if record is None else [record]
     peaks = [(f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in motions]
     for channel, values in zip(measurements.channels, measurements.values, strict=True):
         if np.isfinite(values).any():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods import Channel, Measurements, Record, check_data
+from fe_likelihoods import Channel, Events, Measurements, Record, check_data
 from fe_likelihoods.checks.screening import check_noise_prior, check_steps_of_mass
 
 TOP, DECK = Channel("top", "displacement", "mm"), Channel("deck", "acceleration", "g")
@@ -17,6 +17,7 @@ def kinds(values=VALUES, record=MOTION, description=""):
 
 def test_plausible_data_are_left_alone():
     assert kinds() == [] and kinds(record=None) == [] and kinds(record=[MOTION, MOTION.scale(0.5)]) == []
+    assert kinds(record=Events([MOTION, MOTION.scale(0.5)], rest=1.0)) == []
     gappy = VALUES.copy()
     gappy[0, 10:20] = np.nan
     assert kinds(gappy) == []
