@@ -99,7 +99,7 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
     assert judgement.status == "use with care"
     found = next(each for each in judgement.findings if each.kind == "The model is too coarse for its data")
     assert "stiffness by" in found.text and made <= 2 * (100 + 2 + 4)
-    fine, _ = judged(lambda theta, record: central_differences(theta, record, 6))
+    fine, _ = judged(lambda theta, record: central_differences(theta, record, 8))
     assert not [each for each in fine.findings if "coarse" in each.kind or "tested" in each.kind], str(fine)
 
 
