@@ -1,5 +1,9 @@
 from . import problems
 from .cache.simulation_cache import SimulationCache
+from .checks.fit import check_fit
+from .checks.rehearsal import check_model
+from .checks.result import check_result
+from .checks.screening import check_data
 from .column_damage.damage import damage, limit_states
 from .column_damage.measures import damage_measures, damage_outputs
 from .column_damage.park_ang import park_ang_constants
@@ -55,9 +59,6 @@ from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Unifor
 from .priors.mixture_prior import fit_mixture
 from .priors.multivariate import MultivariateNormal
 from .priors.priors import Prior
-from .reporting.advice import check_result
-from .reporting.fit_gate import check_fit
-from .reporting.rehearsal import rehearse
 from .reporting.report import report
 from .signals.alignment import align
 from .signals.channels import Channel, Measurements
@@ -121,7 +122,9 @@ __all__ = [
     "align",
     "arias_intensity",
     "average_predictions",
+    "check_data",
     "check_fit",
+    "check_model",
     "check_result",
     "damage",
     "damage_measures",
@@ -169,7 +172,6 @@ __all__ = [
     "read_imposed_test",
     "read_modal_data",
     "read_record",
-    "rehearse",
     "report",
     "residual_checks",
     "rms",

@@ -21,6 +21,7 @@ from emcee.backends import Backend, HDFBackend
 from .blobs import converted
 from .emcee_internals import change_blobs, cut_chain, restore_counts, trim_chain
 from .estimates.importance import EvidenceCheck
+from .finding import Finding
 from .judgement.verdict import Verdict
 from .output_file import FileHeld, change_file, open_file, patient_open, read_object
 from .reports import AnnealingResult, Stage, warn
@@ -223,7 +224,11 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
         None if check is None else EvidenceCheck(*check),
         None if founders is None else np.array(founders),
     )
-    return result, None if verdict is None else Verdict(verdict[0], tuple(verdict[1]), *verdict[2:])
+    if verdict is None:
+        return result, None
+    status, reasons, *others = verdict[:6]
+    findings = verdict[6] if len(verdict) > 6 else ()  # version 0.2 stored none
+    return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
 
 
 def _checksum_of_steps(group: h5py.Group, known: int = 0, checksum: int = 0) -> tuple[int, int]:

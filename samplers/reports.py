@@ -13,10 +13,10 @@ import numpy as np
 
 from .estimates.control_variates import SignedSample
 from .estimates.importance import EvidenceCheck
+from .finding import Finding
 
 __all__ = [
     "AnnealingResult",
-    "Concern",
     "EarlyStop",
     "GuideTick",
     "GuidedRound",
@@ -42,13 +42,6 @@ def warn(message: str) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OUR_PACKAGES:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, SamplingWarning, stacklevel=level)
-
-
-class Concern(NamedTuple):
-    """A reason why the result may be wrong."""
-
-    message: str  # the finding, and what to do
-    grave: bool  # whether the numbers may be wrong by more than their stated errors
 
 
 class Stage(NamedTuple):
@@ -160,7 +153,7 @@ class EarlyStop(NamedTuple):
 
 
 Report = (
-    Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | SignedSample | EarlyStop | Concern
+    Stage | Sweep | GuideTick | Restart | EvidenceCheck | GuidedRound | GuidedStart | SignedSample | EarlyStop | Finding
 )
 
 
@@ -177,7 +170,7 @@ class AnnealingResult(NamedTuple):
     concerns: tuple[str, ...] = ()  # reasons of the guide why parts of the posterior may be missing
     refusals: tuple[str, ...] = ()  # reasons of the guide why the result is not to be used
     basis: str = ""  # how the guide searched for parts of the posterior; empty if it does not say
-    findings: tuple[Concern, ...] = ()  # of the checks
+    findings: tuple[Finding, ...] = ()  # of the checks
     # effective sample size of the walkers when beta = 1 was reached; None for a result read from a backend
     independent_points: float | None = None
 

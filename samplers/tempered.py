@@ -623,8 +623,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
         said = check_likelihood(log_prob, self._target.log_prior(coords))
-        for concern in said:
-            warn(concern.message)
+        for finding in said:
+            warn(finding.message)
         return result._replace(
             findings=(*result.findings, *said),
             concerns=() if guidance is None else guidance.guide.concerns,

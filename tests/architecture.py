@@ -42,6 +42,7 @@ ORDER = {
         ("prediction",),
         ("modal",),
         ("events", "models"),
+        ("checks",),
         ("likelihood",),
         ("emulation",),
         ("cache",),
@@ -63,7 +64,7 @@ ORDER = {
         ("presets", "reports"),
         ("budget", "estimates", "moves"),
         ("proposals", "record", "settings"),
-        ("blobs", "emcee_internals", "interrupts", "resampling"),
+        ("blobs", "emcee_internals", "finding", "interrupts", "resampling"),
     ),
 }
 

@@ -27,7 +27,7 @@ WORKERS = {"faults", "interrupts", "folder", "shared_files", "by_value", "user_c
     "programs",
 }
 # a thing and its figure, section of the command, report or other package
-SAME_NAME = {"comparison", "damage", "events", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
+SAME_NAME = {"comparison", "damage", "events", "finding", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
     "interrupts",
     "sampling",
     "scores",
@@ -268,3 +268,78 @@ def test_sources_cite_only_what_a_reader_has():
 
 def test_defaults_of_settings_are_written_once():
     assert not second_defaults()
+
+
+CHECKS = ("samplers/judgement/", "fe_likelihoods/checks/")
+# limits of effort, of a search, and of what is printed: they end work, and judge nothing
+EFFORT = {"FEWEST_DRAWS", "KEPT_APART", "LARGEST_TEST", "LATE_SHARE", "LONGEST_LAG", "LONGEST_SHARE", "MOST_DRAWS"} | {
+    "MOST_FAULTS",
+    "MOST_SEARCHED",
+    "MOST_STORED",
+    "MOST_VALUES",
+    "SECONDS",
+    "TEST_SECONDS",
+}
+MAKERS = {"Finding", "warnings.warn", "logger.warning"}
+
+
+def called(node: ast.AST) -> set[str]:
+    """Functions and classes that are called in a part of a module, as they are written."""
+    return {ast.unparse(each.func) for each in ast.walk(node) if isinstance(each, ast.Call)}
+
+
+def limits_of(tree: ast.Module) -> set[str]:
+    """Module-level names of numbers."""
+    found = set()
+    for node in tree.body:
+        numbers = isinstance(node, ast.Assign) and [
+            each
+            for each in ast.walk(node.value)
+            if isinstance(each, ast.Constant) and isinstance(each.value, int | float)
+        ]
+        if numbers and any(numbers):
+            found |= {each.id for target in node.targets for each in ast.walk(target) if isinstance(each, ast.Name)}
+    return found
+
+
+def judged_by_limits(tree: ast.Module) -> list[str]:
+    """Conditions on a number of the module under which the module warns or makes a finding."""
+    limits = limits_of(tree)
+    return [
+        ast.unparse(node.test)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If)
+        and {each.id for each in ast.walk(node.test) if isinstance(each, ast.Name)} & limits
+        and any(called(statement) & MAKERS for statement in node.body)
+    ]
+
+
+def test_findings_are_made_in_checks_and_judgement_alone():
+    """Other modules return numbers; they may ask the checks, keep findings, show them and warn of them."""
+    makers = {name(path) for path, tree in trees() if "Finding" in called(tree)}
+    makers.remove("samplers/output.py")  # reads stored findings
+    assert not [path for path in makers if not path.startswith(CHECKS)]
+    assert len(makers) > 8  # control
+
+
+def test_limits_that_judge_are_in_checks_and_judgement_alone():
+    """No other module of a result warns where a number of its own is exceeded; caches and processes may."""
+    control = ast.parse("LIMIT = 0.5\ndef f(x):\n    if x > LIMIT:\n        warnings.warn('large')\n")
+    assert judged_by_limits(control) == ["x > LIMIT"]
+    for path, tree in trees():
+        if not name(path).startswith(CHECKS) and folder(path) not in ("cache", "simulation"):
+            assert not judged_by_limits(tree), name(path)
+
+
+def test_the_limits_of_the_checks_are_few_and_have_a_source():
+    """At most 40, each with a comment beside it or above."""
+    count = 0
+    for path in sorted((ROOT / "fe_likelihoods" / "checks").glob("*.py")):
+        lines = path.read_text().splitlines()
+        for node in tree_of(path).body:
+            found = limits_of(ast.Module([node], []))
+            above = lines[max(node.lineno - 4, 0) : node.lineno - 1]
+            said = "#" in lines[node.lineno - 1] or any(line.startswith("#") for line in above)
+            assert said or not found, f"{name(path)}: {found} without a source"
+            count += len(found - EFFORT)
+    assert 10 < count <= 40

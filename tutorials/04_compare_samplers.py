@@ -182,7 +182,7 @@ def sample(problem: Problem) -> tuple[Posterior, dict[str, Run]]:
         report = posterior.report()
         made = sum(report[each] - chain_from[each] for each in ("simulations", "disk_hits"))
         messages = [
-            str(each) for each in check_result(sampler, discard=args.steps // 3).findings if each.weight == "wrong"
+            str(each) for each in check_result(sampler, discard=args.steps // 3).findings if each.severity == "wrong"
         ]
         runs[label] = Run(sampler, time.perf_counter() - begin, report["simulations"], searched + made, messages)
     return posterior, runs

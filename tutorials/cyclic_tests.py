@@ -179,12 +179,11 @@ def _plot_residuals(fit: Fit, name: str, scale: float, unit: str) -> tuple[Figur
     """Figure, checks and a sentence: residuals at the posterior mean, or under AR(1) their innovations."""
     mean, likelihood = fit.samples.mean(axis=0), fit.posterior.likelihood
     shown, title = likelihood.residuals(mean), f"residuals of the fit with {name} errors"
-    whitened = name == "AR(1)"
-    if whitened:
+    if name == "AR(1)":
         shown = innovations(shown, mean[-1:])
         title = f"innovations of the residuals of the fit with AR(1) errors, rho {mean[-1]:.2f}"
-    checks = residual_checks(shown, whitened=whitened)
-    figure = plot_residuals(shown, likelihood.model.channels, 1.0, whitened=whitened)
+    checks = residual_checks(shown)
+    figure = plot_residuals(shown, likelihood.model.channels, 1.0)
     figure.suptitle(title, fontsize="small")
     for axes, label in zip(figure.axes, ("sample", "lag [samples]", "quantile of a normal [-]"), strict=True):
         axes.set_xlabel(label)

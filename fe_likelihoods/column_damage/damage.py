@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..checks.finding import Finding, labelled
 from ..events.ratios import EventRatios
 from ..events.spread import EventSpread
 from ..prediction.prediction import Prediction
@@ -134,8 +135,8 @@ class Damage(NamedTuple):
         State of the structure at the beginning, "virgin" or "end".
     uncertainty : str
         Which uncertainties the probabilities contain.
-    remarks : tuple of str
-        What speaks against the prediction (`Prediction.remarks`), such as residual drifts of a column that still moves.
+    findings : tuple of Finding
+        What speaks against the prediction (`Prediction.findings`), such as residual drifts of a moving column.
     """
 
     events: tuple[str, ...]
@@ -155,7 +156,7 @@ class Damage(NamedTuple):
     n_collapsed: int
     from_state: str
     uncertainty: str
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def failures(self) -> str:
@@ -193,7 +194,7 @@ class Damage(NamedTuple):
         lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
         closing = [f"The probabilities contain {self.uncertainty}."]
         closing += [f"{self.failures}."] if self.failures else []
-        return "\n".join([*lines, "", *closing, *(f"CAUTION: {remark}" for remark in self.remarks)])
+        return "\n".join([*lines, "", *closing, *labelled(self.findings)])
 
 
 def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
@@ -332,7 +333,7 @@ def damage(
         n_collapsed=len(prediction.collapsed),
         from_state=prediction.from_state,
         uncertainty=_contents(states, errors, weights is not None),
-        remarks=prediction.remarks,
+        findings=prediction.findings,
     )
 
 

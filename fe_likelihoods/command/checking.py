@@ -1,15 +1,18 @@
 """What the command ``check`` does: read everything, simulate a few times, estimate the cost, draw the picture."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..checks.finding import labelled
+from ..checks.rehearsal import ModelCheck, check_model
+from ..checks.screening import check_noise_prior
+from ..information.identifiability import of_mode
 from ..likelihood.posterior import Posterior
-from ..reporting.rehearsal import Rehearsal, rehearse
-from ..signals.data_faults import REMARK
 from ..signals.error_measures import rrmse
 from ..units import from_si
 from .events import Event, read_events
@@ -36,7 +39,7 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     sampler = make_sampler(job, problem)
     events = read_events(job, problem)
     _say_data(problem, say)
-    rehearsal = _say_simulation(problem, events, say, progress)
+    checked = _say_simulation(problem, events, say, progress)
     for event in events:
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
@@ -46,10 +49,10 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         simulations = sampler.nwalkers * (job.sampler["steps"] + 1)
         say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
     else:
-        _say_cost(make_problem(job).posterior, sampler, guided, job.budget, rehearsal, say)
-    _draw(problem, rehearsal.seconds, picture)
+        _say_cost(make_problem(job).posterior, sampler, guided, job.budget, checked, say)
+    _draw(problem, checked.seconds, picture)
     say(f"{picture}: the measurements should lie within the band of the simulations at draws of the prior")
-    made, cache = rehearsal.simulations, problem.posterior.likelihood.simulator.cache
+    made, cache = checked.simulations, problem.posterior.likelihood.simulator.cache
     stored = (
         "" if cache is None else f", those of the calibrated model are stored in {default_folder(file)}/ for the run"
     )
@@ -79,11 +82,10 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         note = " (assumed: not in the file)" if parameter.name in problem.assumed else ""
         say(f"  {parameter.label:<{width}}  prior mean {mean:.3g}, standard deviation {sd:.3g}{note}")
         channel = channels.get(parameter.name)
-        if channel is not None and prior.moments[0] > np.nanmax(np.abs(measured.channel(channel.name))):
-            say(
-                f"  CAUTION: this noise is expected to be larger than every measured value of {channel.name}. A number "
-                f'without a unit is in SI units; give one, such as "half-normal(5 {channel.unit})"'
-            )
+        if channel is not None:
+            largest = float(np.nanmax(np.abs(measured.channel(channel.name))))
+            for line in labelled(check_noise_prior(channel.name, channel.unit, float(prior.moments[0]), largest)):
+                say(f"  {line}")
 
 
 def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
@@ -99,8 +101,8 @@ def _cache_of_the_run(job: Job, folder: Path) -> SimulationCache | None:
 
 def _say_simulation(
     problem: Problem, events: tuple[Event, ...], say: Callable[[str], None], progress: bool
-) -> Rehearsal:
-    """Rehearse, and say what was found."""
+) -> ModelCheck:
+    """Check the model, and say what was found."""
     posterior = problem.posterior
     likelihood, mean = posterior.likelihood, posterior.prior.mean()
     measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
@@ -110,38 +112,34 @@ def _say_simulation(
             f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
             "check [model] and [priors]"
         )
-    rehearsal = rehearse(posterior, {event.name: event.record for event in events}, progress=progress)
-    report = posterior.report()
-    if report["failure_count"]:
-        often, count = max(report["failure_reasons"].items(), key=lambda each: each[1])
-        say(
-            f"CAUTION: {report['failure_count']} of the simulations of this check failed, {count} of them: {often}. A "
-            "failed simulation counts as impossible: mend the model where its parameters are plausible"
-        )
+    checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
     response = likelihood.simulate(mean[None, :n]).response[0]
     errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
-    say(f"One simulation takes {rehearsal.seconds:.2g} s")
+    say(f"One simulation takes {checked.seconds:.2g} s")
     say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
-    for finding in rehearsal.findings:
-        say(f"{'Note' if finding.weight == REMARK else 'CAUTION'}: {finding}")
-    if rehearsal.identifiability is not None:
-        say(f"{rehearsal.identifiability}")
-    return rehearsal
+    for line in labelled(checked.findings):
+        say(line)
+    if checked.best_fit is not None:
+        with suppress(ValueError):  # a parameter that its prior does not let vary there
+            say(f"{of_mode(*checked.best_fit)}")
+    for name, how in checked.tests.items():
+        say(f"{name}: {how}")
+    return checked
 
 
 def _say_cost(
-    posterior: Posterior, sampler: Any, guided: bool, budget: dict, rehearsal: Rehearsal, say: Callable[[str], None]
+    posterior: Posterior, sampler: Any, guided: bool, budget: dict, checked: ModelCheck, say: Callable[[str], None]
 ) -> None:
     """Estimate the cost with a posterior whose simulations are not cached."""
     from samplers import estimate_cost
 
     estimate = estimate_cost(posterior, sampler.nwalkers, type(sampler), seed=1)
-    if guided and np.isfinite(rehearsal.searched):
+    if guided and np.isfinite(checked.searched):
         # later starts often join earlier ones; rough responses take several rounds of draws
-        fewest = 2.0 * rehearsal.searched + sampler.nwalkers
+        fewest = 2.0 * checked.searched + sampler.nwalkers
         say(
-            f"The run uses a guide: a search from one start took {rehearsal.searched:.0f} simulations, so that the run "
+            f"The run uses a guide: a search from one start took {checked.searched:.0f} simulations, so that the run "
             f"needs at least about {fewest:.0f}, and up to several times as many if the response is rough; "
             f"{5.0 * fewest:.0f} take {estimate.time_of(5.0 * fewest)}, to which the guide adds its own computations, "
             "half a minute for 7 parameters"

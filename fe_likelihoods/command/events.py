@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks.finding import labelled
 from ..likelihood.posterior import Posterior
 from ..noise.protocol import follows_response
 from ..prediction.prediction import Prediction
@@ -95,7 +96,7 @@ def _measured(own: Job, channels: tuple[Channel, ...], record: Record) -> Measur
 
 
 def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str, Prediction]:
-    """The result of `propagate`; its warnings are remarks of the result, and other warnings are given afterwards."""
+    """The result of `propagate`; its warnings are findings of the result, and other warnings are given afterwards."""
     from ..prediction.propagation import propagate
 
     kept: set[str] = set()
@@ -104,7 +105,8 @@ def propagate_quietly(*arguments: Any, **options: Any) -> Prediction | dict[str,
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             found = propagate(*arguments, **options)
-            kept.update(*(each.remarks for each in (found.values() if isinstance(found, Mapping) else [found])))
+            results = found.values() if isinstance(found, Mapping) else [found]
+            kept.update(finding.message for each in results for finding in each.findings)
     finally:  # also where all simulations have failed
         shown: dict[Any, Any] = {}  # equal ones of the same line once, as without this function
         for each in caught:
@@ -200,7 +202,7 @@ def _write_event(paths: list[Path], event: Event, found: OtherEvent) -> None:
 
     steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
     lines = [f"Event {event.name}: {event.record.name}, {steps}", found.sentence]
-    lines += [f"CAUTION: {remark}" for remark in found.remarks]
+    lines += labelled(found.findings)
     if found.values:
         lines += ["", "Peaks against the measurements", *map(str, found.values)]
     else:

@@ -113,8 +113,8 @@ def _show(outcome: Any) -> None:
     if "CAUTION" in description:
         click.echo(f"Measurements: {description}")
     _say_assumed(outcome.problem)
-    for caution in outcome.cautions:
-        click.echo(f"CAUTION: {caution}")
+    for finding in outcome.findings:
+        click.echo(f"CAUTION: {finding}")
     click.echo(f"Written to {outcome.folder}/: {', '.join(outcome.files)}")
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.finding import Judgement
+from ..checks.run import FinishedRun
+from ..checks.table import moments_of
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..prediction.prediction import Prediction
-from ..reporting.advice import Judgement
-from ..reporting.run import FinishedRun
-from ..reporting.table import moments_of
 from ..signals.error_measures import rrmse
 
 __all__ = ["write_csv", "write_samples", "write_tables"]

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..cache.simulation_cache import SimulationCache
+from ..checks.finding import NOTE
+from ..checks.rehearsal import refuse_chance
+from ..checks.result import judge_run
+from ..checks.run import read_run
 from ..prediction.prediction import Prediction
-from ..reporting.advice import judge_run
-from ..reporting.rehearsal import refuse_chance
-from ..reporting.run import read_run
-from ..signals.data_faults import REMARK
 from ..signals.hdf5_files import DAMAGE
 from .events import (
     Event,
@@ -52,7 +52,7 @@ class Outcome(NamedTuple):
     sampler: Any
     problem: Problem
     files: tuple[str, ...]  # names of the result files
-    cautions: tuple[str, ...]  # doubts about the result and the predictions
+    findings: tuple[str, ...]  # what speaks against the result and the predictions
     usable: bool  # whether the result can be used, if with care
 
 
@@ -202,11 +202,10 @@ def _write(
     page = folder / "report.html"
     write_page(page, run, prediction, judged, events=predicted, measured=measured, repeat=_command(file, folder))
     tables = write_tables(folder, run, judgement)  # last: they say how many simulations there are
-    cautions = [str(finding) for finding in judgement.findings if finding.weight != REMARK]
-    cautions += [] if prediction is None else [f"prediction: {remark}" for remark in prediction.remarks]
-    for each in described:
-        cautions += [f"event {each.name}: {remark}" for remark in each.remarks]
-    return (page.name, *tables, samples, *pictures), tuple(cautions), judgement.status != "do not use"
+    sources = {"": judgement.findings, "prediction: ": () if prediction is None else prediction.findings}
+    sources |= {f"event {each.name}: ": each.findings for each in described}
+    said = tuple(f"{title}{each}" for title, found in sources.items() for each in found if each.severity != NOTE)
+    return (page.name, *tables, samples, *pictures), said, judgement.status != "do not use"
 
 
 def _prepare(job: Job, folder: Path, fingerprint: str | None, resume: bool, overwrite: bool) -> None:

@@ -4,24 +4,24 @@
 checks where the stored posteriors do not suffice, and draws the parameters of the tests and of a further one.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from ..checks.finding import labelled, warn
+from ..checks.stored_tests import check_new_test
 from ..priors.distributions import RandomState
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
-from .hierarchy_checks import check_hierarchy
 from .population_marginal import draw_parameters, sample_weights
+from .reweighting import check_hierarchy
 
 __all__ = ["Hierarchy"]
 
 _HYPER_SAMPLES = 200
 _MOSTLY_PRIOR = 0.7  # posterior to prior standard deviation of a spread, above which the data say little
-_LARGEST_OUTSIDE = 0.01  # of the draws of a new test, outside the tests' prior bounds
 
 
 class Hierarchy:
@@ -44,7 +44,7 @@ class Hierarchy:
         As given.
     checks : HierarchyChecks
         Effective sample sizes and errors of the stored posteriors; ``print(hierarchy.checks)`` is a table. Every
-        message in it is a warning as well.
+        finding in it is a warning as well.
 
     Raises
     ------
@@ -72,8 +72,7 @@ class Hierarchy:
             )
         self.posterior, self.samples = posterior, points
         self.checks = check_hierarchy(posterior, points, seed)
-        for message in self.checks.messages:
-            warnings.warn(message, stacklevel=2)
+        warn(self.checks.findings)
 
     def __repr__(self) -> str:
         return f"<Hierarchy: {len(self.samples)} samples of {self.posterior!r}>"
@@ -88,8 +87,14 @@ class Hierarchy:
         for name, *each in zip(self.posterior.parameter_names, *columns, strict=True):
             rows.append((name, *map(number, each)))
         first = f"Population of {len(self.posterior.tests)} tests, {len(self.samples)} samples"
-        messages = [f"CAUTION: {message}" for message in self.checks.messages]
-        return "\n".join([f"{first}: {', '.join(self.posterior.tests)}", text_table(rows), self.spread, *messages])
+        return "\n".join(
+            [
+                f"{first}: {', '.join(self.posterior.tests)}",
+                text_table(rows),
+                self.spread,
+                *labelled(self.checks.findings),
+            ]
+        )
 
     @property
     def spread(self) -> str:
@@ -110,13 +115,13 @@ class Hierarchy:
             factor = 100.0 if varying.scale == "log" else 1.0
             ends = f"{number(factor * low, 2)} to {number(factor * high, 2)}{unit}"
             prior = np.std(varying.sd.rvs(2000, random_state=0))
-            doubt = ", mostly by its prior" if np.std(self.samples[:, 2 * k + 1]) > _MOSTLY_PRIOR * prior else ""
+            by_prior = ", mostly by its prior" if np.std(self.samples[:, 2 * k + 1]) > _MOSTLY_PRIOR * prior else ""
             if low > error:
                 known = True
                 times = f"{middle / error:.{0 if middle > 9.95 * error else 1}f} times the error of one test"
-                found.append(f"{name} by {number(factor * middle, 2)}{unit} ({ends}{doubt}), {times}")
+                found.append(f"{name} by {number(factor * middle, 2)}{unit} ({ends}{by_prior}), {times}")
             else:
-                found.append(f"{name} by no more than the error of one test shows ({ends}{doubt})")
+                found.append(f"{name} by no more than the error of one test shows ({ends}{by_prior})")
         what = "must carry" if known else "carry"
         return (
             f"The tests differ in {', '.join(found)}: predictions for a further one {what} this spread "
@@ -167,14 +172,8 @@ class Hierarchy:
         for each in posterior.described.values():
             low, high = each.prior.bounds.T
             outside |= (draws < low) | (draws > high)
-        if outside.any(axis=1).mean() > _LARGEST_OUTSIDE:
-            named = ", ".join(f"{own[i]} {outside[:, i].mean():.1%}" for i in np.flatnonzero(outside.any(axis=0)))
-            warnings.warn(
-                f"{outside.any(axis=1).mean():.0%} of the draws of a new test are outside the bounds of the priors of "
-                f"the tests ({named}): use Varying(..., scale='logit') for a parameter between two physical bounds "
-                "such as a share, scale='log' for a positive one, or a narrower prior of the spread",
-                stacklevel=2,
-            )
+        shares = dict(zip(own, outside.mean(axis=0).tolist(), strict=True))
+        warn(check_new_test(shares, float(outside.any(axis=1).mean())))
         found = dict(zip(own, draws.T, strict=True))
         for name in () if names is None else [name for name in names if name not in own]:
             found[name] = self._prior_draws(name, n, generator)

@@ -34,11 +34,13 @@ from samplers.estimates.pareto import LARGEST_SHAPE, smoothed_weights
 from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
+from ..checks.finding import warn
+from ..checks.stored_tests import check_chain_length
 from ..priors.points import as_points
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
-from .hierarchy_checks import ends_within
 from .hierarchy_result import Hierarchy
+from .reweighting import ends_within
 
 __all__ = ["LeftOut", "without_each"]
 
@@ -213,12 +215,6 @@ def _ensemble(log_prob: Callable[[np.ndarray], np.ndarray], start: np.ndarray, r
         moved = (np.ptp(sampler.get_chain(discard=half), axis=0) > 0.0).all()  # emcee divides by the variance of each
         times = sampler.get_autocorr_time(discard=half, quiet=True, tol=0) if moved else np.inf
         time = float(np.max(times)) if np.isfinite(times).all() else np.inf
-    if not sampler.iteration >= 2.0 * _FEWEST_TIMES * time:
-        warnings.warn(
-            f"a population was sampled for {sampler.iteration / 2.0 / time:.1f} autocorrelation times, "
-            f"{_FEWEST_TIMES:.0f} are needed: give sample= with another sampler, or a Hierarchy with more different "
-            "hyper-samples",
-            stacklevel=5,
-        )
+    warn(check_chain_length(sampler.iteration / 2.0 / time, _FEWEST_TIMES), stacklevel=5)
     thin = int(np.ceil(time)) if np.isfinite(time) else 1
     return sampler.get_chain(discard=sampler.iteration // 2, thin=max(thin, 1), flat=True)

@@ -16,7 +16,6 @@ A. Gelman, J. B. Carlin, H. S. Stern, D. B. Dunson, A. Vehtari, D. B. Rubin (201
 Chapman and Hall/CRC, sections 3.2, 3.3 and 14.2.
 """
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -25,6 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from ..checks.finding import warn
+from ..checks.stored_tests import check_equal_ratios
 from ..text_tables import number, text_table
 
 __all__ = ["PRIOR_EVENTS", "PRIOR_SD", "EventRatios", "RatioPopulations", "standardised"]
@@ -148,13 +149,8 @@ class EventRatios:
         gain = 1.0 / np.square(offsets).sum(axis=0) if line else np.zeros(values.shape[1:])
         mean, slope = logs.mean(axis=0), gain * (offsets * logs).sum(axis=0)
         squares = np.square(logs - mean - slope * offsets).sum(axis=0)
-        if not self.prior_events and (squares <= _REACH**2).any():
-            warnings.warn(
-                f"EventRatios: the ratios of {len(values)} events are equal, so that nothing is left of the error of "
-                "the model between events: intervals have no width, and probabilities are 0 or 1. Leave the prior of "
-                "the scatter in (prior_events=)",
-                stacklevel=3,
-            )
+        if not self.prior_events:
+            warn(check_equal_ratios(len(values), float(np.sqrt(squares.min())), _REACH), stacklevel=3)
         found = {"values": values, "prior_sd": sd, "degrees_of_freedom": degrees}
         found |= {"_mean": mean, "_slope": slope, "_gain": gain, "_squares": squares}
         for name, value in found.items():

@@ -147,7 +147,7 @@ def sensitivity(
     if good.sum() < 5 * d:
         raise ValueError(
             f"expected at least {5 * d} simulations that succeed; got {good.sum()} of {simulations}: narrow the prior, "
-            "or see why simulations fail (rehearse)"
+            "or see why simulations fail (check_model)"
         )
     values, inputs = values[good], _inputs(known, thetas[good])
     mean, sd = values.mean(axis=0), values.std(axis=0)

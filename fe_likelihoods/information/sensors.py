@@ -341,7 +341,7 @@ def rank_sensors(
     if good.sum() < 2:
         raise ValueError(
             f"expected at least two draws whose {known.dim + 1} simulations all succeed; got {good.sum()} of {draws}: "
-            "narrow the prior, or see why simulations fail (rehearse)"
+            "narrow the prior, or see why simulations fail (check_model)"
         )
     rms = np.sqrt(slopes.mean_squares[good].mean(axis=0))
     levels = levels if isinstance(noise, Mapping) else levels * rms  # zero for a share of a channel without response

@@ -8,7 +8,6 @@ residuals, see `fe_likelihoods.noise.gaussian`.) A `Simulator` runs and caches t
 
 import math
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import MarginalNoise
-from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under, remark_on_gaps
+from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under
 from ..noise.sample_counts import count_samples
 from ..noise.time_shifts import with_time_shifts
 from ..priors.distributions import Distribution, RandomState, uniform_numbers
@@ -131,8 +130,6 @@ class FELikelihood(SumOfParts):
         noise = GaussianNoise(model.channels) if noise is None else noise
         check_noise(model, noise)
         noise = noise_of_part(noise_under(noise, model), measurements)
-        if gaps := remark_on_gaps(noise):
-            warnings.warn(gaps, stacklevel=2)
         self.noise = with_time_shifts(noise, time_shifts, model.dt)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others

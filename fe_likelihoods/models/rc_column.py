@@ -28,13 +28,14 @@ a full-scale bridge-column using sequential Monte Carlo (2022): the tested colum
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
+from ..checks.finding import warn
+from ..checks.screening import check_steps_of_mass
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
@@ -57,7 +58,6 @@ from .validation import (
 
 __all__ = ["PARAMETERS", "RCColumn"]
 
-_SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 
 PARAMETERS = {
     "Ec": "modulus of concrete [Pa]",
@@ -282,14 +282,8 @@ class RCColumn(ThreadedModel):
             for name in self.outputs
             if "acceleration@" in name and float(name.partition("@")[2]) < self.height * (1.0 - 1e-6)
         ]
-        if isinstance(self.loading, Record) and below and step > _SHORT_STEP:
-            warnings.warn(
-                f"{', '.join(below)}: accelerations below the top contain vibrations above 20 Hz, which a step of "
-                f"{step:.2g} s does not resolve (with 1/256 s, they are wrong by 48 %). Give substeps= so that a step "
-                f"is {_SHORT_STEP:.2g} s or shorter, and compare different n_elements",
-                UserWarning,
-                stacklevel=4,
-            )
+        if isinstance(self.loading, Record):
+            warn(check_steps_of_mass(below, step), stacklevel=4)
 
     @property
     def nominal(self) -> dict[str, float]:

@@ -47,7 +47,6 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _PARTS = 3  # parts of a window; the window moves by one part
 _ROUND_OFF = 1e-6  # of a step
 _LOCAL = 0.25  # see docs/theory/noise.rst
-_LARGEST_GAP = 0.05  # largest share of missing samples in a channel without a warning
 _RESPONSE = 'level="response" without bands'
 _SHARES = 'level="measured" or "response", without bands'
 
@@ -461,16 +460,15 @@ class GaussianNoise:
                     "Replace short stretches by NaN, fill short gaps, or use AutoregressiveNoise, which bridges gaps"
                 )
 
-    def remark_on_gaps(self) -> str:
-        """Warning text on gaps, which make shares refer to the level of the measured part of a motion only.
+    def gap_shares(self) -> dict[str, float]:
+        """Share of the samples that are missing within the measured motion, by channel [-].
 
-        Empty for a noise whose levels do not follow the response over time, without measurements, for ``local=1``, and
-        if at most 5 % of the samples are missing within the measured motion. An event without any sample of a channel
-        is no gap, since mean squares are computed per event.
+        Empty for a noise whose levels do not follow the response over time, without measurements, and for ``local=1``.
+        An event without any sample of a channel is no gap, since mean squares are computed per event.
         """
         if not self._in_parts or self.layout is None or self.local == 1.0:
-            return ""
-        named, counts, events = [], np.array(self.layout.counts), self.of_parts
+            return {}
+        shares, counts, events = {}, np.array(self.layout.counts), self.of_parts
         for channel, step, row in zip(self.channels, self.layout.steps, counts.T, strict=True):
             known = np.flatnonzero(row)
             inside = np.arange(known[0] + 1, known[-1]) if known.size else known  # without the first and last part
@@ -479,15 +477,8 @@ class GaussianNoise:
                 measured = np.unique(of_parts[row > 0])  # each event has its own mean square
                 inside = inside[(of_parts[inside] % 2 == 1) & np.isin(of_parts[inside], measured)]
             expected = self.window / _PARTS / step * inside.size
-            share = 1.0 - row[inside].sum() / expected if inside.size else 0.0
-            named += [f"{channel.name!r} ({share:.0%})"] if share > _LARGEST_GAP else []
-        if not named:
-            return ""
-        return (
-            f"{self.title}: samples are missing within the channels {', '.join(named)}. The share refers to the "
-            "mean square of the other samples. If the strong part of the motion is missing, the share is too large and "
-            "predictions of whole motions too wide: use local=1, whose level is taken from samples near by"
-        )
+            shares[channel.name] = float(1.0 - row[inside].sum() / expected) if inside.size else 0.0
+        return shares
 
     def with_channels(self, channels: Sequence[Channel], weights: np.ndarray) -> "tuple[GaussianNoise, np.ndarray]":
         """Noise of other channels, with the weights of the parameters; see `fe_likelihoods.noise.protocol.Noise`.

@@ -17,7 +17,6 @@ __all__ = [
     "noise_time_shifts",
     "noise_title",
     "noise_under",
-    "remark_on_gaps",
 ]
 
 
@@ -52,8 +51,8 @@ class Noise(Protocol):
     * ``with_channels(channels, weights)``, for predictions of channels that were not measured. ``weights`` (n_others,
       n_channels) expresses each new channel by the noise's channels. It returns the noise of the new channels, and the
       weights (n_others_noise, n_noise) that express the new noise's parameters by the parameters of this noise.
-    * ``remark_on_gaps()``, which returns a sentence on measurement gaps that make predictions doubtful, empty if there
-      are none. A likelihood warns with this sentence, and predictions with noise list it among their remarks.
+    * ``gap_shares()``, which returns the share of missing samples by channel where gaps change the level of the noise;
+      `fe_likelihoods.checks` judges them.
     """
 
     @property
@@ -98,11 +97,6 @@ def noise_of_part(noise: Noise, measurements: Measurements) -> Noise:
 def noise_under(noise: Noise, model: Any, first: int = 0) -> Noise:
     """Noise under the excitation of a model: unchanged unless it has a method ``under``."""
     return noise.under(model, first) if hasattr(noise, "under") else noise
-
-
-def remark_on_gaps(noise: Noise) -> str:
-    """A noise's warning text on gaps in its measurements; empty without a method ``remark_on_gaps``."""
-    return noise.remark_on_gaps() if hasattr(noise, "remark_on_gaps") else ""
 
 
 def follows_response(noise: Any) -> bool:

@@ -29,14 +29,11 @@ __all__ = [
     "residual_checks",
 ]
 
-_UNLIKELY = 0.01  # probability below which residuals are not called white, or normal
-_WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
-_FEWEST = 10  # samples that checks of correlation and distribution need
 _WINDOW = 5.0  # length of the sums over lags, in correlation times
 
 
 class ResidualChecks(NamedTuple):
-    """Checks of the residuals per channel; all arrays are (n_channels,). ``str`` gives a table and sentences.
+    """Checks of the residuals per channel; all arrays are (n_channels,). ``str`` gives a table.
 
     Attributes
     ----------
@@ -54,8 +51,6 @@ class ResidualChecks(NamedTuple):
         Number of samples, without missing ones.
     channels : tuple of Channel
         The channels, for names and units in the table; empty if they were not given.
-    whitened : bool
-        Whether a noise model with correlation was already applied, so that the advice must not be to use one.
     """
 
     mean: np.ndarray
@@ -66,7 +61,6 @@ class ResidualChecks(NamedTuple):
     normal: np.ndarray
     n_samples: np.ndarray
     channels: tuple[Channel, ...] = ()
-    whitened: bool = False
 
     def __str__(self) -> str:
         names, units = [f"channel {i}" for i in range(len(self.mean))], [("SI", 1.0)] * len(self.mean)
@@ -80,37 +74,7 @@ class ResidualChecks(NamedTuple):
             sizes = f"{self.mean[i] / factor:>11.3g} {self.standard_deviation[i] / factor:>11.3g}"
             counts = f"{self.lag_one[i]:>11.2f} {self.n_samples[i]:>11.0f} {self.n_effective[i]:>11.0f}"
             lines.append(f"{name:<{width}} {unit:>11} {sizes} {counts} {self.white[i]:>11.2g} {self.normal[i]:>11.2g}")
-        return "\n".join([*lines, *(f"{name}: {text}" for name, text in zip(names, self.sentences, strict=True))])
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """Result of the checks and advice in words, one text per channel."""
-        return tuple(_sentence(*numbers, self.whitened) for numbers in zip(*self[2:7], strict=True))
-
-
-def _sentence(lag_one: float, n_effective: float, white: float, normal: float, n_samples: int, whitened: bool) -> str:
-    """The verdict on one channel."""
-    if n_samples < _FEWEST:
-        return f"Not checked: {n_samples:.0f} samples are too few, {_FEWEST} are needed."
-    if white >= _UNLIKELY:
-        found = ["White: no correlation from sample to sample was found."]
-    elif abs(lag_one) < _WEAK:
-        found = [f"Nearly white: the correlation from sample to sample, {lag_one:.2f}, changes intervals little."]
-    elif whitened:
-        found = [
-            f"Not white: correlation {lag_one:.2f} from sample to sample is left. The errors have another correlation "
-            "than the noise, and intervals may be wrong: use fewer samples until this check passes, "
-            "GaussianNoise with bands of frequency (groups = [1.0, 5.0] in TOML), or effective_samples=."
-        ]
-    else:
-        found = [
-            f"Not white: correlation {lag_one:.2f} from sample to sample. {n_samples:.0f} samples are worth "
-            f"{n_effective:.0f} independent ones, and intervals under white noise are too narrow: use "
-            'AutoregressiveNoise (kind = "autoregressive" in TOML) or GaussianNoise(effective_samples=...).'
-        ]
-    if normal < _UNLIKELY:
-        found.append("Not normal: look at the tails for outliers or missing physics.")
-    return " ".join(found)
+        return "\n".join(lines)
 
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
@@ -281,9 +245,7 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     return (residuals[:, 1:] - rho[:, None] * residuals[:, :-1]) / np.sqrt(1.0 - rho[:, None] ** 2)
 
 
-def residual_checks(
-    residuals: np.ndarray, channels: Sequence[Channel] = (), *, whitened: bool = False
-) -> ResidualChecks:
+def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> ResidualChecks:
     """Compare residuals with Gaussian white noise.
 
     Parameters
@@ -293,9 +255,6 @@ def residual_checks(
         missing.
     channels : sequence of Channel, optional
         The channels, one per row: their names and display units are printed in the table.
-    whitened : bool
-        True if the rows were whitened by a noise model: `innovations` for `AutoregressiveNoise`, or the result of
-        ``GaussianNoise.whitened``. The numbers are the same; the advice in the sentences differs.
 
     Returns
     -------
@@ -347,7 +306,6 @@ def residual_checks(
         normal=stats.chi2.sf(score, 2),
         n_samples=(~missing).sum(axis=1),
         channels=tuple(channels),
-        whitened=whitened,
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checks.fit import describe_residuals
 from ..noise.residuals import autocorrelation, residual_checks
 from ..signals.channels import Channel, Measurements
 from ..units import find_unit, from_si
@@ -262,11 +263,11 @@ def plot_response(model: Model, theta: np.ndarray, measurements: Measurements | 
     return plot_histories(measurements, response, time_label=getattr(model, "time_label", "time [s]"))
 
 
-def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float, *, whitened: bool = False) -> Figure:
+def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> Figure:
     """Plot residuals against time, their autocorrelation and their normal quantiles, one row per channel.
 
     For white residuals, 95 % of the autocorrelation coefficients are in the shaded band. The quantiles of normal
-    residuals follow the straight line. The text above each row is the verdict of `residual_checks`.
+    residuals follow the straight line. The text above each row says what `residual_checks` has found.
 
     Parameters
     ----------
@@ -276,8 +277,6 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         The channels, one per row of `residuals`.
     dt : float
         Time step [s].
-    whitened : bool
-        See `residual_checks`.
 
     Returns
     -------
@@ -297,8 +296,8 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     import matplotlib.pyplot as plt
     from scipy.special import ndtri
 
-    checks = residual_checks(residuals, channels if len(channels) == len(residuals) else (), whitened=whitened)
-    correlation = autocorrelation(residuals)
+    checks = residual_checks(residuals, channels if len(channels) == len(residuals) else ())
+    told, correlation = describe_residuals(checks), autocorrelation(residuals)
     n_channels, n = correlation.shape
     if len(channels) != n_channels:
         raise ValueError(f"expected one channel for each row of residuals; got {len(channels)} and {n_channels} rows")
@@ -317,7 +316,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
         samples = len(values)
         normal = ndtri((np.arange(samples) + 0.5) / samples)
         history.set_ylabel(channel_label(channels[k]))
-        history.set_title(fill(checks.sentences[k], 80), fontsize="small", loc="left")
+        history.set_title(fill(told[k], 80), fontsize="small", loc="left")
         # Beyond about ten correlation times the estimated autocorrelation is noise.
         shown = min(n, 20 + int(10.0 * samples / checks.n_effective[k]))
         band = 1.96 / np.sqrt(samples)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks.finding import Finding, labelled
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
 from ..units import from_si
@@ -44,8 +45,8 @@ class AveragedPrediction(NamedTuple):
         Channels of the predictions.
     dt : float or None
         Time step of histories [s], None for other quantities.
-    remarks : tuple of str
-        Doubts about the predictions, each remark once.
+    findings : tuple of Finding
+        What speaks against the predictions, each finding once.
     """
 
     mean: np.ndarray
@@ -56,7 +57,7 @@ class AveragedPrediction(NamedTuple):
     probabilities: dict[str, float]
     channels: tuple[Channel, ...]
     dt: float | None
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __str__(self) -> str:
         shares = ", ".join(f"{name} {share:.2f}" for name, share in self.probabilities.items())
@@ -72,7 +73,7 @@ class AveragedPrediction(NamedTuple):
             shown = [x if unit == "SI" else from_si(x, unit) for x in (mean, sd, np.sqrt(within), np.sqrt(between))]
             rows.append((name, unit, *map(number, shown)))
         first = f"Average of the models {shares}; {what}; sd within and between models"
-        return "\n".join([first, text_table(rows), *(f"CAUTION: {remark}" for remark in self.remarks)])
+        return "\n".join([first, text_table(rows), *labelled(self.findings)])
 
     @property
     def sd(self) -> np.ndarray:
@@ -127,6 +128,6 @@ def average_predictions(
     between = np.tensordot(weights, [np.square(part.mean - mean) for part in parts], axes=1)
     error = np.sqrt(np.tensordot(weights**2, [np.square(part.standard_error) for part in parts], axes=1))
     known = dict(zip(names, weights.tolist(), strict=True))
-    remarks = tuple(dict.fromkeys(remark for part in parts for remark in part.remarks))
+    findings = tuple(dict.fromkeys(each for part in parts for each in part.findings))
     first = parts[0]
-    return AveragedPrediction(mean, within + between, within, between, error, known, first.channels, first.dt, remarks)
+    return AveragedPrediction(mean, within + between, within, between, error, known, first.channels, first.dt, findings)

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.transfer import check_emulated
 from ..emulation.gaussian_process import GaussianProcess, fit_process, left_out_errors, predict_mean
 from .prediction import Prediction
 from .propagation import propagate
@@ -31,7 +32,6 @@ __all__ = ["propagate_few"]
 
 FEWEST = 20  # simulations
 FOLDS = 10  # of the jackknife
-ROUGH = 0.5  # share of the variance that the emulator does not explain, above which a remark says so
 
 
 def propagate_few(
@@ -140,22 +140,8 @@ def propagate_few(
     result, error = result * scale, error * scale
     shape = np.shape(drawn.mean)
     mean, variance, standard_error = (x.reshape(shape) for x in (result[0], np.square(result[1]), error[0]))
-    remarks = drawn.remarks
-    if equal := bool((values == values[0]).all(axis=0).any()):
-        remarks += (
-            f"all {len(values)} simulated values of a number are equal, so nothing is known of its scatter: a rare "
-            f"event with a probability below about {3.0 / len(values):.0%} may not be among them",
-        )
-    if np.isnan(variance).any():
-        remarks += (
-            f"the signed sample does not determine the standard deviation of {np.isnan(variance).sum()} numbers, whose "
-            "variance by it is negative: use more simulations, or propagate with the chain",
-        )
-    if unexplained > ROUGH:
-        remarks += (
-            f"the emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "
-            "more than as many draws: use more simulations, or propagate with the chain",
-        )
+    equal = bool((values == values[0]).all(axis=0).any())
+    unknown = int(np.isnan(variance).sum())
     return replace(
         drawn,
         mean=mean,
@@ -164,7 +150,7 @@ def propagate_few(
         quantiles=result[2:].reshape(-1, *shape),
         quantile_error=error[2:].reshape(-1, *shape),
         effective_sample_size=float(len(values) if equal else np.min(variance / np.square(standard_error))),
-        remarks=remarks,
+        findings=(*drawn.findings, *check_emulated(len(values), equal, unexplained, unknown)),
     )
 
 

@@ -24,22 +24,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..checks.finding import warn
+from ..checks.stored_tests import check_impossible_draws
+from ..checks.transfer import check_widening, is_narrow
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.spread import EventSpread
 from ..signals.records import Record
+from .calibrated_range import bandwidth
 from .excitation import under_record
 from .inputs import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, measured_quantity
 from .streaming import quantiles_with_errors
-from .transfer_checks import remark_on_harmonic
 
 __all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
 
 _SENSITIVITY = 20  # draws of the population, under a motion of another kind
-_LARGEST_IMPOSSIBLE = 0.01  # share of draws with an impossible noise without a warning
 
 
 def event_ratios(
@@ -216,15 +218,19 @@ def predict_new_event(
         moved = read_source(predictor).model
         moved = moved if record is None else under_record(moved, record)
         tests = list(hierarchy.posterior.tests)
-        if all(remark_on_harmonic(read_source(posteriors[name]).model, moved) for name in tests):
+        width = bandwidth(moved)
+        if all(is_narrow(width, bandwidth(read_source(posteriors[name]).model)) for name in tests):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of draws beyond bounds, and what the prediction has said
                 seeds = np.random.SeedSequence(seed).spawn(1)[0]
                 draws, _ = draw_new_event(hierarchy, list(rows), _SENSITIVITY, None, seeds)
                 own = _log_sd(predictor, draws, quantity, record, settings)
                 events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in tests]
-            ratios, remark = _widened(ratios, own, np.max(events, axis=0), quantity)
-            prediction = replace(prediction, remarks=(*prediction.remarks, *remark))
+            ratios = _widened(ratios, own, np.max(events, axis=0))
+            several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+            found = check_widening(dict(zip(map(str, several), np.atleast_1d(ratios.widening).tolist(), strict=True)))
+            warn(found)
+            prediction = replace(prediction, findings=(*prediction.findings, *found))
         prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
         return _corrected(prediction, ratios, np.random.default_rng(seed))
     source = read_source(predictor)
@@ -247,24 +253,10 @@ def _log_sd(predictor: Any, draws: Mapping[str, np.ndarray], quantity: Any, reco
     return np.log(np.maximum(values, np.finfo(float).tiny)).std(axis=0)
 
 
-def _widened(
-    ratios: EventRatios, own: np.ndarray, of_events: np.ndarray, quantity: Any
-) -> tuple[EventRatios, tuple[str, ...]]:
-    """Ratios for a new event that depends more on the parameters than the events do, and a remark on it."""
+def _widened(ratios: EventRatios, own: np.ndarray, of_events: np.ndarray) -> EventRatios:
+    """Ratios for a new event that depends more on the parameters than the events do."""
     excess = np.maximum(np.square(own) - np.square(of_events), 0.0)
-    widening = np.sqrt(1.0 + excess / np.square(ratios.sd))
-    ratios = replace(ratios, widening=widening)
-    if not excess.any():
-        return ratios, ()
-    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
-    told = ", ".join(f"{each} {w:.1f} times" for each, w in zip(several, np.atleast_1d(widening), strict=True))
-    remark = (
-        "the calibration hardly speaks for this motion, which is nearly a harmonic. The scatter between events is "
-        "widened by what the response depends on the parameters more than in all calibrated events: "
-        f"{told}. Calibrate with a motion of this kind"
-    )
-    warnings.warn(f"predict_new_event: {remark}", stacklevel=3)
-    return ratios, (remark,)
+    return replace(ratios, widening=np.sqrt(1.0 + excess / np.square(ratios.sd)))
 
 
 def _is_number(quantity: Any) -> bool:
@@ -305,14 +297,7 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
         return draws
     deviations = noise.standard_deviations(np.stack([draws[name] for name in noise.parameter_names], axis=1))
     possible = (deviations > 0.0).all(axis=1)
-    if possible.mean() < 1.0 - _LARGEST_IMPOSSIBLE:
-        warnings.warn(
-            f"predict_new_event: {1.0 - possible.mean():.0%} of the draws have an impossible noise, such as a share of "
-            "the measured signal of 1 or more, and are left out. Use level='response', whose shares have no "
-            'upper bound, let shares vary with Varying(..., scale="logit"), or state a narrower prior of their '
-            "spread between events",
-            stacklevel=3,
-        )
+    warn(check_impossible_draws(possible), stacklevel=3)
     return {name: values[possible] for name, values in draws.items()}
 
 

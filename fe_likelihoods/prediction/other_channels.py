@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks.finding import Finding
+from ..checks.transfer import note_assumed_noise
 from ..likelihood.inputs import check_model
 from ..noise.protocol import noise_channels, noise_title, noise_under
 from ..priors.points import as_points
@@ -20,11 +22,11 @@ __all__ = ["predict_channels_of"]
 
 def predict_channels_of(
     model: Model, source: PredictionSource, samples: Any, noise: bool | str
-) -> tuple[PredictionSource, Any, str]:
+) -> tuple[PredictionSource, Any, list[Finding]]:
     """Source and samples with which a posterior predicts the channels of another model that has the same parameters.
 
     The samples get the noise parameters of these channels, if the noise is wanted (`noise` as for `split_samples`). The
-    remark says which channels have the mean noise of which others, and is else empty. ValueError if there is no
+    findings say which channels have the mean noise of which others. ValueError if there is no
     likelihood; the model has other parameters; or, if the noise is wanted, a channel shares its quantity with no
     measured channel, a measured channel has another quantity, or the noise has no method ``with_channels``.
     """
@@ -40,7 +42,7 @@ def predict_channels_of(
             f"{', '.join(names)}"
         )
     if not noise:
-        return source._replace(model=model), samples, ""
+        return source._replace(model=model), samples, []
     thetas, _ = split_samples(source, samples, noise)
     calibrated = source.noise
     if not hasattr(calibrated, "with_channels"):
@@ -48,15 +50,15 @@ def predict_channels_of(
             f"{noise_title(calibrated)} does not say what the noise of other channels is: give it a method "
             "with_channels(channels, weights), see fe_likelihoods.noise.protocol.Noise, or predict with noise=False"
         )
-    weights, remark = _weights(model, source)
+    weights, found = _weights(model, source)
     other, of_parameters = calibrated.with_channels(model.channels, weights)
     points = as_points(samples, own + tuple(calibrated.parameter_names))
     samples = np.hstack([thetas, points[:, len(own) :] @ of_parameters.T])
-    return source._replace(model=model, noise=noise_under(other, model)), samples, remark
+    return source._replace(model=model, noise=noise_under(other, model)), samples, found
 
 
-def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, str]:
-    """Weights (n_channels, n_measured) of the measured channels in each channel of a model, and the remark on them."""
+def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, list[Finding]]:
+    """Weights (n_channels, n_measured) of the measured channels in each channel of a model, with findings."""
     measured = noise_channels(source.noise, source.model.channels)
     rows = {channel.name: k for k, channel in enumerate(measured)}
     weights, of_quantity = np.zeros((len(model.channels), len(measured))), {}
@@ -79,11 +81,4 @@ def _weights(model: Model, source: PredictionSource) -> tuple[np.ndarray, str]:
             )
         row[alike] = 1.0 / len(alike)
         of_quantity.setdefault(tuple(measured[k].name for k in alike), []).append(channel.name)
-    parts = [f"{', '.join(others)} (mean of {', '.join(known)})" for known, others in of_quantity.items()]
-    if not parts:
-        return weights, ""
-    return weights, (
-        f"the noise of channels that were not measured is assumed: {'; '.join(parts)}. The calibration made the error "
-        "of the model small at the measured channels only, so that it may be larger elsewhere. Hold a measured channel "
-        "out of a calibration to see how much"
-    )
+    return weights, note_assumed_noise(of_quantity)

@@ -1,13 +1,14 @@
 """The result of uncertainty propagation: mean, variance and quantiles of a quantity."""
 
 import math
-import warnings
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..checks.finding import Finding, labelled, warn
+from ..checks.transfer import check_interval_samples
 from ..events.spread import EventSpread
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_shifted, compare_with
@@ -81,8 +82,8 @@ class Prediction:
     spread : EventSpread or None
         Uncertainty of ratios and event population, for the intervals of `fe_likelihoods.exceedance`; None unless a new
         event is predicted (`fe_likelihoods.predict_new_event`).
-    remarks : tuple of str
-        Doubts about the prediction: the warnings of `fe_likelihoods.propagate`.
+    findings : tuple of Finding
+        What speaks against the prediction, each with what to do; the warnings of `fe_likelihoods.propagate`.
     """
 
     mean: np.ndarray
@@ -104,7 +105,7 @@ class Prediction:
     shifted: tuple[str, ...] = ()
     quantity: object = None
     spread: EventSpread | None = None
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     collapsed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @property
@@ -332,7 +333,7 @@ class Prediction:
         if self.n_failed:
             collapse = f" (the structure collapsed in {len(self.collapsed)})" if len(self.collapsed) else ""
             lines.append(f"{self.n_failed} samples failed{collapse} and are left out")
-        lines += [f"CAUTION: {remark}" for remark in self.remarks]
+        lines += labelled(self.findings)
         units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
         if self.dt is not None:
             header = ("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")
@@ -394,13 +395,7 @@ def _check_number(n_samples: int, least: int, level: float) -> None:
     """Raise ValueError for fewer samples than `least`; warn if the ends of an interval are beyond all samples."""
     if n_samples < least:
         raise ValueError(f"score: expected {least} samples or more, and 20 for intervals of 90 %; got {n_samples}")
-    needed = math.ceil(2.0 / (1.0 - level) - 1e-9)
-    if n_samples < needed:
-        warnings.warn(
-            f"score: the intervals are from {n_samples} samples and do not have their level of {level:g}: coverage and "
-            f"interval score need {needed} samples or more",
-            stacklevel=4,
-        )
+    warn(check_interval_samples(n_samples, math.ceil(2.0 / (1.0 - level) - 1e-9), level), stacklevel=4)
 
 
 def _values_of(compared: np.ndarray | Comparison) -> np.ndarray:

@@ -21,7 +21,6 @@ Probabilistic Engineering Mechanics 16(2), 103-113, doi:10.1016/S0266-8920(00)00
 
 import logging
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
@@ -32,13 +31,17 @@ from tqdm import tqdm
 
 from ..cache.simulation_cache import SimulationCache
 from ..cache.stored_responses import StoredResponses
-from ..noise.protocol import noise_time_shifts, noise_under, remark_on_gaps
+from ..checks.finding import warn
+from ..checks.screening import check_gaps
+from ..checks.transfer import check_bandwidth, check_final_values, check_peaks, check_same_response
+from ..noise.protocol import noise_time_shifts, noise_under
 from ..priors.points import as_points
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
+from .calibrated_range import Ends, Peaks, bandwidth, calibration_of, difference_of_responses
 from .excitation import chosen_state, excite, under_record
 from .inputs import (
     distinct_rows,
@@ -51,19 +54,6 @@ from .inputs import (
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
-from .transfer_checks import (
-    Ends,
-    Peaks,
-    calibration_of,
-    is_first_warning,
-    remark_on_harmonic,
-    remark_on_level,
-    remark_on_peaks,
-    remark_on_same_response,
-    remark_on_white_peaks,
-    remarks_on_calibration,
-    sample_to_check,
-)
 
 __all__ = ["AllFailed", "check_effective_sample_size", "fit_measures", "propagate"]
 
@@ -145,7 +135,7 @@ def propagate(
         A model with the same parameters and other channels, such as unmeasured floors, and possibly another excitation.
         Default: the posterior's model. With noise, an unmeasured channel gets the mean noise parameters of the measured
         channels with the same quantity: the mean share if the noise is in shares of the response, the mean standard
-        deviation [SI] otherwise. `Prediction.remarks` states it.
+        deviation [SI] otherwise. `Prediction.findings` states it.
     quantity : optional
         None for the histories of all channels, the name of a channel or several names for their histories,
         ``peak(name)`` or another `fe_likelihoods.prediction.quantities.ChannelQuantity` or several of them, or a
@@ -192,11 +182,9 @@ def propagate(
         Measurements of the calibration events, with whose amplitudes a prediction under another record is compared.
         Default: the likelihood's measurements. An empty sequence for no comparison.
     check : bool
-        Whether the calibration residuals are compared with the noise, where samples of all parameters are given. If
-        they disagree, one warning per likelihood says so, and the `Prediction.remarks` of every prediction. Under
-        another record this needs one simulation under the calibration record, which the likelihood counts. No
-        simulation is needed if the likelihood has stored responses, or if earlier samples of this likelihood were
-        compared: that result is then repeated.
+        Whether the response to another `record` is compared with the response to the calibration record, at the
+        parameters of one sample: a model that reads one file whatever motion it is given repeats the calibration. This
+        is one simulation, which the likelihood counts, unless it has cached the response.
     seed : int, optional
         Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
         except for round-off.
@@ -222,23 +210,16 @@ def propagate(
     Warns
     -----
     UserWarning
-        If channels of `model` have the mean noise of others. If a `final_value` is taken while the structure moves.
-        If the median of the predicted peak of a channel, under another record or of another `model`, is more than twice
-        the largest measured peak of the calibration, or less than half of the smallest one.
-        If histories, or quantities of channels, under another record or of another `model` are predicted with noise in
-        SI units, and their level is more than three times the level of the calibration measurements, or less than a
-        third. If the power of another record is in a band of less than a fifth of the width in the calibration.
-        If peaks are predicted with ``noise=True``, the noise has white errors in shares of the response, and the
-        median peak is more than 1.1 times as large as without noise. Once for each likelihood, if its residuals are
-        correlated and `GaussianNoise` or `AutoregressiveNoise` states that they (or the innovations) are independent,
-        or the whitened residuals of shares or bands are correlated; and if less than 0.75 times the simulated response
-        fits the measurements better by more than a tenth of the RRMSE, under a noise whose likelihood has shares of
-        this response.
+        For each finding in `Prediction.findings` that is more than a note: channels of `model` have the mean noise of
+        others; a `final_value` is taken while the structure moves; the median of the predicted peak of a channel, under
+        another record or of another `model`, is more than twice the largest measured peak of the calibration, or less
+        than half of the smallest one; the power of another record is in a band of less than a fifth of the width in
+        the calibration; the response to another record is the response to the calibration record.
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
     calibration = source = read_source(posterior_or_model, pool)
-    complete, assumed, other = samples, "", record is not None or model is not None
+    assumed, other = [], record is not None or model is not None
     moved = record is not None and model is None  # the calibrated model under another motion
     if model is not None:
         source, samples, assumed = predict_channels_of(model, source, samples, noise)
@@ -292,20 +273,18 @@ def propagate(
         cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
         stored = StoredResponses(model, source.executor, cache)
     peaks, ends = Peaks(), Ends(wanted.values(), model)
-    checked = sample_to_check(calibration, complete) if check else None
-    own_response = other_response = None  # of the checked sample to the excitation of the calibration, and to another
+    compared = moved and state == "virgin" and calibration.likelihood is not None
+    first: tuple[np.ndarray, np.ndarray] | None = None  # parameters of a sample, and its response to another motion
     with tqdm(total=n, disable=not progress, unit="sample", desc="propagate") as bar:
         for start in range(0, len(distinct), batch):
             responses, reasons = excitation.simulate(distinct[start : start + batch], source.executor, stored)
             for accumulator in accumulators.values():
                 accumulator.add(start, responses, reasons)
-            if checked is not None and 0 <= (row := row_of_sample[checked] - start) < len(responses):
-                if not reasons[row] and not other:
-                    own_response = responses[row].copy()
-                elif not reasons[row] and moved and state == "virgin":
-                    other_response = responses[row].copy()
+            if first is None and compared and check:
+                good = next((row for row, reason in enumerate(reasons) if not reason), None)
+                first = None if good is None else (distinct[start + good], responses[good].copy())
             ends.add(responses, reasons)
-            if other or noise is True:
+            if other:
                 peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
     shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
@@ -315,29 +294,17 @@ def propagate(
         )
         for name, each in accumulators.items()
     }
-    remarks, of_calibration = [assumed, ends.remark()], ()
+    findings = [*assumed, *check_final_values(ends.medians())]
     if other:
-        remarks.append(remark_on_peaks(peaks, model.channels, known, alone=calibrated is None))
-    if moved and state == "virgin" and calibration.likelihood is not None:
-        remarks.append(remark_on_harmonic(calibration.model, model))
-    if other and noise:
-        remarks.append(remark_on_level(predictions.values(), peaks, source))
-    if noise is True:
-        remarks.append(remark_on_white_peaks(predictions.values(), peaks, source))
-    if checked is not None and (other or own_response is not None):
-        names = (*calibration.model.parameter_names, *calibration.noise.parameter_names)
-        point = as_points(complete, names)[checked]
-        of_calibration = remarks_on_calibration(calibration, point, own_response)
-        remarks.append(remark_on_same_response(calibration, excitation.model, point, other_response))
-    of_gaps = remark_on_gaps(source.likelihood.noise) if noise and source.likelihood is not None else ""
-    known_already = [of_gaps]  # the likelihood has warned of gaps, and an earlier prediction of the residuals
-    if of_calibration and not is_first_warning(source.likelihood):
-        known_already += of_calibration
-    remarks = tuple(remark for remark in (*remarks, *of_calibration, of_gaps) if remark)
-    for remark in remarks:
-        if remark not in known_already:
-            warnings.warn(remark, stacklevel=2)
-    predictions = {name: replace(each, remarks=remarks) for name, each in predictions.items()}
+        findings += check_peaks(peaks.medians(c.name for c in model.channels), known, alone=calibrated is None)
+    if compared:
+        findings += check_bandwidth(bandwidth(model), bandwidth(calibration.model))
+    if first is not None:
+        findings += check_same_response(difference_of_responses(calibration, model, *first))
+    if noise and source.likelihood is not None:
+        findings += check_gaps(source.likelihood.noise)
+    warn(findings)
+    predictions = {name: replace(each, findings=tuple(findings)) for name, each in predictions.items()}
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 

@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from ..checks.finding import warn
+from ..checks.transfer import check_unit_of_threshold
 from ..events.ratios import EventRatios
 from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..signals.channels import Channel
@@ -46,8 +48,6 @@ __all__ = [
     "with_collapses",
     "warn_of_missing_error",
 ]
-
-_FAR = 10.0  # factor beyond all values from which a threshold is far from them
 
 
 class Exceedance(NamedTuple):
@@ -200,7 +200,7 @@ def exceedance(
         )
     check_level(level)
     if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
-        _warn_of_unit(limits, values, channels[0])
+        warn(check_unit_of_threshold(limits, values, channels[0]), stacklevel=2)
     said, unit = contents(has_error, spread), unit_of_threshold(unit, channels)
     found = _of_values(values, limits, spread, effective, level, seed)._replace(uncertainty=said, unit=unit)
     return found if prediction is None else with_collapses(found, prediction, level)
@@ -356,20 +356,6 @@ def threshold_in_si(threshold: ArrayLike, unit: str | None, channels: Sequence[C
             "units, without a unit"
         )
     return np.asarray(to_si(limits, unit, *dimensions))
-
-
-def _warn_of_unit(limits: np.ndarray, values: np.ndarray, channel: Channel) -> None:
-    """Warn if thresholds are far from all values [SI], and among them in the unit of the channel."""
-    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
-    low, high = np.abs(values).min() / _FAR, np.abs(values).max() * _FAR
-    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
-    if np.all(inside & outside):
-        unit, largest = channel.unit, np.abs(values).max()
-        warnings.warn(
-            f"the threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all "
-            f'predicted values (up to {largest:.3g}): is it in {unit}? Then pass unit="{unit}"',
-            stacklevel=3,
-        )
 
 
 def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:

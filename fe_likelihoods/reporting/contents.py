@@ -4,16 +4,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from samplers.estimates.pareto import LARGEST_SHAPE
-
+from ..checks.compared import Fits
+from ..checks.finding import Judgement
+from ..checks.fit import SAME_AS_PRIOR, residual_sentence
+from ..checks.run import FinishedRun
+from ..checks.table import ParameterRow
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_title
 from ..prediction.prediction import Prediction
-from .advice import Judgement, residual_sentence
-from .fit_gate import SAME_AS_PRIOR
-from .fit_results import Fits
-from .run import FinishedRun
-from .table import ParameterRow
 
 __all__ = [
     "DataSet",
@@ -141,7 +139,7 @@ def verdict_sentences(run: FinishedRun, rows: list[ParameterRow]) -> list[str]:
 
 
 def evidence(run: FinishedRun) -> list[str]:
-    """The evidence with its check, in sentences."""
+    """The evidence with its check, in sentences; the findings judge them."""
     if not run.tempered:
         return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
     sampler, check = run.sampler, run.check
@@ -149,36 +147,22 @@ def evidence(run: FinishedRun) -> list[str]:
         f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}. Only differences between models "
         "for the same data mean something: a difference of 3 is odds of 20 to 1."
     ]
-    own, error = sampler.log_evidence_ladder, sampler.ladder[-1].log_evidence_error
-    if check is None and sampler.rounds:
-        draws, shape = (
-            sum(each.draws for each in sampler.rounds),
-            None if run.verdict is None else run.verdict.pareto_shape,
+    if check is not None:
+        own, error = sampler.log_evidence_ladder, sampler.ladder[-1].log_evidence_error
+        text = (
+            f"Check: the tempering stages (or all weighted draws) give {own:.2f} ± {error:.2f}, {check.evaluations} "
+            f"independent draws give {check.log_evidence:.2f} ± {check.error:.2f} (effective sample size "
+            f"{check.effective_sample_size:.2g}, Pareto shape of the weights {check.pareto_shape:.2f})."
         )
-        text = f"It is the mean weight of {draws} draws that a guide proposed."
-        if shape is not None:
-            good = "so the error can be trusted" if shape < LARGEST_SHAPE else "so the error cannot be trusted"
-            text += f" The Pareto shape of their weights is {shape:.2f} (the limit is {LARGEST_SHAPE}), {good}."
-        return [*lines, text]
-    if check is None:
-        why = " (check_draws=0)" if sampler.settings.check_draws == 0 else ""
-        if sampler.ended_at is not None:
-            why = f", because the limit of simulations ended the run at beta = {sampler.ended_at:.3g}"
-        return [*lines, f"It was not checked by independent draws{why}."]
-    text = (
-        f"Check: the tempering stages (or all weighted draws) give {own:.2f} ± {error:.2f}, {check.evaluations} "
-        f"independent draws give {check.log_evidence:.2f} ± {check.error:.2f}."
-    )
-    if not check.reliable:
-        verdict = (
-            f"The weights of these draws are uneven (effective sample size {check.effective_sample_size:.2g}, Pareto "
-            f"shape {check.pareto_shape:.2f}), so they confirm nothing."
-        )
-    elif abs(own - check.log_evidence) <= 3.0 * np.hypot(error, check.error):
-        verdict = "The two agree within three standard errors."
-    else:
-        verdict = "The two disagree by more than three standard errors: do not compare models by this evidence."
-    return [*lines, text, verdict]
+        return [*lines, text if check.reliable else f"{text} Its weights are too uneven to confirm anything."]
+    if sampler.rounds:
+        shape = None if run.verdict is None else run.verdict.pareto_shape
+        text = f"It is the mean weight of {sum(each.draws for each in sampler.rounds)} draws that a guide proposed"
+        return [*lines, f"{text}." if shape is None else f"{text}; the Pareto shape of their weights is {shape:.2f}."]
+    why = " (check_draws=0)" if sampler.settings.check_draws == 0 else ""
+    if sampler.ended_at is not None:
+        why = f", because the limit of simulations ended the run at beta = {sampler.ended_at:.3g}"
+    return [*lines, f"It was not checked by independent draws{why}."]
 
 
 def residual_sentences(fits: Fits) -> list[str]:

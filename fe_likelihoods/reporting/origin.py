@@ -8,8 +8,8 @@ from typing import Any
 
 from samplers.smc import FEWEST_TO_RECYCLE
 
+from ..checks.run import FinishedRun
 from ..likelihood.joint import JointLikelihood
-from .run import FinishedRun
 
 __all__ = ["fingerprints", "how_to_repeat", "sampler_settings", "versions"]
 

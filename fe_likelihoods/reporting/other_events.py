@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks.finding import Finding
+from ..checks.transfer import check_coverage, check_failed_samples, check_scores
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores, central_interval
 from ..prediction.scores import share_within
@@ -20,7 +22,6 @@ EventPredictions = Mapping[str, Prediction]
 """Predictions of one event by quantity, such as the result of `fe_likelihoods.propagate` for several quantities."""
 
 LEVEL = 0.9  # of the intervals
-SMALL_COVERAGE = 0.5  # of the strong part, below which a prediction is said to be wrong
 
 
 class NumberRow(NamedTuple):
@@ -56,7 +57,7 @@ class OtherEvent(NamedTuple):
     histories: tuple[HistoryScores, ...]
     values: tuple[QuantityScores, ...]
     sentence: str  # how it was predicted, and how the measurements compare with it
-    remarks: tuple[str, ...]  # doubts: warnings, failed samples, scores that could not be computed
+    findings: tuple[Finding, ...]  # of the predictions, failed samples, scores that could not be computed
 
 
 def as_events(events: Any) -> dict[str, EventPredictions | SimulationFailed]:
@@ -90,49 +91,38 @@ def describe_event(
 ) -> OtherEvent:
     """Describe and score the predictions of an event, or the error that `propagate` raises if all simulations fail."""
     if isinstance(predictions, SimulationFailed):
-        remark = f"all simulations failed: {predictions.reason}"
-        return OtherEvent(name, {}, measured, (), (), (), "It could not be predicted.", (remark,))
-    remarks = list(dict.fromkeys(remark for each in predictions.values() for remark in each.remarks))
+        found = tuple(check_failed_samples({}, predictions.reason))
+        return OtherEvent(name, {}, measured, (), (), (), "It could not be predicted.", found)
+    findings = list(dict.fromkeys(found for each in predictions.values() for found in each.findings))
     first = next(iter(predictions.values()))
-    if first.n_failed:
-        reasons = "; ".join(f"{count}: {reason}" for reason, count in first.failure_reasons.items())
-        remarks.append(f"{first.n_failed} samples failed and are left out ({reasons})")
+    findings += check_failed_samples(first.failure_reasons if first.n_failed else {})
     histories, values, numbers = [], [], []
     for each in predictions.values():
         scores = None
         if measured is not None:
             scores, told = _scores(each, measured)
-            remarks += [text for text in told if text not in remarks]
+            findings += [each for each in check_scores(told) if each not in findings]
         if scores is not None:
             (histories if each.dt is not None else values).append(scores)
         if each.dt is None and each.values is not None:
             numbers += _number_rows(each, scores)
-    missed = [
-        channel.name
-        for scores in histories
-        for channel, share in zip(scores.channels, scores.coverage_strong, strict=True)
-        if share < SMALL_COVERAGE
-    ]
-    if missed:
-        remarks.append(
-            f"the {_percent(LEVEL)} band contains less than half of the strong part of {', '.join(missed)}: its spread "
-            "leaves out differences of events. Calibrate with several events (in Python, predict_new_event has their "
-            "spread), or with a noise that follows the response; and look for what the model lacks"
-        )
+    for scores in histories:
+        shares = {c.name: float(s) for c, s in zip(scores.channels, scores.coverage_strong, strict=True)}
+        findings += check_coverage(shares, LEVEL)
     sentence = _sentence(first, measured, histories, numbers)
     return OtherEvent(
-        name, predictions, measured, tuple(numbers), tuple(histories), tuple(values), sentence, tuple(remarks)
+        name, predictions, measured, tuple(numbers), tuple(histories), tuple(values), sentence, tuple(findings)
     )
 
 
 def _scores(prediction: Prediction, measured: Measurements) -> tuple[HistoryScores | QuantityScores | None, list[str]]:
-    """Scores (None where they cannot be computed), and remarks on them."""
+    """Scores (None where they cannot be computed), and what was said about them."""
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             scores = prediction.score(measured, LEVEL)
     except ValueError as error:
-        return None, [f"no scores: {error}"]
+        return None, [f"No scores: {error}."]
     return scores, [str(each.message) for each in caught]
 
 

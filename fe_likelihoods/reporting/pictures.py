@@ -10,12 +10,12 @@ import numpy as np
 
 from samplers import plot_corner, plot_marginals, plot_run
 
+from ..checks.compared import Fit
+from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
-from .fit_results import Fit
 from .other_events import OtherEvent
-from .run import FinishedRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

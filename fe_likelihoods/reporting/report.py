@@ -9,14 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks.compared import Fits
+from ..checks.failed_simulations import Failures
+from ..checks.finding import Finding
+from ..checks.result import JudgedRun, judge_run
+from ..checks.run import FinishedRun, read_run
+from ..checks.table import ParameterRow
 from ..information.identifiability import of_samples
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from ..signals.channels import Measurements
-from ..signals.data_faults import Finding
 from ..simulation.model import SimulationFailed
 from ..units import from_si
-from .advice import JudgedRun, judge_run
 from .contents import (
     DataSet,
     PredictedValue,
@@ -28,8 +32,6 @@ from .contents import (
     summary_sentences,
     verdict_sentences,
 )
-from .failed_simulations import Failures
-from .fit_results import Fits
 from .origin import fingerprints, how_to_repeat, sampler_settings, versions
 from .other_events import EventPredictions, OtherEvent, as_events, describe_event
 from .pictures import (
@@ -43,8 +45,6 @@ from .pictures import (
     draw_scores,
     draw_scores_of_events,
 )
-from .run import FinishedRun, read_run
-from .table import ParameterRow
 
 __all__ = ["Contents", "Predicted", "report", "write_page"]
 
@@ -59,7 +59,7 @@ class Predicted(NamedTuple):
     n_samples: int
     n_failed: int
     scores: str
-    remarks: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 class Contents(NamedTuple):
@@ -69,10 +69,11 @@ class Contents(NamedTuple):
     date: str
     status: str
     summary: list[str]
-    advice: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
     data: list[DataSet]
     rows: list[ParameterRow]
     has_truth: bool
+    factor: float
     evidence: list[str]
     fits: Fits
     told: list[str]
@@ -92,6 +93,7 @@ class Contents(NamedTuple):
     settings: list[tuple[str, str]]
     versions: list[tuple[str, str]]
     fingerprints: list[tuple[str, str]]
+    tests: tuple[tuple[str, str], ...]
     repeat: str
 
 
@@ -112,9 +114,9 @@ def report(
 ) -> Path:
     """Write a report of a finished run: one HTML file without scripts or links to other files.
 
-    It contains a summary in words, every doubt with what to do about it, the table of the parameters, the evidence with
-    its check, figures, checks of the residuals, failures, cost, and what is needed to repeat the run. The response at
-    two points (before and after the update) is needed for the figures. Where the likelihood has not cached it, it is
+    It contains a summary in words, every finding with what to do about it, the table of the parameters, the evidence
+    with its check, figures, checks of the residuals, failures, cost, and what is needed to repeat the run. The response
+    at two points (before and after the update) is needed for the figures. Where the likelihood has not cached it, it is
     simulated, and the report says how many simulations that took.
 
     Parameters
@@ -212,9 +214,10 @@ def gather(
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         status=judgement.status,
         summary=summary_sentences(run, rows, fits, judgement),
-        advice=judgement.findings,
+        findings=judgement.findings,
         data=sets,
         rows=rows,
+        factor=judgement.width_factor,
         has_truth=bool(np.isfinite(run.truth).any()),
         evidence=evidence(run),
         fits=fits,
@@ -235,6 +238,7 @@ def gather(
         settings=sampler_settings(run),
         versions=versions(),
         fingerprints=fingerprints(run),
+        tests=judgement.tests,
         repeat=repeat or how_to_repeat(run),
     )
 
@@ -306,7 +310,7 @@ def _predicted(name: str, prediction: Prediction, measurements: Measurements | N
     pictures = draw_prediction(prediction, measurements) if prediction.dt is not None else []
     pictures += draw_scores(scores) if not isinstance(scores, str) else []
     values, counts = tuple(predicted_values(prediction)), (prediction.n_samples, prediction.n_failed)
-    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores), prediction.remarks)
+    return Predicted(name, tuple(pictures), values, prediction.probabilities, *counts, str(scores), prediction.findings)
 
 
 def _scores(prediction: Prediction, measurements: Measurements | None) -> HistoryScores | QuantityScores | str:

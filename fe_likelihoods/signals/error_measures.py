@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["rrmse", "sum_of_squares"]
+__all__ = ["relative_errors", "rrmse", "sum_of_squares"]
 
 
 def rrmse(
@@ -44,11 +44,17 @@ def rrmse(
     predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)
     if predicted.shape != measured.shape or not measured.ndim:
         raise ValueError(f"expected histories of one shape, (..., n_steps); got {predicted.shape} and {measured.shape}")
-    squares = np.square(predicted - measured)
-    missing = np.isnan(measured)
-    if missing.any():
-        squares[missing] = 0.0
-    return np.sqrt(squares.sum(axis=-1) / sum_of_squares(measured, names))
+    sum_of_squares(measured, names)
+    unknown = (np.isnan(predicted) & ~np.isnan(measured)).any(axis=-1)
+    return np.where(unknown, np.nan, relative_errors(predicted - measured, measured))[()]
+
+
+def relative_errors(residuals: np.ndarray, measured: np.ndarray) -> NDArray[np.float64]:
+    """RRMSE (...,) of residuals (..., n_steps); NaN is left out, and a measured history of zeros has the error NaN."""
+    there = np.isfinite(residuals) & np.isfinite(measured)
+    squares, power = (np.square(np.where(there, each, 0.0)).sum(axis=-1) for each in (residuals, measured))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sqrt(np.where(power > 0.0, squares / power, np.nan))
 
 
 def sum_of_squares(measured: ArrayLike, names: Sequence[str] | None = None) -> NDArray[np.float64] | np.float64:

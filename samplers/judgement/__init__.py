@@ -1,4 +1,4 @@
-"""Quality of a run's result: concerns found during and after the run, and the verdict."""
+"""Quality of a run's result: findings during and after the run, and the verdict."""
 
 from .failures import NearFailures, failures_near
 

@@ -1,7 +1,7 @@
-"""Concerns about runs that ended without an error but whose result may be wrong.
+"""What is found about runs that ended without an error but whose result may be wrong.
 
 Collapsed populations, moves that are rejected or too few, and evidences or shares that disagree. Each check is a
-function of stages and arrays that returns a list of concerns. How often each speaks in wrong runs and in right ones is
+function of stages and arrays that returns a list of findings. How often each speaks in wrong runs and in right ones is
 in ``docs/which_sampler``.
 """
 
@@ -12,8 +12,9 @@ import numpy as np
 from ..estimates.genealogy import standard_error_of_mean
 from ..estimates.importance import EvidenceCheck
 from ..estimates.weights import normalised_weights
+from ..finding import CARE, WRONG, Finding
 from ..proposals.mixture import Mixture, log_responsibilities
-from ..reports import Concern, Stage
+from ..reports import Stage
 
 __all__ = [
     "check_annealing",
@@ -24,6 +25,7 @@ __all__ = [
     "check_shares",
     "check_stages",
     "describe_unused_guide",
+    "find_unreached_part",
 ]
 
 LOW_ACCEPTANCE = 0.01
@@ -46,6 +48,7 @@ ROUNDING = 1e-12
 LARGE_SHARE_DIFFERENCE = 0.1
 # Error of the log-odds above which probabilities of models are called rough.
 LARGE_ERROR_OF_ODDS = 0.5
+DIFFERENT = "The two estimates of the evidence differ"
 # Differences of evidences are reported beyond this many standard errors.
 FAR = 3.0
 
@@ -54,12 +57,12 @@ def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
     return stage.distinct_ancestors < max(ndim + 2, nwalkers // 50)
 
 
-def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concern]:
-    """A concern if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
+def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
+    """A finding if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
 
     The posterior is then the prior, or it is where none of these points is, and the value is a penalty or comes from a
     model that ignores its parameters. Beside -inf, one value may be the likelihood of uniform errors, which is right,
-    or a penalty: the concern is not grave; for a value of 0, an indicator, there is none.
+    or a penalty: the finding is not severe; for a value of 0, an indicator, there is none.
     """
     known = np.isfinite(log_prob)
     if np.count_nonzero(known) < 2:
@@ -72,115 +75,122 @@ def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Concer
     if not known.all():
         others = f" (the other {len(known) - len(values)} failed or have -inf)"
         indicator = " If errors are uniform, such a likelihood is right, and so is the result."
-    message = (
-        f"the log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with{others}: it is a "
+    text = (
+        f"The log-likelihood is {values[0]:.6g} at all {len(values)} points that the run began with{others}: it is a "
         "penalty in place of a failure, or the model ignores its parameters, or the data are not used. The result is "
-        "the prior, and a posterior elsewhere was not found. Look at responses to a few draws of the prior; let failed "
-        f"simulations raise an exception or return NaN, and narrow the prior to where the model works.{indicator}"
+        "the prior, and a posterior elsewhere was not found."
     )
-    return [Concern(message, bool(known.all()))]
+    action = (
+        "Look at responses to a few draws of the prior; let failed simulations raise an exception or return NaN, and "
+        f"narrow the prior to where the model works.{indicator}"
+    )
+    return [Finding("The likelihood tells nothing", WRONG if known.all() else CARE, text, action)]
 
 
-def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Concern]:
-    """Concerns if the last stage is collapsed or stuck, and no earlier stage was.
+def check_stages(stages: Sequence[Stage], nwalkers: int, ndim: int) -> list[Finding]:
+    """Findings if the last stage is collapsed or stuck, and no earlier stage was.
 
     Collapsed: the distinct points that survived the resampling are fewer than 2 % of the walkers, or too few to span
     the parameters. Stuck: less than 1 % of the proposals were accepted.
     """
-    stage, number, concerns = stages[-1], len(stages), []
+    stage, number, found = stages[-1], len(stages), []
     collapsed = [_collapsed(s, nwalkers, ndim) for s in stages]
     stuck = [s.acceptance < LOW_ACCEPTANCE for s in stages]
     if collapsed[-1] and not any(collapsed[:-1]):
-        message = (
-            f"collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
-            f"{nwalkers} survived the resampling. Use more walkers, more moves or a larger ess_ratio"
+        text = (
+            f"Collapse at stage {number} (beta = {stage.beta:.3g}): only {stage.distinct_ancestors} distinct points of "
+            f"{nwalkers} survived the resampling."
         )
-        concerns.append(Concern(message, True))
+        action = "Use more walkers, more moves or a larger ess_ratio."
+        found.append(Finding("The walkers have collapsed", WRONG, text, action))
     if stuck[-1] and not any(stuck[:-1]):
-        message = (
-            f"stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
-            "accepted, so the points did not move. Use other moves or more of them"
+        text = (
+            f"Stuck at stage {number} (beta = {stage.beta:.3g}): {100 * stage.acceptance:.2g} % of the proposals were "
+            "accepted, so the points did not move."
         )
-        concerns.append(Concern(message, True))
-    return concerns
+        found.append(Finding("The walkers are stuck", WRONG, text, "Use other moves or more of them."))
+    return found
 
 
-def check_annealing(stages: Sequence[Stage], correlation: float) -> list[Concern]:
-    """A concern if annealing by moves ended with points that had not moved enough.
+def check_annealing(stages: Sequence[Stage], correlation: float) -> list[Finding]:
+    """A finding if annealing by moves ended with points that had not moved enough.
 
     The largest correlation of the final population with its resampled start, `correlation`, is then above 0.9. Not
     reported if `check_stages` found the moves stuck.
     """
     if correlation <= HIGH_CORRELATION or any(s.acceptance < LOW_ACCEPTANCE for s in stages):
         return []
-    message = (
-        f"the moves at beta = {stages[-1].beta:.3g} were too short: particles are still correlated "
+    text = (
+        f"The moves at beta = {stages[-1].beta:.3g} were too short: particles are still correlated "
         f"({correlation:.2f}) with their resampled start, so copies have not separated, and modes keep the weights "
-        "that the resampling gave them. Use more moves (max_moves, burn_in) or longer ones"
+        "that the resampling gave them."
     )
-    return [Concern(message, False)]
+    return [Finding("The moves were too short", CARE, text, "Use more moves (max_moves, burn_in) or longer ones.")]
 
 
 def check_evidence(
     log_evidence: float, error: float, check: EvidenceCheck | None, has_several_modes: Callable[[], bool]
-) -> list[Concern]:
-    """Concerns if the two estimates of the evidence disagree, or if its error is large.
+) -> list[Finding]:
+    """Findings if the two estimates of the evidence disagree, or if its error is large.
 
     `log_evidence` and `error` belong to the stages, `check` to fresh draws. The limits come from 1277 right and 180
     wrong runs with known posteriors: such errors go with wrong means as well. A `check` with even weights that is
     higher than the stages has found what the stages have lost: the evidence is right by it, and where the difference is
     large, the walkers may be too far spread. The final points are searched for modes only where these matter.
     """
-    concerns, believed = [], check is not None and check.reliable
+    found, believed = [], check is not None and check.reliable
     difference = 0.0 if check is None else abs(log_evidence - check.log_evidence)
     is_higher = believed and check.log_evidence > log_evidence
     if difference > WRONG_DIFFERENCE and not believed:
-        message = (
+        text = (
             f"{_both(log_evidence, error, check)}, and the weights of the second estimate are uneven (effective sample "
             f"size {check.effective_sample_size:.2g} of {check.evaluations}, Pareto shape {check.pareto_shape:.2f}). "
             "Evidence, means and standard deviations may be wrong by more than their errors, as with many parameters "
-            "and few walkers, heavy tails, or modes that the final points do not show. Use more walkers or more moves "
-            "(min_moves, max_moves), and compare two runs. Where log_prior is a function of your own, check that it is "
-            "normalised"
+            "and few walkers, heavy tails, or modes that the final points do not show."
         )
-        concerns.append(Concern(message, True))
+        action = (
+            "Use more walkers or more moves (min_moves, max_moves), and compare two runs. Where log_prior is a "
+            "function of your own, check that it is normalised."
+        )
+        found.append(Finding(DIFFERENT, WRONG, text, action))
     elif is_higher and difference > HIGHER_CHECK:
-        message = (
+        text = (
             f"{_both(log_evidence, error, check)}: the evidence is right by the second one, but the stages have lost a "
-            "part of it, and the walkers may be too far spread, or in modes with wrong shares. Use more walkers or "
-            "more moves (min_moves, max_moves), or recycling, and compare standard deviations"
+            "part of it, and the walkers may be too far spread, or in modes with wrong shares."
         )
-        concerns.append(Concern(message, False))
+        action = "Use more walkers or more moves (min_moves, max_moves), or recycling, and compare standard deviations."
+        found.append(Finding(DIFFERENT, CARE, text, action))
     elif difference > LARGE_DIFFERENCE and not is_higher:
-        message = (
-            f"{_both(log_evidence, error, check)}. The posterior may still be right. Use more walkers or more moves "
-            "for the evidence. Where log_prior is a function of your own, check that it is normalised: only the second "
-            "estimate depends on this"
+        text = f"{_both(log_evidence, error, check)}. The posterior may still be right."
+        action = (
+            "Use more walkers or more moves for the evidence. Where log_prior is a function of your own, check that it "
+            "is normalised: only the second estimate depends on this."
         )
-        concerns.append(Concern(message, False))
+        found.append(Finding(DIFFERENT, CARE, text, action))
     stated = min(error, check.error) if believed else error
     if stated > LARGE_ERROR:
-        concerns.append(Concern(f"the standard error of the log-evidence is {stated:.2g}: use more walkers", False))
+        text = f"The standard error of the log-evidence is {stated:.2g}."
+        found.append(Finding("The evidence is rough", CARE, text, "Use more walkers."))
     elif error > LARGE_ERROR_OF_MODES and has_several_modes():
-        message = (
-            f"the standard error of the log-evidence of the stages is {error:.2g}, so the shares of the modes may be "
-            "wrong: use more walkers"
+        text = (
+            f"The standard error of the log-evidence of the stages is {error:.2g}, so the shares of the modes may be "
+            "wrong."
         )
-        concerns.append(Concern(message, False))
-    return concerns
+        found.append(Finding("The evidence is rough", CARE, text, "Use more walkers."))
+    return found
 
 
 def _both(log_evidence: float, error: float, check: EvidenceCheck) -> str:
     return (
-        f"the stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
+        f"The stages give the log-evidence {log_evidence:.2f} +- {error:.2f}, importance sampling from the final "
         f"points gives {check.log_evidence:.2f} +- {check.error:.2f}"
     )
 
 
 def check_fallback(
     stages: Sequence[Stage], check: EvidenceCheck | None, log_evidence: float, error: float, earlier: EvidenceCheck
-) -> list[Concern]:
-    """A concern if annealing by moves lost a part of the posterior that recycling before it had found.
+) -> list[Finding]:
+    """A finding if annealing by moves lost a part of the posterior that recycling before it had found.
 
     Recycling may have found more modes although its result (`log_evidence`, `error`, and the check `earlier`) was not
     reliable. Both its estimates of the evidence must exceed the evidence of the moves: the estimate of their `check` if
@@ -192,18 +202,18 @@ def check_fallback(
     excess = min(log_evidence, earlier.log_evidence) - now
     if excess <= max(3.0 * float(np.hypot(own, max(error, earlier.error))), LOST_EVIDENCE):
         return []
-    message = (
-        f"annealing by moves gives the log-evidence {now:.2f} +- {own:.2f}, and recycling before it, which was not "
-        f"reliable, gave {log_evidence:.2f} and {earlier.log_evidence:.2f}: the moves may have lost a mode. Use more "
-        "walkers, so that recycling is reliable, and compare two runs"
+    text = (
+        f"Annealing by moves gives the log-evidence {now:.2f} +- {own:.2f}, and recycling before it, which was not "
+        f"reliable, gave {log_evidence:.2f} and {earlier.log_evidence:.2f}: the moves may have lost a mode."
     )
-    return [Concern(message, True)]
+    action = "Use more walkers, so that recycling is reliable, and compare two runs."
+    return [Finding("A mode may be lost", WRONG, text, action)]
 
 
 def check_shares(
     mixture: Mixture, points: np.ndarray, founders: np.ndarray, coords: np.ndarray, log_weights: np.ndarray
-) -> list[Concern]:
-    """A concern if a part of the posterior has different shares among final points (n, ndim) and weighted draws.
+) -> list[Finding]:
+    """A finding if a part of the posterior has different shares among final points (n, ndim) and weighted draws.
 
     The draws `coords` (m, ndim) with `log_weights` (m,) come from a `mixture` that also covers points of earlier
     stages; its components are the parts, and points count for them by responsibilities. A difference is reported if it
@@ -224,26 +234,30 @@ def check_shares(
     if not wrong.any():
         return []
     worst = int(np.argmax(np.where(wrong, difference, 0.0)))
-    message = (
-        f"a part of the posterior has the share {found[worst]:.2f} among the final points and {expected[worst]:.2f} "
+    text = (
+        f"A part of the posterior has the share {found[worst]:.2f} among the final points and {expected[worst]:.2f} "
         f"+- {error[worst]:.2f} among weighted draws from all parts that any stage has seen: a mode has been lost or "
-        "has a wrong weight. Use more walkers or more moves, and compare two runs"
+        "has a wrong weight."
     )
-    return [Concern(message, False)]
+    return [Finding("A mode may be lost", CARE, text, "Use more walkers or more moves, and compare two runs.")]
 
 
 def check_guide_against_recycling(
     of_guide: float, error_of_guide: float, log_evidence: float, error: float
-) -> list[Concern]:
-    """A concern if the rounds of a guide and the recycling after them differ in the evidence: one has lost a part."""
+) -> list[Finding]:
+    """A finding if the rounds of a guide and the recycling after them differ in the evidence: one has lost a part."""
     if abs(of_guide - log_evidence) <= FAR * float(np.hypot(error_of_guide, error)):
         return []
-    message = (
-        f"recycling gives the log-evidence {log_evidence:.2f} +- {error:.2f}, the draws of the guide before it give "
-        f"{of_guide:.2f} +- {error_of_guide:.2f}: one of them has lost a part of the posterior. Use a better guide, or "
-        "more walkers without one"
+    text = (
+        f"Recycling gives the log-evidence {log_evidence:.2f} +- {error:.2f}, the draws of the guide before it give "
+        f"{of_guide:.2f} +- {error_of_guide:.2f}: one of them has lost a part of the posterior."
     )
-    return [Concern(message, True)]
+    return [Finding("A mode may be lost", WRONG, text, "Use a better guide, or more walkers without one.")]
+
+
+def find_unreached_part(text: str, severity: str) -> Finding:
+    """A finding about draws of a guide that hardly reached a part of the posterior."""
+    return Finding("The guide missed a part of the posterior", severity, f"{text[0].upper()}{text[1:]}.")
 
 
 def describe_unused_guide(reason: str, impossible: bool) -> str:

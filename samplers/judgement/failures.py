@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import binom
 
-from ..reports import Concern
+from ..finding import CARE, WRONG, Finding
 
 __all__ = ["NearFailures", "check_failed_region", "failures_near", "judged_failures"]
 
@@ -159,26 +159,32 @@ def judged_failures(
     return unknown._replace(known=False) if unknown.borders else found
 
 
-def check_failed_region(near: NearFailures) -> list[Concern]:
-    """A concern if known failures adjoin the final points: grave if they are many and not scattered."""
+def check_failed_region(near: NearFailures) -> list[Finding]:
+    """A finding if known failures adjoin the final points: severe if they are many and not scattered."""
     if near.place == "away" or not near.known:
         return []
-    where = f"in the region of the final points, {near.failed} of {near.evaluated} evaluated points"
+    where = f"in the region of the final points, {near.failed} of {near.evaluated} evaluated points failed"
+    text = f"{where[0].upper()}{where[1:]}"
     if near.place == "scattered":
-        message = (
-            f"{where} failed, scattered among successful ones. Means and standard deviations are right if these "
-            "failures do not depend on the parameters. Look at their reasons, and mend the model or its solver"
+        text += (
+            ", scattered among successful ones. Means and standard deviations are right if these failures do not "
+            "depend on the parameters."
         )
-    elif near.place == "edge":
-        message = (
-            f"{near.adjoining} failed points adjoin the final points at an edge ({where} failed). If the posterior "
-            "goes on there, standard deviations are too small. Look at the parameters of the failures, and whether "
-            "the final points end there abruptly: if so, mend the model there, or exclude the region by the prior if "
-            "it is impossible"
+        return [
+            Finding(
+                "Failures among the samples", CARE, text, "Look at their reasons, and mend the model or its solver."
+            )
+        ]
+    if near.place == "edge":
+        text = (
+            f"{near.adjoining} failed points adjoin the final points at an edge ({where}). If the posterior goes on "
+            "there, standard deviations are too small."
         )
-    else:
-        message = (
-            f"{where} failed: the failures, not the data, end the posterior there, so means and standard deviations "
-            "may be wrong. Mend the model there, or exclude the region by the prior if it is impossible"
+        action = (
+            "Look at the parameters of the failures, and whether the final points end there abruptly: if so, mend the "
+            "model there, or exclude the region by the prior if it is impossible."
         )
-    return [Concern(message, near.borders)]
+        return [Finding("Failures at an edge of the samples", CARE, text, action)]
+    text += ": the failures, not the data, end the posterior there, so means and standard deviations may be wrong."
+    action = "Mend the model there, or exclude the region by the prior if it is impossible."
+    return [Finding("Failures border on the samples", WRONG, text, action)]

@@ -24,7 +24,9 @@ from ..estimates.importance import (
     usable,
 )
 from ..estimates.pareto import LARGEST_SHAPE
-from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound
+from ..finding import CARE, NOTE, WRONG, Finding
+from ..reports import AnnealingResult, EarlyStop, GuidedRound
+from .checks import find_unreached_part
 from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
 
@@ -44,6 +46,9 @@ CONVERGED = "converged"
 USABLE = "usable"
 NOT_USABLE = "not usable"
 STATUSES = (CONVERGED, USABLE, NOT_USABLE)
+SEVERITIES = (NOTE, CARE, WRONG)
+LIMIT = "The limit of simulations ended the run"
+UNSEEN = "A part of the posterior may be missing"
 
 
 class EvidenceEstimate(NamedTuple):
@@ -81,6 +86,7 @@ class _Stored(NamedTuple):
     more_simulations: float | None
     effective_sample_size: float
     sample: str
+    findings: tuple[Finding, ...] = ()
 
 
 class Verdict(_Stored):
@@ -106,6 +112,9 @@ class Verdict(_Stored):
     sample : str
         The points that `effective_sample_size` counts: the walkers, or weighted points that the walkers were resampled
         from.
+    findings : tuple of `samplers.finding.Finding`
+        What speaks against the result, each with its severity and what to do; empty for a verdict that version 0.2 has
+        stored.
     """
 
     _run: RunParts | None = None
@@ -243,7 +252,7 @@ def judge(
         found += _of_early_stop(stop, stage.log_evidence_error, ndim)
         more = _missing_draws(result.rounds, nwalkers) if stop.from_guide else None
     elif stop is not None:
-        found.append(Concern("the limit of simulations ended the run at beta = 1, before its last check", False))
+        found.append(Finding(LIMIT, CARE, "The limit of simulations ended the run at beta = 1, before its last check."))
         more = None
     if result.start is not None and result.start.used:
         last = result.rounds[-1]
@@ -253,13 +262,14 @@ def judge(
             f"weights is {result.start.pareto_shape:.2f}"
         )
         if result.start.shortfall:
-            found.append(Concern(result.start.shortfall, False))
+            found.append(find_unreached_part(result.start.shortfall, CARE))
         found += _of_signed_sample(result)
     elif result.start is not None:
-        found.append(Concern(f"the draws of the guide were not used ({result.start.reason})", False))
+        text = f"The draws of the guide were not used ({result.start.reason})."
+        found.append(Finding("The guide was not used", CARE, text))
     if result.start is not None or (stop is not None and stop.from_guide):
-        found += [Concern(f"concern of the guide: {concern}", False) for concern in result.concerns]
-        found += [Concern(f"concern of the guide: {refusal}", True) for refusal in result.refusals]
+        found += [Finding(UNSEEN, CARE, f"The guide says: {text}.") for text in result.concerns]
+        found += [Finding(UNSEEN, WRONG, f"The guide says: {text}.") for text in result.refusals]
         if not result.concerns and not result.refusals:
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
     if missing_steps > 0:
@@ -269,18 +279,19 @@ def judge(
         )
     if failures:
         reasons.append(f"{failures} failed and count as impossible")
-    status = STATUSES[max((1 + concern.grave for concern in found), default=0)]
+    status = STATUSES[max((SEVERITIES.index(each.severity) for each in found), default=0)]
     if status == CONVERGED:
         more = 0.0
     elif stop is None:
         more = None
     return Verdict(
         status,
-        (*(concern.message.rstrip(".") for concern in found), *reasons),
+        (*(each.message.rstrip(".") for each in found), *reasons),
         float(simulations),
         None if more is None else float(more),
         float(stage.effective_sample_size if result.independent_points is None else result.independent_points),
         _sample(result, nwalkers),
+        tuple(found),
     )
 
 
@@ -324,32 +335,32 @@ def describe_early_stop(verdict: Verdict, limit: float, result: AnnealingResult,
     )
 
 
-def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Concern]:
-    """Concerns about a population that was made from the points known when the limit of simulations was reached."""
+def _of_early_stop(stop: EarlyStop, error: float, ndim: int) -> list[Finding]:
+    """Findings about a population that was made from the points known when the limit of simulations was reached."""
     where = f"at beta = {stop.beta:.3g} " if stop.beta < 1.0 else ""
     text = (
-        f"the limit of simulations ended the run {where}with {stop.points} weighted points, whose effective sample "
+        f"The limit of simulations ended the run {where}with {stop.points} weighted points, whose effective sample "
         f"size is {stop.effective_sample_size:.2g} and whose weights have a Pareto shape of {stop.pareto_shape:.2g}"
     )
     if usable(stop.effective_sample_size, stop.pareto_shape, error, ndim):
-        return [Concern(text, False)]
+        return [Finding(LIMIT, CARE, f"{text}.")]
     wanted = f"an effective sample size of {fewest_points(ndim):.0f} and a shape below {LARGEST_SHAPE:g} are needed"
-    return [Concern(f"{text} ({wanted})", True)]
+    return [Finding(LIMIT, WRONG, f"{text} ({wanted}).")]
 
 
-def _of_signed_sample(result: AnnealingResult) -> list[Concern]:
-    """A concern if the signed sample does not determine the standard deviation of some parameters."""
+def _of_signed_sample(result: AnnealingResult) -> list[Finding]:
+    """A finding if the signed sample does not determine the standard deviation of some parameters."""
     if result.signed is None:
         return []
     unknown = np.flatnonzero(np.isnan(result.signed.standard_deviation().value))
     if len(unknown) == 0:
         return []
-    message = (
-        f"the standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
-        "the signed sample is negative, as with a tail of the posterior in which the guide makes few draws. Use more "
-        "walkers, a prior without this tail, or no guide"
+    text = (
+        f"The standard deviation of parameter {', '.join(map(str, unknown + 1))} is not determined: its variance by "
+        "the signed sample is negative, as with a tail of the posterior in which the guide makes few draws."
     )
-    return [Concern(message, False)]
+    action = "Use more walkers, a prior without this tail, or no guide."
+    return [Finding("A standard deviation is not determined", CARE, text, action)]
 
 
 def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | None:

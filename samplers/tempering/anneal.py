@@ -29,17 +29,19 @@ from ..estimates.importance import (
 )
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
+from ..finding import WRONG, Finding
 from ..judgement.checks import (
     check_annealing,
     check_fallback,
     check_guide_against_recycling,
     check_shares,
     describe_unused_guide,
+    find_unreached_part,
 )
 from ..proposals.basins import cover_basins
 from ..proposals.mixture import fit_mixture, log_density
 from ..proposals.transforms import find_support_bounds
-from ..reports import Concern, EarlyStop, GuidedStart, Report, Restart, Stage, warn
+from ..reports import EarlyStop, GuidedStart, Report, Restart, Stage, warn
 from ..resampling import systematic
 from ..settings import Settings
 from .early_stop import NothingToReport, StoppedEarly
@@ -110,7 +112,7 @@ def _check_moves(
     settings: Settings,
     visited: VisitedPoints,
 ) -> Steps:
-    """The evidence check after annealing by moves, and concerns; `recycled`: an unreliable result before the moves."""
+    """The evidence check after annealing by moves, and findings; `recycled`: an unreliable result before the moves."""
     yield from ((population, each) for each in check_annealing(stages, correlation))
     check = None
     if settings.check_draws != 0:
@@ -133,11 +135,11 @@ def check_population(
     log_evidence: float,
     random: np.random.RandomState,
     draws: int | None = None,
-) -> tuple[EvidenceCheck, list[Concern]]:
+) -> tuple[EvidenceCheck, list[Finding]]:
     """Estimate the evidence and the shares of the posterior's parts by fresh draws of a fitted mixture.
 
     `population` are the final points, `visited` the points of all stages, and `log_evidence` belongs to the stages.
-    There are as many draws as final points by default. Returns the check, and concerns about shares
+    There are as many draws as final points by default. Returns the check, and findings about shares
     (`samplers.judgement.checks.check_shares`).
     """
     coords, n = population.coords, len(population.coords)
@@ -146,8 +148,8 @@ def check_population(
     mixture = cover_basins(mixture, points, log_target - log_evidence)
     drawn, made = draw_inside(mixture, n if draws is None else draws, random, density.inside)
     log_weights = density.evaluate(drawn)["log_prob"] - log_density(mixture, drawn)
-    concerns = check_shares(mixture, coords, population.founders[0], drawn, log_weights)
-    return evidence_from_weights(log_weights, made), concerns
+    findings = check_shares(mixture, coords, population.founders[0], drawn, log_weights)
+    return evidence_from_weights(log_weights, made), findings
 
 
 def _by_recycling(
@@ -158,11 +160,11 @@ def _by_recycling(
     random: np.random.RandomState,
     schedule: MoveSchedule,
     settings: Settings,
-    compare: Callable[[Recycled], Sequence[Concern]] = lambda found: (),
+    compare: Callable[[Recycled], Sequence[Finding]] = lambda found: (),
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Make the `steps` of `recycle`, then resample the weighted draws to `size` points and move them.
 
-    `population`: the starting points. `compare`: function that returns concerns about a reliable result.
+    `population`: the starting points. `compare`: function that returns findings about a reliable result.
     """
     found = yield from steps
     if not found.reliable:
@@ -215,7 +217,7 @@ def _from_guide(
         yield population, found.signed
     if found.stopped:
         if found.shortfall:
-            yield population, Concern(found.shortfall, True)
+            yield population, find_unreached_part(found.shortfall, WRONG)
         raise stopped_rounds(found)
     pooled = found.pooled
     start = GuidedStart(found.reason, "" if found.reason else found.shortfall, pooled.pareto_shape)
@@ -238,7 +240,7 @@ def _from_guide(
     except BudgetExhausted:
         raise stopped_rounds(found) from None
 
-    def compare(recycled: Recycled) -> list[Concern]:
+    def compare(recycled: Recycled) -> list[Finding]:
         value, error = recycled.log_evidence, recycled.log_evidence_error
         return check_guide_against_recycling(pooled.log_evidence, pooled.log_evidence_error, value, error)
 

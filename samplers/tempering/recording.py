@@ -6,9 +6,10 @@ import numpy as np
 
 from ..estimates.control_variates import SignedSample
 from ..estimates.importance import EvidenceCheck
+from ..finding import Finding
 from ..judgement.checks import check_evidence
 from ..judgement.clusters import find_clusters
-from ..reports import AnnealingResult, Concern, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
+from ..reports import AnnealingResult, EarlyStop, GuidedRound, GuidedStart, Report, Restart, Stage, warn
 from .population import Density, Population
 
 __all__ = ["Recording"]
@@ -22,7 +23,7 @@ class Recording:
         self._seconds, self._evaluations = time.perf_counter(), density.evaluations
 
     def add(self, population: Population, report: Report) -> None:
-        """Add a report of `samplers.tempering.anneal.anneal`; a concern is a warning as well."""
+        """Add a report of `samplers.tempering.anneal.anneal`; a finding is a warning as well."""
         result = self.result
         if isinstance(report, Stage):
             now = time.perf_counter(), self._density.evaluations
@@ -40,7 +41,7 @@ class Recording:
             result = result._replace(start=report)
         elif isinstance(report, SignedSample):
             result = result._replace(signed=report)
-        elif isinstance(report, Concern):
+        elif isinstance(report, Finding):
             warn(report.message)
             result = result._replace(findings=(*result.findings, report))
         elif isinstance(report, EarlyStop):
@@ -60,6 +61,6 @@ class Recording:
         def has_several_modes() -> bool:
             return len(find_clusters(coords[None], founders)) > 1
 
-        for concern in check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes):
-            warn(concern.message)
-            self.result = self.result._replace(findings=(*self.result.findings, concern))
+        for finding in check_evidence(result.log_evidence_ladder, error, result.check, has_several_modes):
+            warn(finding.message)
+            self.result = self.result._replace(findings=(*self.result.findings, finding))

@@ -34,8 +34,9 @@ from ..estimates.weights import (
     log_mean_weight,
     normalised_weights,
 )
+from ..finding import Finding
 from ..judgement.checks import check_stages
-from ..reports import Concern, Stage, Sweep
+from ..reports import Stage, Sweep
 from ..settings import Settings
 from .early_stop import stop_at
 from .leaders import grow_chains
@@ -53,11 +54,11 @@ def anneal_by_moves(
     schedule: MoveSchedule,
     settings: Settings,
     visited: VisitedPoints,
-) -> Generator[tuple[Population, Stage | Sweep | Concern], None, tuple[Population, list[Stage], float]]:
+) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage], float]]:
     """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to `visited`.
 
     Yields the points as they are now with a report: a `Sweep` when they have been moved once, a `Stage` when a stage is
-    finished, a `Concern` if it is collapsed or stuck. Returns the points at beta = 1, all stages, and the correlation
+    finished, a `Finding` if it is collapsed or stuck. Returns the points at beta = 1, all stages, and the correlation
     of the points with their start after the moves of the last stage. Raises StoppedEarly if the limit of simulations is
     exceeded.
     """
@@ -96,7 +97,7 @@ def anneal_by_moves(
             raise stop_at(population, log_evidence, standard_error, log_evidence - increment)
         stages.append(Stage(beta, ess, moved.acceptance, moved.moves, distinct, increment, standard_error))
         yield population, stages[-1]
-        yield from ((population, concern) for concern in check_stages(stages, n, ndim))
+        yield from ((population, finding) for finding in check_stages(stages, n, ndim))
     return population, stages, moved.correlation
 
 

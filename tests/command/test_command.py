@@ -473,7 +473,9 @@ def test_check_warns_of_what_is_likely_wrong(folder):
     (folder / "oscillator.toml").write_text(text.replace("[prediction]", "[budget]\nmax_simulations = 5\n[prediction]"))
     output = call("check", "oscillator.toml")
     assert "displacement: 291 samples, 10 missing" in output
-    assert "larger than every measured value of displacement" in output and output.count("this noise is") == 1
+    assert (
+        "larger than every measured value of displacement" in output and output.count("The prior expects a noise") == 1
+    )
     assert "will probably end before beta = 1" in output
 
 

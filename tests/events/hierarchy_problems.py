@@ -25,7 +25,7 @@ from fe_likelihoods import (
     Uniform,
     Varying,
 )
-from fe_likelihoods.events.hierarchy_checks import HierarchyChecks
+from fe_likelihoods.events.reweighting import HierarchyChecks
 from fe_likelihoods.priors.distributions import Distribution
 
 __all__ = ["RIGHT", "WRONG", "Problem", "Result", "problem", "solve"]
@@ -33,12 +33,6 @@ __all__ = ["RIGHT", "WRONG", "Problem", "Result", "problem", "solve"]
 RIGHT, WRONG = 0.15, 0.3  # largest error of a right result, smallest of a wrong one [posterior sd]
 _CENTER, _SPREAD = 0.5, 0.3  # standard deviations of the priors of the mean (about 1, or log 1) and of the spread
 _HYPER_SAMPLES = 1500
-_KINDS = {
-    "prior": "the population reaches values",
-    "bound": "reach a bound",
-    "narrow": "the population is narrower",
-    "finite": "the finite samples",
-}
 
 
 class Problem(NamedTuple):
@@ -147,7 +141,7 @@ def solve(given: Problem, seed: int = 0) -> Result:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         checks = Hierarchy(posterior, samples[rng.choice(len(samples), 1000, p=weights)]).checks
-    kinds = tuple(kind for message in checks.messages for kind, words in _KINDS.items() if words in message)
+    kinds = tuple(each.kind for each in checks.findings)
     return Result(
         float(error.max()),
         float(ratio[np.abs(np.log(ratio)).argmax()]),

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import HalfNormal, HierarchicalPosterior, Prior, StoredPosterior, TruncatedNormal, Uniform, Varying
-from fe_likelihoods.events.hierarchy_checks import check_hierarchy
+from fe_likelihoods.events.reweighting import check_hierarchy
 
 WIDE = TruncatedNormal(0.0, 3.0, -np.inf, np.inf)
 LINEAR = Varying(TruncatedNormal(0.0, 1.0, -np.inf, np.inf), HalfNormal(0.5), "linear")
@@ -134,7 +134,7 @@ def shares(n_flat: int, prior: str, rng: np.random.Generator) -> dict[str, Store
     ],
 )
 def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right):
-    """Such tests should add a constant. Where the mixture makes something else of them, an alarm says so."""
+    """Such tests should add a constant; of a flat prior the mixture makes something else."""
     varying, common = {"share": Varying(Uniform(0.0, 1.0), HalfNormal(0.5), scale)}, {"c": LINEAR.location}
     means = np.linspace(0.1, 0.9, 9)
     sd = 0.1 if scale == "linear" else 0.4
@@ -144,30 +144,6 @@ def test_a_varying_parameter_that_tests_say_nothing_about(prior, scale, is_right
     error = np.ptp(posterior.log_marginals(points)[:, 2:].sum(axis=1) - 5.0 * np.log(mass))
     if scale == "logit":  # 0.1 to 0.3 and 0.9 to 1.4 with six seeds; 0.2 to 1.0 on the linear scale
         assert error < 0.4 if is_right else error > 0.6
-    near = np.array([0.3, sd, 0.0]) + 0.02 * np.random.default_rng(1).random((50, 3))
-    said = [each for each in check_hierarchy(posterior, near).messages if "pile up" in each]
-    assert len(said) == (not is_right)
-    if not is_right:
-        assert all(f"share in 'T{k}'" in said[0] for k in (2, 3, 4, 5)) and "'T1'" not in said[0]
-        alone = HierarchicalPosterior(posterior.tests, varying)
-        assert not [each for each in check_hierarchy(alone, near[:, :2]).messages if "pile up" in each]
-
-
-@pytest.mark.parametrize("bounds", [None, (5e-4, 1.0 - 5e-4)])
-def test_flat_shares_are_told_with_bounds_of_the_scale_within_those_of_the_prior(bounds):
-    """Some draws of the prior are beyond them."""
-    low, high = bounds or (0.0, 1.0)
-    varying = {"share": Varying(Uniform(low, high), HalfNormal(0.5), "logit", bounds)}
-    tests = shares(3, "uniform", np.random.default_rng(3))
-    inside = {
-        name: StoredPosterior(each.samples[((each.samples > low) & (each.samples < high))[:, 0]], each.prior)
-        for name, each in tests.items()
-    }
-    posterior = HierarchicalPosterior(inside, varying, common={"c": LINEAR.location})
-    near = np.array([0.3, 0.4, 0.0]) + 0.02 * np.random.default_rng(1).random((50, 3))
-    (said,) = [each for each in check_hierarchy(posterior, near).messages if "pile up" in each]
-    assert all(f"share in 'T{k}'" in said for k in (2, 3, 4)) and "'T1'" not in said
-    assert "johnsonsb(0.0, 0.6, low, high - low) for scale='logit'" in said
 
 
 @pytest.mark.slow
@@ -204,6 +180,3 @@ def test_tests_that_pile_up_at_one_bound(counts, is_right, rng):
     shift = (moments_of(posterior.log_likelihood(points))[0] - mean) / sd
     # -0.28 to -0.57 and -0.12 to -0.02 with five seeds
     assert abs(shift) < 0.2 if is_right else abs(shift) > 0.2
-    near = points[rng.choice(300, 100, p=p)] + 1e-6 * rng.random((100, 3))
-    said = [each for each in check_hierarchy(posterior, near).messages if "pile up" in each]
-    assert len(said) == (not is_right)

@@ -179,7 +179,7 @@ def test_partial_correlations_have_the_lkj_distribution(rng):
 
 
 def test_weights_and_draws_of_a_test_are_its_shrunk_posterior(one, result, grid):
-    assert result.checks.messages == ()
+    assert result.checks.findings == ()
     mean, sd = grid.T
     conditional = 1.0 / (1.0 / 0.04 + 1.0 / sd**2)
     centers = conditional * (DATA[0, 0] / 0.04 + mean / sd**2)
@@ -249,8 +249,7 @@ def test_test_beside_the_population_is_a_warning(one):
     points = np.random.default_rng(1).normal([50.0, 0.3], [0.1, 0.01], (60, 2))
     with pytest.warns(UserWarning, match="or beside it") as found:
         result = Hierarchy(one, points)
-    assert len(found) == len(DATA) + 1
-    assert "give the mean of" in str(found[-1].message)
+    assert len(found) == len(DATA) and "The means have errors of up to" in str(found[-1].message)
     assert result.checks.tests["T0"].effective_samples < 2.0
     assert np.isfinite(result.draw_test("T0", 1)["a"]).all()
 
@@ -263,7 +262,7 @@ def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
     points = np.random.default_rng(1).normal([4.0, 2.0], [0.5, 0.3], (60, 2))
     with pytest.warns(UserWarning, match="test 'T0': the population reaches values.*wider prior of a") as found:
         hierarchy = Hierarchy(posterior, points)
-    assert len(found) == len(hierarchy.checks.messages) == 1
+    assert len(found) == len(hierarchy.checks.findings) == 1
     assert found[0].filename == __file__
     assert "T0" in str(hierarchy.checks)
 
@@ -281,7 +280,7 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
     messages = [str(each.message) for each in found]
     expected = list(checks.tests) if is_named else []
     assert [text.split("'")[1] for text in messages if "is narrower" in text and "Give more" in text] == expected
-    assert len(messages) == len(expected) + is_named
+    assert len(messages) == len(expected)
     change = posterior.log_likelihood(points) - [exact(DATA[:, 0], m, 0.04 + s**2) for m, s in points]
     weights = np.exp(change - change.max())
     shift = abs((weights @ points[:, 0] / weights.sum() - points[:, 0].mean()) / points[:, 0].std())
@@ -298,24 +297,11 @@ def test_right_results_have_no_warning(seed):
     assert found.kinds == ()
 
 
-@pytest.mark.parametrize(("seed", "kind"), [(366, "prior"), (382, "finite"), (401, "narrow"), (403, "bound")])
-def test_wrong_results_have_a_warning(seed, kind):
+@pytest.mark.parametrize("seed", [366, 382, 401])
+def test_wrong_results_have_a_warning(seed):
     found = solve(problem(seed), seed)
     assert found.error > WRONG
-    assert kind in found.kinds
-
-
-def test_samples_at_a_bound_below_the_population_are_a_warning(rng):
-    tests = {
-        name: StoredPosterior(rng.uniform(low, 2.0, (150, 1)), Prior({"a": Uniform(0.0, 2.0)}))
-        for name, low in (("free", 0.0), ("informed", 1.9))
-    }
-    tests["inside"] = StoredPosterior(1.0 + 0.1 * rng.standard_normal((150, 1)), Prior({"a": Uniform(0.0, 2.0)}))
-    posterior = HierarchicalPosterior(tests, {"a": LINEAR})
-    points = np.random.default_rng(1).normal([1.5, 1.0], [0.1, 0.1], (60, 2))
-    with pytest.warns(UserWarning, match="reach a bound of its prior") as found:
-        Hierarchy(posterior, points)
-    assert [str(each.message).split("'")[1] for each in found] == ["free", "informed"]
+    assert found.kinds
 
 
 # ------------------------------------------------------------------ interface

@@ -18,7 +18,6 @@ from fe_likelihoods import (
     Varying,
     leave_one_out,
 )
-from fe_likelihoods.events.hierarchy_checks import check_hierarchy
 from samplers.estimates.pareto import smoothed_weights
 
 module = importlib.import_module("fe_likelihoods.events.leave_one_out")
@@ -255,14 +254,6 @@ def test_bounds_that_other_priors_have_too_are_no_reason_for_a_new_run():
 @pytest.mark.parametrize(("inwards", "found"), [(4e-15, {}), (1e-9, {}), (1e-7, {"c": [-5.0 + 1e-7, 5.0 - 1e-7]})])
 def test_bounds_that_differ_by_round_off_leave_nothing_out(inwards, found):
     assert module.ends_within(with_common(-5.0 + inwards, 5.0 - inwards), "C") == found
-
-
-@pytest.mark.parametrize(("bounds", "is_told"), [((1.0, 5.0), True), ((-5.0, 5.0), False), ((-3.0, 4.0), False)])
-def test_a_prior_that_ends_within_the_population_of_a_common_parameter_is_told(bounds, is_told):
-    posterior = with_common(*bounds)
-    samples = drawn(posterior, 200) + 1e-6 * np.random.default_rng(2).random((200, 3))
-    said = [each for each in check_hierarchy(posterior, samples).messages if "common parameter c ends at 1" in each]
-    assert len(said) == is_told and all("test 'C'" in each for each in said)
 
 
 def test_the_density_without_a_test_is_known_where_the_test_is_impossible():

@@ -34,7 +34,7 @@ def _check(log_evidence, error=0.05, effective=200.0, shape=0.3):
 )
 def test_two_evidences_that_differ_are_reported_without_condemning_the_posterior(check, doubted):
     found = check_evidence(-10.0, 0.1, check, lambda: True)
-    assert [doubt.grave for doubt in found] == [False] * doubted
+    assert [each.severity for each in found] == ["care"] * doubted
     for doubt in found:
         own = doubt.message.find("log_prior is a function of your own")
         assert own < 0 or doubt.message.index("more walkers") < own
@@ -47,7 +47,7 @@ def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
     (doubt,) = check_evidence(-10.0, 0.1, _check(value, error=0.4, effective=12.0, shape=0.9), lambda: False)
     assert "heavy tails" in doubt.message
     assert doubt.message.index("more walkers or more moves") < doubt.message.index("log_prior")
-    assert doubt.grave
+    assert doubt.severity == "wrong"
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_unreliable_check_that_differs_by_more_than_one_is_grave(value):
 )
 def test_a_large_error_of_the_evidence_is_reported(error, check, several_modes, doubted):
     found = check_evidence(-10.0, error, check, lambda: several_modes)
-    assert [(doubt.grave, "standard error of the log-evidence" in doubt.message) for doubt in found] == [
+    assert [(doubt.severity == "wrong", "standard error of the log-evidence" in doubt.message) for doubt in found] == [
         (False, True)
     ] * doubted
 
@@ -76,8 +76,8 @@ def test_evidence_that_moves_lose_after_recycling_is_reported(recycled, check_of
     """Both estimates of recycling must exceed that of the moves: that of the check, or else that of the stages."""
     stages = [Stage(1.0, 250.0, 0.3, 5, 300, -10.0 if not reliable else -9.3, 0.05)]
     check = _check(-10.0) if reliable else _check(-9.3, shape=1.2)
-    concerns = check_fallback(stages, check, recycled, 0.05, _check(check_of_it))
-    assert [concern.grave for concern in concerns] == [True] * lost
+    found = check_fallback(stages, check, recycled, 0.05, _check(check_of_it))
+    assert [each.severity for each in found] == ["wrong"] * lost
 
 
 @pytest.mark.parametrize(("Sampler", "walkers", "seed"), [(TMCMCSampler, 500, 1), (SMCSampler, 250, 80)])
@@ -175,8 +175,8 @@ INF = np.inf
 def test_one_log_likelihood_at_all_first_points_is_doubted(values):
     """Beside -inf, it may be the likelihood of uniform errors."""
     (doubt,) = check_likelihood(np.array(values) + LOG_PRIOR, LOG_PRIOR)
-    assert f"the log-likelihood is {values[0]:.6g} at all" in doubt.message
-    assert doubt.grave == np.isfinite(values).all()
+    assert f"The log-likelihood is {values[0]:.6g} at all" in doubt.message
+    assert (doubt.severity == "wrong") == np.isfinite(values).all()
 
 
 def test_real_structure_on_a_large_offset_is_no_reason_to_doubt():

@@ -58,7 +58,7 @@ def test_a_run_that_is_piled_up_against_failures_says_so(way, options):
     assert near.borders and near.known == (way != "inf")
     assert (sampler.verdict.status == "not usable") == near.known
     said = sampler.verdict.reasons if near.known else sampler.verdict.unknown
-    (reason,) = (r for r in said if "in the region of the final points" in r)
+    (reason,) = (r for r in said if "n the region of the final points" in r)
     assert f"{near.failed} of {near.evaluated} evaluated points" in reason
     # the points cannot tell: mean and standard deviation are those of half a Gaussian
     samples = sampler.get_chain(flat=True)[:, 0]

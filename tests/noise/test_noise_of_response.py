@@ -3,7 +3,6 @@ reports."""
 
 import pickle
 import warnings
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -28,6 +27,7 @@ from fe_likelihoods import (
     residual_checks,
 )
 from fe_likelihoods.cache.comparison import largest_difference
+from fe_likelihoods.checks.screening import check_gaps
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.emulation.target import ResponseTarget
 
@@ -242,11 +242,9 @@ def test_gaps_and_times_of_channels(kind, rng):
     values = response([1.0]) + rng.standard_normal((2, N)) * [[0.1], [0.001]]
     gap, parameters = values.copy(), PARAMETERS[kind]
     gap[0, 100:130] = np.nan
-    named = (
-        pytest.warns(UserWarning, match=r"within the channels .* \(\d+%\)") if kind == "modulated" else nullcontext()
-    )
-    with named:
-        likelihood = likelihood_of(kind, gap)
+    likelihood = likelihood_of(kind, gap)
+    named = check_gaps(likelihood.noise)
+    assert len(named) == (kind == "modulated") and all("within the channels" in each.text for each in named)
     simulated = response([1.2])
     if kind == "modulated":  # the envelope is that of the samples that are there
         there = np.where(np.isnan(gap), np.nan, simulated)
@@ -463,15 +461,13 @@ def test_a_gap_makes_the_share_that_of_another_level_and_is_named(rng):
         if gap:
             values[0, strong] = np.nan
         likelihood = FELikelihood(MODEL, Measurements(CHANNELS, DT, values), noise)
+        assert [each.kind for each in check_gaps(likelihood.noise)] == ["Gaps in the data"] * (gap and local == 0.0)
         grid = np.column_stack([np.ones(400), shares, np.full(400, 0.2)])
         return shares[np.argmax(likelihood(grid))]
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        whole = [found(0.0, False) for _ in range(20)]
-        nearby = [found(1.0, True) for _ in range(20)]
-    with pytest.warns(UserWarning, match="local=1"):
-        beside = [found(0.0, True) for _ in range(20)]
+    whole = [found(0.0, False) for _ in range(20)]
+    nearby = [found(1.0, True) for _ in range(20)]
+    beside = [found(0.0, True) for _ in range(20)]
 
     def differs(sample):
         return abs(np.mean(sample) - 0.2) / (np.std(sample, ddof=1) / np.sqrt(20))

@@ -1,7 +1,5 @@
 """Noise that is a share of the response level: likelihood, level of a response, predictions under other motions."""
 
-import warnings
-
 import numpy as np
 import pytest
 
@@ -95,14 +93,8 @@ def test_a_prediction_of_a_weaker_motion_has_the_noise_of_the_weaker_response(re
         posterior.prior.subset(["stiffness", "damping"]).distributions
         | {f"sigma_{c.name}": HalfNormal(1.0) for c in model.channels},
     )
-    with pytest.warns(UserWarning, match=r"another level .*acceleration \(0\.1 times\).*shares of the response"):
-        fixed = propagate(absolute, np.tile([1.0, 1.0, 0.3, 0.2], (300, 1)), record=record.scale(0.1), **options)
+    fixed = propagate(absolute, np.tile([1.0, 1.0, 0.3, 0.2], (300, 1)), record=record.scale(0.1), **options)
     np.testing.assert_allclose(fixed.sd[0], 0.3, rtol=1e-9)
-    with warnings.catch_warnings():  # neither noise that scales, nor a similar level
-        warnings.simplefilter("error")
-        # without the warning of other peaks, which is for any noise
-        propagate(posterior, samples[:20], record=record.scale(0.1), calibrated=(), **options)
-        propagate(absolute, samples[:20], record=record.scale(0.5), calibrated=(), **options)
 
 
 def test_draws_have_the_stated_standard_deviations_whatever_the_batch_and_the_channels(record):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import plot_histories, plot_record, plot_residuals, plot_response, plot_spectrum
+from fe_likelihoods.checks.fit import describe_residuals
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.residuals import autocorrelation, residual_checks
@@ -137,4 +138,4 @@ def test_residuals(rng):
         assert f"{checks.n_effective[k]:.0f} effective samples of 300" in lags.get_title()
         np.testing.assert_allclose(quantiles.lines[1].get_ydata(), np.sort(factor * residuals[k]))
         assert all(shows(axes, axes.lines) for axes in (history, lags, quantiles))
-        assert history.get_title(loc="left").replace("\n", " ") == checks.sentences[k]
+        assert history.get_title(loc="left").replace("\n", " ") == describe_residuals(checks)[k]

@@ -111,10 +111,10 @@ def test_residual_drifts_of_a_structure_that_still_moves_are_said(rng):
             with warnings.catch_warnings(record=True) as told:
                 warnings.simplefilter("always")
                 found = damage(propagate(model, np.ones((5, 1)), quantity=measures, progress=False), [], noise=False)
-            remarks = [remark for remark in found.remarks if "still moves in the last 2 s" in remark]
-            assert len(remarks) == len(told) == (moves and settle < 1.0)
-            assert all("u after EQ1 (+- " in remark and "u after EQ2 (+- " in remark for remark in remarks)
-            assert ("CAUTION" in str(found)) == bool(remarks)
+            texts = [each.text for each in found.findings if "still moves in the last 2 s" in each.text]
+            assert len(texts) == len(told) == (moves and settle < 1.0)
+            assert all("u after EQ1 (+- " in text and "u after EQ2 (+- " in text for text in texts)
+            assert ("CAUTION" in str(found)) == bool(texts)
 
 
 def test_period_and_damping_are_those_of_a_linear_oscillator():

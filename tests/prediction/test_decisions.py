@@ -302,7 +302,7 @@ def test_fragility_has_the_error_of_the_model_where_it_is_known(wave, rng):
     gaussian = with_noise(wave, "si")
     with pytest.warns(UserWarning, match="ratios=EventRatios"):
         fragility(gaussian, samples, *arguments, progress=False)
-    with pytest.warns(UserWarning, match="keeps its level in SI units"):
+    with pytest.warns(UserWarning, match="predicted peaks are outside"):
         far = [wave.record.scale(k) for k in (4.0, 5.0)]
         fragility(gaussian, samples, far, *arguments[1:], noise=True, progress=False)
 

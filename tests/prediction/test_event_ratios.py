@@ -155,7 +155,7 @@ def test_what_cannot_be_used_is_refused():
 
 
 def test_equal_ratios_without_a_prior_are_said_and_have_no_nan():
-    with pytest.warns(UserWarning, match="EventRatios: the ratios of 2 events are equal.*prior_events="):
+    with pytest.warns(UserWarning, match="The ratios of 2 events are equal.*prior_events="):
         equal = EventRatios([1.0, 1.0], prior_events=0)
     with pytest.warns(UserWarning, match="are equal"):  # one of two quantities
         EventRatios([[1.0, 1.1], [1.0, 1.2]], prior_events=0)

@@ -45,7 +45,7 @@ def test_a_linear_quantity_is_known_from_thirty_simulations(sample):
     np.testing.assert_allclose(found.quantiles, slopes @ MEAN + sd * np.array([-1.645, 1.645]), atol=0.06 * sd)
     assert found.n_samples == 30 and len(found.values) == 30
     assert found.effective_sample_size > 5_000  # the sample has 10 000 points
-    assert "30 samples" in str(found) and not found.remarks
+    assert "30 samples" in str(found) and not found.findings
 
 
 @pytest.mark.slow
@@ -71,13 +71,13 @@ def test_a_quantity_without_structure_gains_nothing_and_says_so(sample):
     scores = np.array([(each.mean - 0.5) / each.standard_error for each in found])
     assert np.mean(np.abs(scores) < 2.0) >= 0.85
     assert np.median([each.effective_sample_size for each in found]) < 40
-    assert all(any("unexplained" in remark for remark in each.remarks) for each in found)
+    assert all(any("unexplained" in one.text for one in each.findings) for each in found)
 
 
-def test_equal_values_have_a_remark(sample):
+def test_equal_values_have_a_finding(sample):
     found = propagate_few(model_of(lambda theta: max(theta[0], 5.0)), sample, quantity=first, progress=False)
     assert found.mean == pytest.approx(5.0) and found.effective_sample_size == 30
-    assert any("values of a number are equal" in each for each in found.remarks)
+    assert any("values of a number are equal" in each.text for each in found.findings)
 
 
 def test_several_numbers_and_failures(sample):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Events, FELikelihood, GaussianNoise, LinearOscillator, Measurements, Record, propagate
+from fe_likelihoods.checks.screening import check_gaps
 
 DT, WINDOW = 0.02, 0.6
 SAMPLES = np.array([[1.0, 1.0, 0.1, 0.1]] * 10)
@@ -24,20 +25,12 @@ def noise_for(model, **options):
     return GaussianNoise(model.channels, level="response", window=WINDOW, sensor=deviations, **options)
 
 
-def with_gap(**options) -> tuple[FELikelihood, list[str]]:
-    """A likelihood with 2 s missing in the strong part, and its warnings of gaps."""
+def with_gap(**options) -> FELikelihood:
+    """A likelihood with 2 s missing in the strong part."""
     model = LinearOscillator(quake(1))
     values = model.simulate([1.0, 1.0])
     values[:, 200:300] = np.nan
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        likelihood = FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model, **options))
-    assert all(each.filename == __file__ for each in caught)
-    return likelihood, gaps_of(caught)
-
-
-def gaps_of(caught) -> list[str]:
-    return [str(each.message) for each in caught if "samples are missing" in str(each.message)]
+    return FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model, **options))
 
 
 def test_pauses_of_the_calibration_are_no_gap_of_another_record():
@@ -49,7 +42,7 @@ def test_pauses_of_the_calibration_are_no_gap_of_another_record():
         warnings.simplefilter("error")
         likelihood = FELikelihood(model, single, noise_for(model))
         found = propagate(likelihood, SAMPLES, record=quake(3), **OPTIONS)
-    assert found.remarks == ()
+    assert found.findings == ()
 
 
 @pytest.mark.parametrize(("missing", "n_told"), [(slice(None), 0), (slice(200, 300), 1)], ids=["whole", "gap"])
@@ -61,28 +54,23 @@ def test_an_event_without_a_channel_is_no_gap(event, missing, n_told):
     values = model.simulate([1.0, 1.0])
     there = events.windows[event].samples
     values[0, np.arange(values.shape[1])[there][missing]] = np.nan
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model))
-    told = gaps_of(caught)
-    assert len(told) == n_told and all(repr(model.channels[0].name) in each for each in told)
+    found = check_gaps(FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model)).noise)
+    assert len(found) == n_told and all(model.channels[0].name in each.text for each in found)
 
 
 @pytest.mark.parametrize("of_events", [False, True])
-def test_a_gap_of_the_calibration_is_warned_of_once_and_a_remark_of_every_prediction(of_events):
-    likelihood, (told,) = with_gap()
+def test_a_gap_of_the_calibration_is_a_finding_of_every_prediction_with_noise(of_events):
+    likelihood = with_gap()
     record = Events([quake(4, 4.0), quake(5, 4.0)], rest=6.0) if of_events else quake(3)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with pytest.warns(UserWarning, match="Samples are missing"):
         found = [propagate(likelihood, SAMPLES, record=record, **OPTIONS) for _ in range(2)]
-    assert not gaps_of(caught)
-    assert found[0].remarks == found[1].remarks == (told,) and f"CAUTION: {told}" in str(found[0])
-    assert propagate(likelihood, SAMPLES, record=record, **OPTIONS | {"noise": False}).remarks == ()
+    assert found[0].findings == found[1].findings == tuple(check_gaps(likelihood.noise))
+    assert "CAUTION: Gaps in the data" in str(found[0])
+    assert propagate(likelihood, SAMPLES, record=record, **OPTIONS | {"noise": False}).findings == ()
 
 
-def test_the_envelope_alone_has_no_remark_on_gaps():
-    likelihood, told = with_gap(local=1.0)
-    assert not told and propagate(likelihood, SAMPLES, record=quake(3), **OPTIONS).remarks == ()
+def test_the_envelope_alone_has_no_finding_on_gaps():
+    assert propagate(with_gap(local=1.0), SAMPLES, record=quake(3), **OPTIONS).findings == ()
 
 
 @pytest.mark.parametrize(

@@ -297,13 +297,13 @@ def test_a_harmonic_near_resonance_widens_the_interval_and_other_motions_hardly(
     with pytest.warns(UserWarning, match=r"hardly speaks for this motion.*peak of top \d\.\d times"):
         near = predict_new_event(hierarchy, posteriors, np.sin(4.0 * np.pi * time), **options)
     ratios, predicted = near.spread.ratios, near.spread.values[0]
-    assert ratios.widening > 1.4 and "nearly a harmonic" in near.remarks[-1]
+    assert ratios.widening > 1.4 and "nearly a harmonic" in near.findings[-1].text
     with pytest.warns(UserWarning, match="as a harmonic has"):
         far = predict_new_event(hierarchy, posteriors, np.sin(np.pi * time), **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         alike = predict_new_event(hierarchy, posteriors, np.random.default_rng(9).standard_normal(1000), **options)
-    assert far.spread.ratios.widening == alike.spread.ratios.widening == 1.0 and alike.remarks == ()
+    assert far.spread.ratios.widening == alike.spread.ratios.widening == 1.0 and alike.findings == ()
     model, rng = Resonant(np.sin(4.0 * np.pi * time)), np.random.default_rng(5)
     truths = np.exp([0.03, 0.4] * rng.standard_normal((100, 2)))  # of new events under the harmonic
     values = np.array([np.abs(model.simulate(truth)).max() for truth in truths])

@@ -18,6 +18,7 @@ from fe_likelihoods import (
     peak,
     propagate,
 )
+from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.prediction.fragility_curve import fit_fragility
 from fe_likelihoods.prediction.held_out import HeldOutScore, HeldOutScores
 from fe_likelihoods.prediction.score_tables import score_values
@@ -61,10 +62,10 @@ def test_averages_of_models(predicted):
         assert cells(text, 2)[:2] == ["displacement", "cm"] and float(cells(text, 2)[-1]) < 1e-9
     assert float(cells(text, 2)[3]) == pytest.approx(1e2 * predicted["peak"].sd, rel=5e-3)
     assert "CAUTION" not in text
-    far, peak = ("the response is far away", "few samples"), predicted["peak"]
-    parts = {"a": peak, "b": replace(peak, remarks=far[:1]), "c": replace(peak, remarks=far)}
+    far, peak = tuple(Finding(text, CARE, "Why.") for text in ("Far away", "Few samples")), predicted["peak"]
+    parts = {"a": peak, "b": replace(peak, findings=far[:1]), "c": replace(peak, findings=far)}
     average = average_predictions(parts, {"a": 0.2, "b": 0.3, "c": 0.5})
-    assert average.remarks == far  # each once
+    assert average.findings == far  # each once
     assert str(average).splitlines()[-2:] == [f"CAUTION: {each}" for each in far]
 
 

@@ -15,10 +15,10 @@ from fe_likelihoods import (
     Posterior,
     TruncatedNormal,
 )
+from fe_likelihoods.checks.compared import fit_data_sets
+from fe_likelihoods.checks.run import read_run
 from fe_likelihoods.noise.draws import sample_noise
 from fe_likelihoods.reporting.contents import residual_sentences
-from fe_likelihoods.reporting.fit_results import fit_data_sets
-from fe_likelihoods.reporting.run import read_run
 from samplers import SMCSampler, compare_models, to_arviz
 
 N, DT, TOP = 400, 0.02, (Channel("top", "acceleration", "m/s2"),)
@@ -90,7 +90,7 @@ def test_reports_check_whitened_residuals_and_arviz_has_the_blocks(name, rng):
     checks = fits.fits[0].channels[0].checks
     assert checks.standard_deviation[0] == pytest.approx(1.0, abs=0.15)  # of whitened residuals
     assert checks.white[0] > 1e-3 and checks.normal[0] > 1e-3
-    expected = "whitened residuals) is white" if name == "bands" else "hite: "
+    expected = "whitened residuals): White" if name == "bands" else "White: "
     assert expected in residual_sentences(fits)[0]
     # the residuals themselves are neither
     plain = posterior.likelihood.residuals(sampler.get_chain(flat=True).mean(axis=0))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Measurements, SimulationFailed, peak, propagate, report
+from fe_likelihoods.checks.finding import CARE, Finding
 from fe_likelihoods.reporting.other_events import describe_event
 from tests.reporting.report_page import read_page
 from tests.reporting.test_report import vibrating
@@ -49,7 +50,7 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
         in page.text
     )
     assert "There are no measurements to compare with" in page.text
-    assert "less than half of the strong part of top" in page.notes["larger"] and "same" not in page.notes
+    assert "less than half of the strong part of top" in page.notes["larger: The measurements are outside of the band"]
     histories = next(table for table in page.tables if table[0][-1] == "In its strong part")[1:]
     scores = events["larger"]["histories"].score(measured["larger"])
     assert [row[0] for row in histories] == ["same", "larger"]
@@ -65,14 +66,15 @@ def test_events_have_tables_sentences_and_figures(vibrating, tmp_path):
 def test_what_speaks_against_an_event_is_said(vibrating, tmp_path):
     sampler, posterior = vibrating
     few = predicted(vibrating, n=8, noise=True)
-    told = describe_event("few", few, posterior.likelihood.measurements).remarks
-    assert any("do not have their level" in remark for remark in told)
-    remarked = {name: replace(each, remarks=("the peaks are far away",)) for name, each in few.items()}
-    assert describe_event("far", remarked, None).remarks == ("the peaks are far away",)  # once for all quantities
+    told = describe_event("few", few, posterior.likelihood.measurements).findings
+    assert any("do not have their level" in each.text for each in told)
+    far = (Finding("Far", CARE, "The peaks are far away."),)
+    found = {name: replace(each, findings=far) for name, each in few.items()}
+    assert describe_event("far", found, None).findings == far  # once for all quantities
     silent = describe_event("silent", predicted(vibrating), posterior.likelihood.measurements)
     assert "A band without noise is that of the response" in silent.sentence
     other = describe_event("other", few, Measurements(posterior.likelihood.measurements.channels, 0.02, [[0.0] * 9]))
-    assert any(remark.startswith("no scores: ") for remark in other.remarks)
+    assert any(each.text.startswith("No scores: ") for each in other.findings)
 
 
 @pytest.mark.slow
@@ -88,7 +90,7 @@ def test_what_is_not_known_of_an_event_is_said_in_words(vibrating, tmp_path, mon
     assert "nan" not in told.sentence and "In the strong part, no sample of top can be compared." in told.sentence
     failed = SimulationFailed("nothing to predict from, all 3 samples failed (3: unstable)")
     page = read_page(report(sampler, posterior, out=tmp_path / "report.html", events={"strong": failed}))
-    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["strong"]
+    assert "strong: It could not be predicted." in page.text and "3: unstable" in page.notes["strong: No prediction"]
 
 
 def test_what_are_no_predictions_of_events_is_refused(vibrating, tmp_path):

@@ -33,14 +33,14 @@ from fe_likelihoods import (
     propagate,
     report,
 )
-from fe_likelihoods.reporting.advice import advise, check_result, judge
+from fe_likelihoods.checks.compared import fit_data_sets
+from fe_likelihoods.checks.failed_simulations import Failures
+from fe_likelihoods.checks.finding import Finding, judge
+from fe_likelihoods.checks.result import check_result, check_run
+from fe_likelihoods.checks.run import _errors, read_run
+from fe_likelihoods.checks.table import moments_of, parameter_rows
 from fe_likelihoods.reporting.contents import evidence, residual_sentences
-from fe_likelihoods.reporting.failed_simulations import Failures
-from fe_likelihoods.reporting.fit_results import fit_data_sets
 from fe_likelihoods.reporting.report import _like
-from fe_likelihoods.reporting.run import _errors, read_run
-from fe_likelihoods.reporting.table import moments_of, parameter_rows
-from fe_likelihoods.signals.data_faults import Finding
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, ladder_table, plot_run
 from samplers.estimates.control_variates import SignedSample
 from tests.contract.targets import Gaussian
@@ -190,14 +190,14 @@ def test_correlated_errors_and_edges_are_named():
     posterior = vibration("measured", 0.02 * slow[None, : len(TIME)], prior)
     finished = read_run(run(posterior), posterior)
     fits, rows = fit_data_sets(finished), parameter_rows(finished)
-    notes = {note.name: note for note in advise(finished, rows, fits, Failures((), 0, 100)).findings}
-    assert "top" in notes["The errors are not white noise"].sentence
-    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].sentence
+    notes = {note.kind: note for note in check_run(finished, rows, fits, Failures((), 0, 100)).findings}
+    assert "top" in notes["The errors are correlated"].text
+    assert f"{ODD} at 1.08" in notes["At the edge of the prior"].text
     assert "Synthetic data" not in notes and "Simulations failed" not in notes
     assert "are worth" in residual_sentences(fits)[0]
-    notes = {note.name: note for note in advise(finished, rows, fits, Failures((), 30, 100)).findings}
-    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].sentence
-    assert notes["Simulations failed"].weight == "care"
+    notes = {note.kind: note for note in check_run(finished, rows, fits, Failures((), 30, 100)).findings}
+    assert "30 of 100 simulations failed (30 %)" in notes["Simulations failed"].text
+    assert notes["Simulations failed"].severity == "care"
 
 
 def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
@@ -205,10 +205,10 @@ def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
     rows, fits = parameter_rows(finished), fit_data_sets(finished)
     (one,) = fits.compared
     turned = fits._replace(compared=(one._replace(responses=-one.responses),))
-    notes = {n.name: n for n in advise(finished, rows, turned, Failures((), 0, 1)).findings}
-    assert "opposite signs: top" in notes["A sign may be wrong"].sentence
-    assert "top" in notes["The model does not follow the measurements"].sentence
-    quiet = {n.name for n in advise(finished, rows, fits, Failures((), 0, 1)).findings}
+    notes = {n.kind: n for n in check_run(finished, rows, turned, Failures((), 0, 1)).findings}
+    assert "opposite signs: top" in notes["A sign may be wrong"].text
+    assert "top" in notes["The model does not follow the measurements"].text
+    quiet = {n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings}
     assert not quiet & {"A sign may be wrong", "The model does not follow the measurements"}
 
 
@@ -217,15 +217,17 @@ def test_parameters_that_the_data_leave_alone_and_those_that_they_move_far_are_n
     finished = read_run(sampler, posterior)
     rows = parameter_rows(finished)
     fits = fit_data_sets(finished)
-    assert "True values are missed" not in {n.name for n in advise(finished, rows, fits, Failures((), 0, 1)).findings}
+    assert "True values are missed" not in {
+        n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings
+    }
     missed = [row._replace(truth=row.high + row.sd) for row in rows]
-    notes = {note.name: note for note in advise(finished, missed, fits, Failures((), 0, 1)).findings}
-    assert "sigma_top [mm]" in notes["True values are missed"].sentence
+    notes = {note.kind: note for note in check_run(finished, missed, fits, Failures((), 0, 1)).findings}
+    assert "sigma_top [mm]" in notes["True values are missed"].text
     moved = [row._replace(prior_mean=row.mean - 4.0 * row.sd, prior_sd=1.01 * row.sd) for row in rows]
-    notes = {note.name: note for note in advise(finished, moved, fits, Failures((), 0, 100)).findings}
+    notes = {note.kind: note for note in check_run(finished, moved, fits, Failures((), 0, 100)).findings}
     for title in ("Not informed by the data", "Far from the prior"):
-        assert "sigma_top [mm]" in notes[title].sentence and title not in {
-            n.name for n in advise(finished, rows, fits, Failures((), 0, 1)).findings
+        assert "sigma_top [mm]" in notes[title].text and title not in {
+            n.kind for n in check_run(finished, rows, fits, Failures((), 0, 1)).findings
         }
 
 
@@ -364,12 +366,12 @@ def test_identical_samples_have_an_effective_sample_size_without_a_warning():
 
 
 def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrating):
-    remark, care, wrong = (Finding(f"{w.capitalize()} thing", w, "Why.", "What.") for w in ("remark", "care", "wrong"))
+    remark, care, wrong = (Finding(f"{w.capitalize()} thing", w, "Why.", "What.") for w in ("note", "care", "wrong"))
     assert str(judge([])) == "Use." and str(judge([remark])) == "Use."
     assert str(judge([remark, care])) == "Use with care: care thing."
     assert str(judge([care, remark, wrong, wrong])) == "Do not use: wrong thing; wrong thing."
     assert judge([remark, wrong, care]).findings == (wrong, care, remark)
     sampler, posterior = vibrating
     judgement = check_result(sampler, posterior)
-    assert {finding.name for finding in judgement.findings} >= set(page.notes) - {"True values are missed"}
+    assert {finding.kind for finding in judgement.findings} >= set(page.notes) - {"True values are missed"}
     assert str(judgement) in page.text and judgement.status in page.text

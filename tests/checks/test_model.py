@@ -1,4 +1,4 @@
-"""A rehearsal names models that are not repeatable, do not read their motion, or are too coarse for their data."""
+"""`check_model` names models that are not repeatable, do not read their motion, or are too coarse for their data."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,14 @@ from fe_likelihoods import (
     Record,
     SimulationFailed,
     TruncatedNormal,
+    check_model,
     check_result,
-    rehearse,
 )
+from fe_likelihoods.checks.rehearsal import refuse_chance
+from fe_likelihoods.checks.steps import halve_steps
+from fe_likelihoods.information.identifiability import of_mode
 from fe_likelihoods.problems import table_motion
-from fe_likelihoods.reporting.rehearsal import refuse_chance
+from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
 
 MOTION = table_motion().trim(0.0, 4.0).resample(0.01)
@@ -49,8 +52,8 @@ def posterior_of(function, noise=0.02):
     return Posterior(FELikelihood(model, measured), prior | {"sigma_top": HalfNormal(0.01)})
 
 
-def names(rehearsal):
-    return [finding.name for finding in rehearsal.findings if finding.weight != "remark"]
+def names(checked):
+    return [finding.kind for finding in checked.findings if finding.severity != "note"]
 
 
 def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
@@ -60,19 +63,19 @@ def test_a_good_model_has_no_findings_and_its_simulations_are_counted():
         made.append(1)
         return central_differences(theta, record, 8)
 
-    found = rehearse(posterior_of(fine), {"weaker": MOTION.scale(0.5)})
+    found = check_model(posterior_of(fine), {"weaker": MOTION.scale(0.5)})
     assert names(found) == [] and found.simulations == len(made) and found.seconds > 0.0
     assert found.searched > 3.0
-    assert str(found.identifiability).startswith("These data determine stiffness and damping (")
+    assert str(of_mode(*found.best_fit)).startswith("These data determine stiffness and damping (")
 
 
 @pytest.mark.parametrize(("noise", "weight"), [(0.003, "care"), pytest.param(1.5, None, marks=pytest.mark.slow)])
 def test_a_coarse_step_is_compared_with_the_width_that_the_data_will_give(noise, weight):
     """The same step is too coarse for precise data, and fine enough for noisy ones."""
-    found = [each for each in rehearse(posterior_of(central_differences, noise)).findings if "coarse" in each.name]
-    assert [each.weight for each in found] == ([weight] if weight else [])
+    found = [each for each in check_model(posterior_of(central_differences, noise)).findings if "coarse" in each.kind]
+    assert [each.severity for each in found] == ([weight] if weight else [])
     if found:
-        assert "stiffness by" in found[0].sentence and "the time step" in found[0].sentence
+        assert "stiffness by" in found[0].text and "the time step" in found[0].text
 
 
 @pytest.mark.slow
@@ -94,10 +97,10 @@ def test_a_coarse_step_limits_the_result_of_a_run(joint):
 
     judgement, made = judged(central_differences)
     assert judgement.status == "use with care"
-    found = next(each for each in judgement.findings if each.name == "The model is too coarse for its data")
-    assert "stiffness by" in found.sentence and made <= 2 * (100 + 2 + 4)
-    fine, _ = judged(lambda theta, record: central_differences(theta, record, 6))
-    assert not [each for each in fine.findings if "coarse" in each.name or "tested" in each.name], str(fine)
+    found = next(each for each in judgement.findings if each.kind == "The model is too coarse for its data")
+    assert "stiffness by" in found.text and made <= 2 * (100 + 2 + 4)
+    fine, _ = judged(lambda theta, record: central_differences(theta, record, 8))
+    assert not [each for each in fine.findings if "coarse" in each.kind or "tested" in each.kind], str(fine)
 
 
 @pytest.mark.slow
@@ -107,8 +110,8 @@ def test_a_motion_that_is_not_read_is_named_after_a_run_as_well():
     sampler = SMCSampler(40, posterior.ndim, posterior, vectorize=True, seed=1, guide=posterior.guide())
     sampler.run_mcmc(None, 1)
     judgement = check_result(sampler)
-    assert judgement.status == "do not use" and judgement.findings[0].name == "The motion changes nothing"
-    assert not [each for each in judgement.findings if "finer" in each.name or "tested" in each.name]
+    assert judgement.status == "do not use" and judgement.findings[0].kind == "The motion changes nothing"
+    assert not [each for each in judgement.findings if "finer" in each.kind or "tested" in each.kind]
 
 
 def test_a_model_without_a_step_that_could_be_halved_is_told():
@@ -117,14 +120,14 @@ def test_a_model_without_a_step_that_could_be_halved_is_told():
     )
     fitted = posterior_of(lambda theta, record: central_differences(theta, record, 8))
     posterior = Posterior(FELikelihood(model, fitted.likelihood.measurements), fitted.prior)
-    found = rehearse(posterior).findings
-    assert [(each.name, each.weight) for each in found] == [("The time step was not tested", "remark")]
+    found = check_model(posterior).findings
+    assert [(each.kind, each.severity) for each in found] == [("Step and mesh were not tested", "note")]
 
 
 def test_a_random_model_is_named_and_a_run_refuses_it():
     rng = np.random.default_rng(3)
     posterior = posterior_of(lambda theta, record: central_differences(theta, record) * (1.0 + 0.02 * rng.normal()))
-    assert names(rehearse(posterior)) == ["The model is not repeatable"]
+    assert names(check_model(posterior)) == ["The model is not repeatable"]
     with pytest.raises(ValueError, match="not repeatable: Two simulations of the same parameters differ by"):
         refuse_chance(posterior)
     refuse_chance(posterior_of(central_differences))
@@ -132,14 +135,16 @@ def test_a_random_model_is_named_and_a_run_refuses_it():
 
 def test_a_motion_that_is_not_read_is_named():
     unread = posterior_of(lambda theta, record: central_differences(theta, MOTION)[:, : record.n_steps])
-    assert names(rehearse(unread, {"double": MOTION.scale(2.0)})) == ["The motion changes nothing"]
+    assert names(check_model(unread, {"double": MOTION.scale(2.0)})) == ["The motion changes nothing"]
 
     def amplitude_alone(theta, record):
         scale = np.abs(record.acceleration).max() / np.abs(MOTION.acceleration).max()
         return scale * central_differences(theta, MOTION)
 
     found = names(
-        rehearse(posterior_of(amplitude_alone), {"shifted": Record("shifted", 0.01, np.roll(MOTION.acceleration, 40))})
+        check_model(
+            posterior_of(amplitude_alone), {"shifted": Record("shifted", 0.01, np.roll(MOTION.acceleration, 40))}
+        )
     )
     assert "The response does not follow the motion" in found and "An event changes nothing" in found
 
@@ -150,14 +155,36 @@ def test_failures_and_sizes_are_named():
             raise SimulationFailed("no convergence")
         return central_differences(theta, record, 4)
 
-    assert "A stronger motion fails" in names(rehearse(posterior_of(weak)))
+    assert "A stronger motion fails" in names(check_model(posterior_of(weak)))
     model = LinearOscillator(MOTION.scale(9.80665), 0.4)  # a motion in g, taken for m/s², and then for g again
     values = LinearOscillator(MOTION, 0.4).simulate(TRUE)
     prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.3)}
     likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values))
     prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
-    found = names(rehearse(Posterior(likelihood, prior)))
+    found = names(check_model(Posterior(likelihood, prior)))
     assert "A size is not plausible" in found and "A unit may be wrong" in found
     failing = posterior_of(lambda theta, record: 1 / 0)
     with pytest.raises(ValueError, match="mean of the prior has failed"):
-        rehearse(failing)
+        check_model(failing)
+
+
+def test_a_model_that_keeps_its_own_step_is_not_tested_which_is_a_note():
+    """It returns as many samples as before under half the step, or integrates with steps of its own."""
+
+    def own_samples(theta, record):
+        return central_differences(theta, MOTION, 8)[:, : MOTION.n_steps] * (np.abs(record.acceleration).max() / PEAK)
+
+    def own_steps(theta, record):
+        fine = record.resample(0.00125) if record.dt > 0.002 else record
+        found = central_differences(theta, fine)
+        return found[:, :: round(record.dt / 0.00125)][:, : record.n_steps]
+
+    PEAK = np.abs(MOTION.acceleration).max()
+    for function in (own_samples, own_steps):
+        posterior = posterior_of(function)
+        point, sd = np.array([1.1, 0.9, 0.001]), np.array([0.01, 0.01, 1e-4])
+        test = halve_steps(posterior, point, sd, simulate_batch)
+        assert [(each.kind, each.severity) for each in test.findings] == [("Step and mesh were not tested", "note")]
+        assert test.tests["Time step"].startswith("not tested: ")
+    tested = halve_steps(posterior_of(central_differences), point, sd, simulate_batch)
+    assert tested.tests == {"Time step": "the time step was halved at the fit"}

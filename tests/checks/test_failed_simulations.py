@@ -15,12 +15,12 @@ from fe_likelihoods import (
     TruncatedNormal,
     report,
 )
+from fe_likelihoods.checks.compared import fit_data_sets
+from fe_likelihoods.checks.failed_simulations import failures
+from fe_likelihoods.checks.run import read_run
+from fe_likelihoods.checks.table import parameter_rows
 from fe_likelihoods.reporting.contents import summary_sentences
-from fe_likelihoods.reporting.failed_simulations import failures
-from fe_likelihoods.reporting.fit_results import fit_data_sets
 from fe_likelihoods.reporting.report import gather
-from fe_likelihoods.reporting.run import read_run
-from fe_likelihoods.reporting.table import parameter_rows
 from samplers import SMCSampler
 from tests.contract.targets import Gaussian
 from tests.reporting.report_page import read_page
@@ -51,7 +51,7 @@ def run(posterior, walkers=60, steps=4, **options):
 
 
 def notes_of(contents):
-    return {note.name: note for note in contents.advice}
+    return {note.kind: note for note in contents.findings}
 
 
 def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
@@ -62,16 +62,16 @@ def test_a_run_that_is_piled_up_against_failures_is_not_called_good():
     assert row.reason == "no convergence" and row.where.startswith("at stiffness above 1.1 (100 %")
     assert contents.failures.count == posterior.report()["failure_count"]
     note = notes_of(contents)["Failures border on the samples"]
-    assert note.weight == "wrong" and contents.status == "do not use"
+    assert note.severity == "wrong" and contents.status == "do not use"
     # one place decides: the sampler
     assert sampler.verdict.status == "not usable" and contents.failures.near == sampler.verdict.near_failures
     assert (
-        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} simulated points failed"
-        in note.sentence
+        f"{sampler.verdict.near_failures.failed} of {sampler.verdict.near_failures.evaluated} evaluated points failed"
+        in note.text
     )
     assert contents.summary[0].startswith("Do not use: ") and "failures border on the samples" in contents.summary[0]
     bad = int((sampler.prior_draws[:, 0] > 1.1).sum())
-    assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].sentence
+    assert f"{bad} of 60 draws of the prior" in notes_of(contents)["Simulations failed"].text
 
 
 def test_reasons_that_differ_in_their_numbers_are_one_row(tmp_path):
@@ -149,7 +149,7 @@ def test_a_run_without_a_result_leads_to_no_conclusion():
     contents = gather(finished, {})
     titles = notes_of(contents).keys()
     assert titles.isdisjoint(
-        {"True values are missed", "Not informed by the data", "The errors are not white noise", "Far from the prior"}
+        {"True values are missed", "Not informed by the data", "The errors are correlated", "Far from the prior"}
     )
     assert "Nothing can be said about the parameters yet" in contents.summary[2] and not contents.residuals
     assert "The chain is short" in titles

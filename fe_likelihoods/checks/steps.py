@@ -11,71 +11,97 @@ Simulations that a sampler has made cannot show this error, because all of them 
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..likelihood.posterior import Posterior
-from ..signals.data_faults import CARE, REMARK, WRONG, Finding
 from ..signals.events import motions_of
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch
+from .finding import CARE, NOTE, WRONG, Finding
 
 __all__ = [
-    "find_discretisation_error",
-    "find_unread_motion",
+    "NOTHING",
+    "UNREAD",
+    "StepTest",
+    "check_stronger_motion",
     "motions_to_replace",
+    "not_tested",
     "relative_difference",
     "simulations_of_the_test",
+    "halve_steps",
     "under",
 ]
 
-SHIFT, LARGE_SHIFT = 0.5, 2.0  # of a parameter by half a step, in standard deviations: a caution, and a wrong result
-LARGE_SHARE = 0.1  # of the prior's standard deviation, below which no shift makes a result wrong
-
-NOTHING = 1e-6  # difference of two responses, relative to their norm, up to which a motion changes nothing
+# Shift of a parameter by half a step, in standard deviations, that limits a result: the mean square of its error is
+# then 1.25 times the variance (0.5^2), and 5 times where the result is wrong (2^2).
+SHIFT, LARGE_SHIFT = 0.5, 2.0
+LARGE_SHARE = 0.1  # of the prior's standard deviation: no shift that is smaller makes a result wrong
+NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
 UNREAD = "Check that the model reads the motion that it is given, and not one file that is always the same."
+STEP, MESH = "Time step", "Mesh"
 
 Simulate = Callable[[Any, np.ndarray], SimulationBatch]
 """Simulates a model at points (n, n_parameters)."""
 
 
-def find_discretisation_error(
-    posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate
-) -> list[Finding]:
+class StepTest(NamedTuple):
+    """What halving step and mesh has shown: findings, and what was tested, by name."""
+
+    findings: list[Finding]
+    tests: dict[str, str]
+
+
+def not_tested(why: str) -> StepTest:
+    """No test of step and mesh, and the reason."""
+    action = "Halve step and mesh in the model at the posterior mean, and compare the responses with the noise."
+    text = f"{why[0].upper()}{why[1:]}."
+    return StepTest([Finding("Step and mesh were not tested", NOTE, text, action)], {STEP: f"not tested: {why}"})
+
+
+def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate) -> StepTest:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
-    ``simulate(model, points)`` returns a `SimulationBatch`. No finding where step and mesh are fine enough.
+    ``simulate(model, points)`` returns a `SimulationBatch`. A model that fails with half a step, or whose response does
+    not change, keeps a step of its own, which is not tested.
     """
     prior_sd = np.array([row[3] for row in posterior.prior.table()[1]])
-    parts, changes = [], {}
+    parts, changes, left = [], {}, {STEP: "the model takes neither a motion nor a step that could be halved"}
     for likelihood, columns in posterior.likelihood.parts():
         n = len(likelihood.model.parameter_names)
         theta, at = point[columns], columns[:n]
         batch = simulate(likelihood.model, theta[:n] + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return [Finding("Step and mesh were not tested", REMARK, f"A simulation failed: {reason}.")]
+            return not_tested(f"a simulation failed ({reason})")
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
         residuals = likelihood.residuals_of(response, theta)
-        sigma = np.sqrt(np.nanmean(np.square(residuals), axis=1))
-        parts.append((at, response, slopes, sigma))
-        for what, model, every in _finer(likelihood.model):
+        parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))
+        for what, name, model, every in _finer(likelihood.model):
+            left.pop(name, None)
             fine = simulate(model, theta[None, :n])
             if fine.reasons[0]:
-                text = f"With half of {what} the simulation at the fit fails: {fine.reasons[0]}."
-                return [Finding("A finer model fails", CARE, text, "Check the convergence of the model.")]
-            changes.setdefault(what, {})[len(parts) - 1] = fine.response[0][:, ::every] - response
-    if not changes:
-        text = "The model takes neither a motion nor a step that could be halved."
-        return [Finding("The time step was not tested", REMARK, text, "Halve it in the model, and compare.")]
-    found = [_compare(what, change, parts, sd, prior_sd, posterior.parameter_names) for what, change in changes.items()]
-    return [each for each in found if each is not None]
+                left[name] = f"with half of {what} the simulation fails ({fine.reasons[0]})"
+                continue
+            change = fine.response[0][:, ::every] - response
+            if relative_difference(change, response) <= NOTHING:
+                left[name] = f"half of {what} changes nothing: the model keeps a step of its own, or its step is exact"
+            changes.setdefault((name, what), {})[len(parts) - 1] = change
+    found = []
+    for (_, what), change in changes.items():
+        found += _compare(what, change, parts, sd, prior_sd, posterior.parameter_names)
+    if left:
+        text = "; ".join(f"{name.lower()}: {why}" for name, why in left.items())
+        action = "Halve it in the model, and compare the responses with the noise."
+        found.append(Finding("Step and mesh were not tested", NOTE, f"{text[0].upper()}{text[1:]}.", action))
+    halved = {name: f"{what} was halved at the fit" for name, what in changes}
+    return StepTest(found, halved | {name: f"not tested: {why}" for name, why in left.items()})
 
 
-def find_unread_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
-    """Finding if twice the motion fails, or does not change the response (n_channels, n_steps) at `theta`.
+def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, simulate: Simulate) -> list[Finding]:
+    """Whether twice the motion fails, or does not change the response (n_channels, n_steps) at `theta`.
 
-    A model without a motion that can be replaced has none; `simulate` as for `find_discretisation_error`.
+    A model without a motion that can be replaced has no finding; `simulate` as for `halve_steps`.
     """
     if not motions_to_replace(model):
         return []
@@ -96,7 +122,7 @@ def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:
 
 
 def simulations_of_the_test(posterior: Posterior) -> int:
-    """Number of simulations that `find_discretisation_error` makes."""
+    """Number of simulations that `halve_steps` makes."""
     models = [likelihood.model for likelihood, _ in posterior.likelihood.parts()]
     return sum(1 + len(model.parameter_names) + len(list(_finer(model))) for model in models)
 
@@ -118,25 +144,25 @@ def under(model: Any, change: Callable[[Record], Record]) -> Any:
     return model.with_record(motions if getattr(model, "supports", ()) else motions[0])
 
 
-def _finer(model: Any) -> Iterator[tuple[str, Any, int]]:
-    """What is halved, the finer model, and its response samples per sample of the model."""
+def _finer(model: Any) -> Iterator[tuple[str, str, Any, int]]:
+    """What is halved, its name, the finer model, and its response samples per sample of the model."""
     names = {each.name for each in fields(model)} if is_dataclass(model) else set()
     if "substeps" in names:
-        yield "the integration step", replace(model, substeps=2 * model.substeps), 1
+        yield "the integration step", STEP, replace(model, substeps=2 * model.substeps), 1
     elif "step" in names and hasattr(model, "integration_step"):
-        yield "the integration step", replace(model, step=0.5 * model.integration_step), 1
+        yield "the integration step", STEP, replace(model, step=0.5 * model.integration_step), 1
     elif motions_to_replace(model):
         finer = under(model, lambda each: each.resample(0.5 * each.dt))
         if (finer.n_steps - 1) == 2 * (model.n_steps - 1):
-            yield "the time step", finer, 2
+            yield "the time step", STEP, finer, 2
     if "mesh" in names and isinstance(model.mesh, int):
-        yield "the fibers of the section", replace(model, mesh=2 * model.mesh), 1
+        yield "the fibers of the section", MESH, replace(model, mesh=2 * model.mesh), 1
 
 
 def _compare(
     what: str, change: dict[int, np.ndarray], parts: list, sd: np.ndarray, prior_sd: np.ndarray, names: tuple[str, ...]
-) -> Finding | None:
-    """The finding about one refinement, whose changes of the response are given by data set; None if it is small."""
+) -> list[Finding]:
+    """The finding about one refinement, whose changes of the response are given by data set; none if it is small."""
     ndim = len(sd)
     widths = sd / prior_sd
     precision = np.diag(np.square(np.where(np.isfinite(widths), widths, 0.0)))
@@ -148,15 +174,16 @@ def _compare(
         if i in change:
             pull[at] += jacobian @ (change[i][used] / sigma[used, None]).ravel()
             squares += np.square(change[i]).sum(), np.square(response).sum()
-    shift = np.linalg.lstsq(precision, pull)[0]
-    large = np.abs(shift) >= SHIFT
-    if not large.any():
-        return None
-    moved = ", ".join(f"{names[i]} by {abs(shift[i]):.2g}" for i in np.flatnonzero(large))
+    shift = np.abs(np.linalg.lstsq(precision, pull)[0])
+    numbers = {names[i]: float(shift[i]) for i in np.flatnonzero(shift >= SHIFT)}
+    if not numbers:
+        return []
     text = (
-        f"Half of {what} changes the response by {100.0 * np.sqrt(squares[0] / squares[1]):.2g} %, which moves {moved} "
-        "posterior standard deviations: intervals that are narrower than the error of the model miss the truth."
+        f"Half of {what} changes the response by {100.0 * np.sqrt(squares[0] / squares[1]):.2g} %, which moves "
+        f"{', '.join(f'{name} by {by:.2g}' for name, by in numbers.items())} posterior standard deviations: intervals "
+        "that are narrower than the error of the model miss the truth."
     )
-    wrong = (np.abs(shift) > LARGE_SHIFT) & ~(np.abs(shift) * widths < LARGE_SHARE)
-    weight = WRONG if wrong.any() else CARE
-    return Finding("The model is too coarse for its data", weight, text, f"Halve {what} until this is small.")
+    wrong = (shift > LARGE_SHIFT) & ~(shift * widths < LARGE_SHARE)
+    severity = WRONG if wrong.any() else CARE
+    action = f"Halve {what} until this is small."
+    return [Finding("The model is too coarse for its data", severity, text, action, numbers)]

@@ -14,14 +14,12 @@ from samplers.judgement.failures import NearFailures, failures_near
 
 from ..likelihood.failure_log import reason_without_numbers
 from ..likelihood.likelihood import FELikelihood
+from .finding import SMALL_PROBABILITY
 from .run import FinishedRun
 
 __all__ = ["Failure", "Failures", "failures"]
 
 KEPT_APART = 3  # reasons that differ in their numbers only: these may be codes, such as signal numbers
-FEWEST_TO_COMPARE = 5  # failures, below which their place is not a pattern
-CLEAR_SEPARATION = 0.5  # Kolmogorov-Smirnov distance between the failed and the successful points
-UNLIKELY = 0.01  # probability of such a distance by chance
 
 
 class Failure(NamedTuple):
@@ -40,7 +38,7 @@ class Failures(NamedTuple):
     rows: tuple[Failure, ...]  # by reason, the most frequent first
     count: int
     attempts: int
-    remark: str = ""  # what is not known about them
+    unknown: str = ""  # what is not known about them
     prior_failed: int = 0  # of the prior draws with which the run began; 0 if not known
     prior_draws: int = 0
     near: NearFailures = NearFailures(0, 0)  # among the posterior samples, and all evaluated points there
@@ -48,7 +46,7 @@ class Failures(NamedTuple):
     @property
     def sentence(self) -> str:
         """The sentence for a report without a table of failures."""
-        return self.remark or "No simulation failed."
+        return self.unknown or "No simulation failed."
 
 
 class _Source(NamedTuple):
@@ -68,13 +66,13 @@ def failures(run: FinishedRun) -> Failures:
     found = [(part, _of_likelihood(run, part, columns)) for part, columns in run.likelihood.parts()]
     sources = [source for _, source in found]
     attempts = sum(each.simulations for part, _ in found for each in (part, *part.shortened))
-    remark = ""
+    unknown = ""
     if not all(_was_here(run, part, source) for part, source in found):
-        remark = (
+        unknown = (
             "Not known: the simulations of this run were made in another process, or are no longer in memory, and "
             "failures are counted in the process that simulates."
         )
-    return _joined(run, sources, attempts, remark)
+    return _joined(run, sources, attempts, unknown)
 
 
 def _of_likelihood(run: FinishedRun, likelihood: FELikelihood, columns: np.ndarray) -> _Source:
@@ -100,14 +98,16 @@ def _of_function(run: FinishedRun) -> Failures:
     draws = np.empty((0, ndim)) if sampler.prior_draws is None else sampler.prior_draws
     draws = draws[~_are_among(draws, failed)]
     source = _Source(np.arange(ndim), failed, reasons, np.concatenate([draws, run.samples]), counts)
-    remark = (
+    unknown = (
         "No evaluation raised an exception or returned NaN. Whether a value of -inf stands for a failed simulation is "
         "not known."
     )
-    return _joined(run, [source], sampler.evaluations, remark, sampler.failure_count)
+    return _joined(run, [source], sampler.evaluations, unknown, sampler.failure_count)
 
 
-def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str, count: int | None = None) -> Failures:
+def _joined(
+    run: FinishedRun, sources: list[_Source], attempts: int, unknown: str, count: int | None = None
+) -> Failures:
     rows = [row for source in sources for row in _by_reason(run, source)]
     rows.sort(key=lambda row: -row.count)
     count = sum(row.count for row in rows) if count is None else count
@@ -117,7 +117,7 @@ def _joined(run: FinishedRun, sources: list[_Source], attempts: int, remark: str
     if draws is not None and (count <= sum(len(source.failed) for source in sources)):
         bad = np.any([_are_among(draws[:, each.columns], each.failed) for each in sources], axis=0)
         prior = (int(bad.sum()), len(draws))
-    return Failures(tuple(rows), count, max(attempts, count), remark, *prior, _near_the_samples(run, sources))
+    return Failures(tuple(rows), count, max(attempts, count), unknown, *prior, _near_the_samples(run, sources))
 
 
 def _by_reason(run: FinishedRun, source: _Source) -> list[Failure]:
@@ -172,12 +172,10 @@ def _near_the_samples(run: FinishedRun, sources: list[_Source]) -> NearFailures:
 def _where(run: FinishedRun, source: _Source, failed: np.ndarray) -> str:
     """The parameter whose values tell these failures from the successes best, by the Kolmogorov-Smirnov distance."""
     succeeded = np.concatenate([source.succeeded, run.samples[:, source.columns]])
-    if len(failed) < FEWEST_TO_COMPARE:
-        return "too few to see a pattern"
     tests = [ks_2samp(failed[:, i], succeeded[:, i]) for i in range(failed.shape[1])]
     i = int(np.argmax([test.statistic for test in tests]))
     test, name = tests[i], run.names[source.columns[i]]
-    if test.statistic < CLEAR_SEPARATION or test.pvalue > UNLIKELY:
+    if test.pvalue > SMALL_PROBABILITY:
         return "no single parameter tells them from the successful ones"
     place = test.statistic_location
     low = test.statistic_sign > 0  # the failures have the smaller values

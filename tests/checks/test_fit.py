@@ -21,9 +21,10 @@ from fe_likelihoods import (
     Uniform,
     check_fit,
 )
+from fe_likelihoods.checks.compared import compare, draws_to_compare
+from fe_likelihoods.checks.fit import check_responses
 from fe_likelihoods.emulation.modes import find_modes
 from fe_likelihoods.problems import table_motion
-from fe_likelihoods.reporting.fit_gate import compare, draws_to_compare, fit_gate
 from samplers import SMCSampler
 
 MOTION = table_motion().trim(0.0, 8.0).resample(0.02)
@@ -63,7 +64,7 @@ def sampled(model, measured, prior, **noise):
 
 
 def names(findings):
-    return {finding.name for finding in findings if finding.weight == "wrong"}
+    return {finding.kind for finding in findings if finding.severity == "wrong"}
 
 
 @pytest.mark.slow
@@ -74,8 +75,8 @@ def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
     posterior, samples = sampled(model, replace(measured, values=measured.values / 9.80665), DECK, **noise)
     for found in (check_fit(posterior, samples), check_fit(posterior)):
         assert names(found) >= {"A unit may be wrong"}
-        (unit,) = (each for each in found if each.name == "A unit may be wrong")
-        assert "m/s2 and g" in unit.sentence
+        (unit,) = (each for each in found if each.kind == "A unit may be wrong")
+        assert "m/s2 and g" in unit.text
     good, samples = sampled(model, measured, DECK, **noise)
     assert not names(check_fit(good, samples)) and not check_fit(good)
 
@@ -83,15 +84,15 @@ def test_a_unit_that_is_wrong_is_named_after_the_run_and_before_it(noise):
 def test_a_late_recorder_of_an_input_is_named():
     model, measured = deck(late=5)
     posterior, samples = sampled(model, measured, DECK)
-    (found,) = (each for each in check_fit(posterior, samples) if each.weight == "wrong")
-    assert found.name == "Clocks of input recorders may differ"
-    assert "of south and north seems to be 0.1 s later" in found.sentence
+    (found,) = (each for each in check_fit(posterior, samples) if each.severity == "wrong")
+    assert found.kind == "Clocks of input recorders may differ"
+    assert "of south and north seems to be 0.1 s later" in found.text
 
 
 def test_parameters_at_bounds_and_far_from_their_prior_are_named():
     model, measured = deck()
     posterior, samples = sampled(model, measured, DECK | {"frequency": Uniform(2.0, 3.0)})
-    assert "At the edge of the prior" in {each.name for each in check_fit(posterior, samples)}
+    assert "At the edge of the prior" in {each.kind for each in check_fit(posterior, samples)}
 
 
 @pytest.mark.slow
@@ -105,7 +106,7 @@ def test_the_fault_of_one_event_is_named_with_it():
     likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values))
     prior |= {name: HalfNormal(1.0) for name in likelihood.noise.parameter_names}
     (found,) = check_fit(Posterior(likelihood, prior))
-    assert "(EQ2)" in found.sentence and " m and mm" in found.sentence
+    assert "(EQ2)" in found.text and " m and mm" in found.text
 
 
 def test_a_fit_that_another_response_beats_is_named():
@@ -113,11 +114,11 @@ def test_a_fit_that_another_response_beats_is_named():
     points = draws_to_compare(posterior)[:20]
     good = np.array([1.05, 1.0, *points[0, 2:]])
     (compared,) = compare(posterior.likelihood, np.stack([good, *points]), True)
-    assert fit_gate([compared]) == ()
+    assert check_responses([compared]) == []
     poor = np.array([1.9, 0.4, *points[0, 2:]])
     (compared,) = compare(posterior.likelihood, np.stack([poor, good, *points]), True)
-    found = {each.name: each for each in fit_gate([compared])}
-    assert "its error (RRMSE) is 5" in found["The fit is not the best one known"].sentence
+    found = {each.kind: each for each in check_responses([compared])}
+    assert "its error (RRMSE) is 5" in found["The fit is not the best one known"].text
     assert "The model does not follow the measurements" in found and not {
         "A unit may be wrong",
         "Clocks may differ",
@@ -135,7 +136,7 @@ def test_what_a_guide_has_simulated_is_compared_as_well():
     (of_supports,) = compare(posterior.likelihood, draws_to_compare(posterior)[:3], False)
     assert set(of_supports.parts) == {"column", "south", "north"}
     np.testing.assert_allclose(sum(of_supports.parts.values()), of_supports.responses, atol=1e-12)
-    assert fit_gate((of_supports, compared)) == ()
+    assert check_responses((of_supports, compared)) == []
 
 
 def _oscillation():
@@ -164,4 +165,4 @@ def test_the_lag_of_a_recorder_is_found_as_a_parameter():
     found = dict(zip(posterior.parameter_names, mean, strict=True))
     assert found["lag_1"] == pytest.approx(0.1, abs=0.005) and found["lag_2"] == pytest.approx(0.1, abs=0.005)
     assert (np.abs(mean[:3] - [4.0, 0.08, 0.6]) < 4.0 * sd[:3] + 0.01).all()
-    assert not [each for each in check_fit(posterior, samples) if each.weight == "wrong"]
+    assert not [each for each in check_fit(posterior, samples) if each.severity == "wrong"]

@@ -1,0 +1,305 @@
+"""Responses beside the measurements of each data set and event: before and after an update, and draws of the prior.
+
+Responses are taken from the caches of the likelihood where they are there; the likelihood counts the others.
+"""
+
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..cache.memory import distinct_keys
+from ..cache.verification import StaleCache
+from ..likelihood.failure_log import TooManyFailures
+from ..likelihood.likelihood import FELikelihood
+from ..likelihood.posterior import Posterior
+from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.marginal import sampled_noise
+from ..noise.residuals import ResidualChecks, innovations, residual_checks
+from ..signals.channels import Channel, Measurements
+from ..signals.error_measures import relative_errors
+from ..signals.events import find_events
+from ..simulation.faults import ChangedModel
+from ..simulation.model import simulate_batch
+from .run import FinishedRun
+
+__all__ = ["ChannelFit", "Compared", "Fit", "Fits", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
+
+logger = logging.getLogger(__name__)
+
+MOST_DRAWS, FEWEST_DRAWS = 100, 5  # of the prior
+SECONDS = 10.0  # of simulations of these draws
+MOST_STORED = 100  # responses of a guide that are compared in addition
+
+
+class Window(NamedTuple):
+    """The part of the measurements that belongs to one event."""
+
+    title: str  # name of the data set and of the event; empty if there is one only
+    measurements: Measurements
+    inside: np.ndarray  # (n_channels, n_samples) bool, among the samples of all events
+    rows: np.ndarray  # channels that are kept
+    columns: np.ndarray  # samples that are kept
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """The part of values (..., n_channels, n_samples), NaN outside of the event."""
+        return np.where(self.inside, values, np.nan)[..., self.rows[:, None], self.columns]
+
+
+class Compared(NamedTuple):
+    """Measurements of one event, and responses to compare with them: the fit, draws of the prior, others of a guide."""
+
+    title: str  # name of the data set and of the event; empty if there is one only
+    measurements: Measurements
+    responses: np.ndarray  # (n, n_channels, n_samples) at the times of the samples [SI]
+    fitted: bool  # whether the first response is the fit, not one more draw of the prior
+    parts: dict[str, np.ndarray]  # shares of each support's motion in the responses of a linear structure
+    draws: slice = slice(None)  # the responses that are draws of the prior
+
+
+class ChannelFit(NamedTuple):
+    """How well one channel of one event is reproduced, by relative root mean square errors [-]."""
+
+    channel: Channel
+    samples: int  # that are compared
+    before: float  # NaN where there is no simulation
+    after: float  # NaN where there is no simulation
+    checks: ResidualChecks | None  # of the residuals after the update; None where they cannot be checked
+    assumed: float = np.nan  # independent samples that the noise assumes
+
+
+class Fit(NamedTuple):
+    """Measurements and responses of one data set or event.
+
+    The noise says how the likelihood treats successive errors: as independent ("white"), with a correlation
+    ("autoregressive") or with a spectrum ("bands"; the innovations or the whitened residuals are checked then), or as
+    fewer independent ones ("effective"). Where its level depends on the response, residuals are divided by it before
+    the checks.
+    """
+
+    title: str  # name of the data set and of the event; empty if there is one only
+    measurements: Measurements
+    responses: dict[str, np.ndarray]  # (n_channels, n_samples) [SI], before and after the update
+    residuals: np.ndarray | None  # (n_channels, n_samples) [SI], measured minus simulated
+    channels: tuple[ChannelFit, ...]
+    noise: str
+
+
+class Fits(NamedTuple):
+    """The fits of all data sets and events; `before` and `after` say in words what the two responses are."""
+
+    fits: tuple[Fit, ...]
+    before: str
+    after: str
+    simulations: int  # run for the fits
+    failures: tuple[str, ...]  # simulations that failed, in words
+    compared: tuple[Compared, ...] = ()  # what `check_responses` judges
+
+
+def data_sets_of(posterior: Any) -> list[tuple[str, FELikelihood, np.ndarray]]:
+    """Name (empty if there is one only), likelihood and columns of the parameters of each data set."""
+    keys = getattr(posterior.likelihood, "likelihoods", {"": None})
+    return [(key, *part) for key, part in zip(keys, posterior.likelihood.parts(), strict=True)]
+
+
+def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:
+    """The measurements of a likelihood, event by event; `key` is the name of the data set."""
+    measured, events = likelihood.measurements, find_events(likelihood.model)
+    spans = [(key, -np.inf, np.inf)]
+    if events is not None and len(events.windows) > 1:
+        spans = [(f"{key}, {each.name}" if key else each.name, each.start, each.end) for each in events.windows]
+    times = np.stack([measured.times(channel.name) for channel in measured.channels])
+    half, found = 0.5 * np.array(measured.steps)[:, None], []
+    for title, start, end in spans:
+        inside = (times > start - half) & (times < end + half)
+        rows = np.flatnonzero((inside & np.isfinite(measured.values)).any(axis=1))
+        columns = np.flatnonzero(inside[rows].any(axis=0))
+        if not len(rows):
+            continue
+        part = Measurements(
+            tuple(measured.channels[row] for row in rows),
+            tuple(measured.steps[row] for row in rows),
+            np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
+            measured.description,
+            tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
+        )
+        found.append(Window(title, part, inside, rows, columns))
+    return found
+
+
+def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.ndarray:
+    """Draws of the prior (n, ndim), always the same ones: 100, or fewer if these take longer than ten seconds.
+
+    A simulation takes `seconds`; by default the mean of those that the posterior has made, or else of the second draw.
+    """
+    try:
+        draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
+    except NotImplementedError:  # a prior without draws
+        return np.empty((0, posterior.ndim))
+    if seconds is None:
+        report = posterior.report()
+        cached = all(
+            part.simulator.are_stored(draws[:, columns][:, : part.simulator.n_structural]).all()
+            for part, columns in posterior.likelihood.parts()
+        )
+        if cached or report["simulations"]:
+            seconds = 0.0 if cached else report["seconds"] / report["simulations"]
+        else:
+            for row in draws[:2]:  # the first one may compile
+                start = time.perf_counter()
+                posterior.likelihood.log_likelihood(row)
+                seconds = time.perf_counter() - start
+    return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
+
+
+def compare(likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "") -> tuple[Compared, ...]:
+    """Responses at points (n, ndim), and those that a guide has left in memory, beside the measurements of each event.
+
+    The points are draws of the prior, after the fit if it is `fitted`. Failed simulations are left out; the result is
+    empty if all fail, or the first one fails and is the fit. `key` is the name of the data set.
+    """
+    n = len(likelihood.model.parameter_names)
+    try:
+        batch = likelihood.simulate(points[:, :n])
+    except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
+        logger.warning("the fit is compared with no draws of the prior: %s", error)
+        return ()
+    good = [i for i, reason in enumerate(batch.reasons) if not reason]
+    if not good or (fitted and good[0]):
+        return ()
+    pairs = [(points[i], batch.response[i]) for i in good]
+    parts = _support_parts(likelihood.model, points[good, :n], batch.response[good])
+    if not parts:
+        known = likelihood.simulator.response_memory.responses(likelihood.model.fingerprint)
+        simulated = set(distinct_keys(points[:, :n])[0])
+        others = [each for each in known if each not in simulated]
+        for place in np.unique(np.linspace(0, len(others) - 1, min(len(others), MOST_STORED)).astype(int)):
+            pairs.append((np.concatenate([np.frombuffer(others[place]), points[0, n:]]), known[others[place]]))
+    measured = likelihood.measurements.values
+
+    def at_samples(theta: np.ndarray, response: np.ndarray) -> np.ndarray:
+        # unknown time shifts are those of the fit
+        return measured - likelihood.residuals_of(response, np.concatenate([theta[:n], points[0, n:]]))
+
+    responses = np.stack([at_samples(*pair) for pair in pairs])
+    sampled = {
+        name: np.stack([at_samples(theta, one) for (theta, _), one in zip(pairs, each, strict=True)])
+        for name, each in parts.items()
+    }
+    return tuple(
+        Compared(
+            window.title,
+            window.measurements,
+            window.of(responses),
+            fitted,
+            {name: window.of(each) for name, each in sampled.items()},
+            slice(int(fitted), len(good)),
+        )
+        for window in windows_of(likelihood, key)
+    )
+
+
+def _support_parts(model: Any, thetas: np.ndarray, responses: np.ndarray) -> dict[str, np.ndarray]:
+    """Contribution of each support to the responses (n, n_channels, n_steps); empty unless they add up to these."""
+    supports = getattr(model, "supports", ())
+    if len(supports) < 2 or not hasattr(model, "with_record"):
+        return {}
+    names = [support.name or f"support {k + 1}" for k, support in enumerate(supports)]
+    names = [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
+    found = {}
+    for k, name in enumerate(names):
+        alone = model.with_record([each if i == k else each.scale(0.0) for i, each in enumerate(supports)])
+        found[name] = simulate_batch(alone, thetas).response
+    rest = np.abs(responses - sum(found.values())).max()
+    return found if rest <= 1e-6 * np.abs(responses).max() else {}
+
+
+def fit_data_sets(run: FinishedRun) -> Fits:
+    """Simulate two points of each data set, before and after the update, and compare them with the measurements.
+
+    The result is empty for a posterior without a likelihood of this package.
+    """
+    if run.likelihood is None:
+        return Fits((), "", "", 0, ())
+    start, start_name = _before(run)
+    names = f"before: {start_name}", f"after: {run.centre_name}"
+    fits, failures, compared, simulations = [], [], [], run.likelihood.simulations
+    for key, likelihood, columns in data_sets_of(run):
+        point, n = run.centre[columns], len(likelihood.model.parameter_names)
+        points = np.stack([np.concatenate([start[columns][:n], point[n:]]), point])  # with the time shifts of the fit
+        batch = likelihood.simulate(points[:, :n])
+        residuals = {}
+        for name, theta, response, reason in zip(names, points, batch.response, batch.reasons, strict=True):
+            if reason:
+                failures.append(f"{key}{', ' if key else ''}{name}: the simulation failed ({reason})")
+            else:
+                residuals[name] = likelihood.residuals_of(response, theta)
+        fits += _split(likelihood, key, residuals, names, dict(zip(likelihood.parameter_names, point, strict=True)))
+        draws = draws_to_compare(run.posterior)[:, columns]
+        compared += compare(likelihood, np.stack([point, *draws]), True, key)
+    made = run.likelihood.simulations - simulations
+    return Fits(tuple(fits), *names, made, tuple(failures), tuple(compared))
+
+
+def _before(run: FinishedRun) -> tuple[np.ndarray, str]:
+    """The point (ndim,) that represents the knowledge before the update, and its name."""
+    fast = set(run.posterior.fast_parameters)
+    nominal = np.array([parameter.nominal for parameter in run.parameters])
+    structural = [i for i in range(len(nominal)) if i not in fast]
+    if np.isfinite(nominal[structural]).all():
+        return nominal, "nominal values"
+    try:
+        median, name = run.posterior.prior_transform(np.full(len(nominal), 0.5)), "median of the prior"
+    except ValueError:  # a joint prior without such a map
+        median, name = np.median(run.posterior.sample_prior(1000, 0), axis=0), "median of draws of the prior"
+    known = np.isfinite(nominal)
+    return np.where(known, nominal, median), name if not known.any() else f"nominal values, where known, and {name}"
+
+
+def _split(
+    likelihood: FELikelihood,
+    key: str,
+    residuals: dict[str, np.ndarray],
+    names: tuple[str, str],
+    values: Mapping[str, float],
+) -> list[Fit]:
+    """One fit per event, from residuals (n_channels, n_samples) by name; `values` are the parameters of the fit."""
+    sampled = sampled_noise(likelihood.noise)
+    fewer = getattr(sampled, "effective_samples", None)
+    noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
+    noise = "bands" if getattr(sampled, "n_bands", 1) > 1 else noise
+    noise = "effective" if fewer is not None else noise
+    checked = residuals.get(names[1])
+    if checked is not None and hasattr(sampled, "whitened"):
+        parameters = np.array([values[name] for name in sampled.parameter_names])
+        checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
+    fits = []
+    for window in windows_of(likelihood, key):
+        part = window.measurements
+        own = {name: window.of(each) for name, each in residuals.items()}
+        errors = {name: relative_errors(each, part.values) for name, each in own.items()}
+        missing, channels = np.full(part.n_channels, np.nan), []
+        left = None if checked is None else window.of(checked)
+        for row, channel in enumerate(part.channels):
+            rho = values.get(f"rho_{channel.name}") if noise == "autoregressive" else 0.0
+            checks = None if left is None else _check(left[[row]], rho)
+            samples = int(np.isfinite(part.values[row]).sum())
+            assumed = samples if fewer is None else min(np.broadcast_to(fewer, part.n_channels)[row], samples)
+            before, after = (float(errors.get(name, missing)[row]) for name in names)
+            channels.append(ChannelFit(channel, samples, before, after, checks, float(assumed)))
+        responses = {name: part.values - each for name, each in own.items()}
+        fits.append(Fit(window.title, part, responses, own.get(names[1]), tuple(channels), noise))
+    return fits
+
+
+def _check(residuals: np.ndarray, rho: float | None) -> ResidualChecks | None:
+    """The checks of one channel's residuals (1, n_samples); None where there is nothing to check.
+
+    There are too few samples, no correlation `rho` of an autoregressive noise, or the fit is exact.
+    """
+    try:
+        return None if rho is None else residual_checks(innovations(residuals, [rho]) if rho else residuals)
+    except ValueError:
+        return None

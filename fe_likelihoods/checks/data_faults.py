@@ -1,0 +1,265 @@
+"""Faults of data that a fit shows: wrong units or signs, swapped channels, clocks that differ.
+
+A fault of the data is seldom a fault of the fit: a sampler finds parameters that make up for a part of it, with a
+frequency far from the true one. Each fault is therefore a hypothesis about responses of many parameters, such as draws
+of the prior: with a factor, the other sign, a shift in time or another order of the channels, is one of them much
+closer to the measurements than the best one is without it? For a channel with measurements y and a response r, the
+errors relative to y are, with the correlation rho of y and r about zero, ::
+
+    e = |y - r| / |y|,    e(factor) = sqrt(1 - rho^2),    e(sign) = |y + r| / |y|,    e(lag) = |y(t) - r(t - lag)| / |y|
+
+and a hypothesis is named where it reduces the errors of the channels that it concerns to less than 0.6, in their
+geometric mean, of the errors of the best response, and to less than 0.7 if the fit is among the responses. Study
+``fit_gate`` of docs/results.rst, on synthetic structures and real events, has chosen the limits.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from ..signals.channels import Measurements
+from ..signals.error_measures import relative_errors
+from ..units import DIMENSIONS, UNITS
+
+__all__ = ["BETTER_THAN_A_FIT", "EXPLAINED", "Fault", "describe_unit", "find_faults"]
+
+BETTER = 0.6  # errors with a fault taken into account, as a share of the errors without
+BETTER_THAN_A_FIT = 0.7  # the same, where one of the responses is the fit
+EXPLAINED = 0.85  # error above which a response explains nothing: a correlation of a half
+FLOOR = 0.02  # error below which smaller ones count as equal
+FACTOR = 1.5  # from which a factor may be one between units
+LONGEST_LAG, LONGEST_SHARE = 5.0, 0.2  # [s], and as a share of the record
+MOST_VALUES = 2**24  # of responses that are compared at once
+MOST_FAULTS = 4  # that are found one after the other
+# share of its gain with which a fault competes: half a period is nearly a sign, and all late supports an early sensor
+SIMPLE = {"factor": 1.0, "swap": 1.0, "lag": 0.85, "input lag": 0.75}
+SAME_UNITS = 1.25  # ratio of a factor to one between units, up to which it is named after them
+EQUALLY_NEAR, NEAR_ENOUGH = 0.01, 0.03  # differences of logarithms of ratios that are named together
+
+
+class Fault(NamedTuple):
+    """A fault of channels, or of supports (input lag), that explains the measurements better."""
+
+    kind: str  # "factor", "sign", "lag", "swap" or "input lag"
+    names: tuple[str, ...]
+    value: float  # measurements / responses [-], or time by which they are late [s]; NaN for a sign and a swap
+    before: float  # error of the channels for the best response (RRMSE, geometric mean)
+    after: float  # the same error with the fault
+
+
+class _Hypothesis(NamedTuple):
+    """A fault, the channels whose errors change, and what corrects responses for it."""
+
+    kind: str
+    channels: tuple[int, ...]
+    errors: np.ndarray  # (n, n of these channels), logarithms, of each response
+    value: np.ndarray  # (n,) factor or lag that gives these errors
+    names: tuple[str, ...] = ()  # of supports
+
+
+def find_faults(
+    measurements: Measurements,
+    responses: np.ndarray,
+    parts: Mapping[str, np.ndarray] | None = None,
+    *,
+    fitted: bool = False,
+) -> tuple[Fault, ...]:
+    """Faults that explain measurements better than any of the responses does without them, the strongest first.
+
+    Responses (n, n_channels, n_samples) [SI] have any parameters; `parts` are their parts by the name of the support
+    that causes them, and add up to them. With the fit among them (`fitted`), a smaller gain counts. Each fault is found
+    after those before it are corrected.
+    """
+    values = np.asarray(measurements.values, dtype=float)
+    there = np.isfinite(values)
+    usable = np.flatnonzero(np.nan_to_num(values).any(axis=1))
+    responses = np.asarray(responses, dtype=float)
+    kept = np.isfinite(responses[:, there]).all(axis=1)
+    if not kept.any() or not len(usable):
+        return ()
+    channels = [measurements.channels[row] for row in usable]
+    steps, starts = (np.array(each)[usable] for each in (measurements.steps, measurements.starts))
+    alike = [(channel.dimension, *when) for channel, *when in zip(channels, steps, starts, strict=True)]
+    y = np.where(there, values, 0.0)[usable]
+    r = np.where(there[usable], responses[kept][:, usable], 0.0)
+    chosen = _closest(y, r)
+    pieces = {
+        name: np.where(there[usable], np.asarray(each, dtype=float)[kept][:, usable], 0.0)[chosen]
+        for name, each in (parts or {}).items()
+    }
+    r, better, found = r[chosen], BETTER_THAN_A_FIT if fitted else BETTER, []
+    while len(found) < MOST_FAULTS:
+        errors = _log_errors(y, r)
+        best, most, explained = int(np.argmin(errors.sum(axis=1))), 0.0, None
+        for each in _hypotheses(y, r, pieces, alike, steps, errors):
+            c = list(each.channels)
+            total = errors.sum(axis=1) + (each.errors - errors[:, c]).sum(axis=1)
+            row = int(np.argmin(total))
+            gain, before, after = errors[best].sum() - total[row], errors[best, c].mean(), each.errors[row].mean()
+            value = float(each.value[row])
+            is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
+            if "lag" in each.kind:
+                is_large = round(abs(value) / steps[c].max()) > 1  # one step is a convention of files
+            clear = after < min(math.log(better) + before, math.log(EXPLAINED)) and gain > -math.log(better) * len(c)
+            if is_large and clear and SIMPLE[each.kind] * gain > most:
+                most, explained = SIMPLE[each.kind] * gain, (each, value, math.exp(before), math.exp(after))
+        if explained is None:
+            break
+        each, value, *change = explained
+        names = each.names or tuple(channels[c].name for c in each.channels)
+        if each.kind == "factor" and value < 0.0:
+            found.append(Fault("sign", names, math.nan, *change))
+        if each.kind != "factor" or _is_factor(abs(value)):
+            # a motion that is recorded late causes a response that must be earlier
+            stated = {"factor": abs(value), "input lag": -value}.get(each.kind, value)
+            found.append(Fault(each.kind, names, stated, *change))
+        if each.kind == "input lag":
+            pieces |= {name: _corrected(each, value, pieces[name], steps) for name in names}
+            r = np.sum(list(pieces.values()), axis=0)
+        else:
+            r = _corrected(each, value, r, steps)
+            pieces = {name: _corrected(each, value, one, steps) for name, one in pieces.items()}
+    return tuple(found)
+
+
+def describe_unit(factor: float, dimension: str) -> str:
+    """Units whose ratio is about a factor or its inverse, in words; empty if there are none.
+
+    Ratios to the SI unit of the channel's dimension come first. Then come ratios of its other units, and units of
+    accelerations, in which the base motion may be wrong.
+    """
+    own, motion = _ratios(dimension), _ratios("acceleration")
+    bases = {DIMENSIONS[dimension], "m/s2", "g"}
+    firsts, of_motion = (
+        {names: value for names, value in ratios.items() if bases & set(names.split(" and "))}
+        for ratios in (own, motion)
+    )
+    if dimension != "acceleration":
+        own |= {f"{names} of the base motion": value for names, value in of_motion.items()}
+    for ratios, near in ((firsts, EQUALLY_NEAR), (own, NEAR_ENOUGH)):
+        apart = {names: abs(abs(math.log(ratio)) - abs(math.log(factor))) for names, ratio in ratios.items()}
+        least = min(apart.values(), default=math.inf)
+        if least < math.log(SAME_UNITS):
+            return " or ".join(names for names, value in apart.items() if value < least + near)
+    return ""
+
+
+def _ratios(dimension: str) -> dict[str, float]:
+    """Ratios of the units of a dimension, by their names; the SI unit, and g, come first in a pair."""
+    units = {unit.name: unit.factor for unit in UNITS.values() if unit.dimension == dimension}
+    order = sorted(units, key=lambda name: (name != DIMENSIONS[dimension], name != "g"))
+    return {f"{one} and {other}": units[one] / units[other] for one, other in combinations(order, 2)}
+
+
+def _is_factor(value: float) -> bool:
+    return max(value, 1.0 / value) > FACTOR
+
+
+def _log_errors(y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Logarithms of the RRMSE (n, n_channels)."""
+    return np.log(np.maximum(relative_errors(y - r, y), FLOOR))
+
+
+def _closest(y: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Rows of the responses that are compared: all, or those with the best fit and the best correlation."""
+    most = max(8, MOST_VALUES // y.size)
+    if len(r) <= most:
+        return np.arange(len(r))
+    factor = (y * r).sum(axis=-1, keepdims=True) / np.maximum(np.square(r).sum(axis=-1, keepdims=True), 1e-300)
+    by_fit, by_shape = (np.argsort(_log_errors(y, each).sum(axis=1)) for each in (r, factor * r))
+    return np.unique(np.concatenate([by_fit[: most // 2], by_shape[: most // 2]]))
+
+
+def _hypotheses(
+    y: np.ndarray,
+    r: np.ndarray,
+    parts: Mapping[str, np.ndarray],
+    alike: Sequence[tuple],
+    steps: np.ndarray,
+    errors: np.ndarray,
+) -> Iterator[_Hypothesis]:
+    """Every fault of one round, simple ones first; only channels of one quantity and the same times can be swapped."""
+    every = tuple(range(len(y)))
+    power, own, product = np.square(r).sum(axis=-1), np.square(y).sum(axis=-1), (y * r).sum(axis=-1)
+    single = [(c,) for c in every]
+    of_kind = [tuple(c for c in every if alike[c][0] == kind) for kind in dict.fromkeys(each[0] for each in alike)]
+    for group in dict.fromkeys([*single, *of_kind, every]):
+        c = list(group)
+        # least squares of relative errors, so that no channel outweighs the others
+        weight, along = (power[:, c] / own[c]).sum(axis=1), (product[:, c] / own[c]).sum(axis=1)
+        factor = np.where(weight > 0.0, along / np.where(weight > 0.0, weight, 1.0), 0.0)[:, None]
+        squares = 1.0 + (np.square(factor) * power[:, c] - 2.0 * factor * product[:, c]) / own[c]
+        squares = np.where(factor == 0.0, np.inf, np.maximum(squares, FLOOR**2))
+        yield _Hypothesis("factor", group, 0.5 * np.log(squares), factor[:, 0])
+    cross = (power[:, :, None] + own - 2.0 * np.einsum("nit,jt->nij", r, y)) / own  # of response i for channel j
+    cross = 0.5 * np.log(np.maximum(cross, FLOOR**2))
+    for j, i in combinations(every, 2):
+        swapped = np.stack([cross[:, i, j], cross[:, j, i]], axis=1)
+        if alike[i] == alike[j] and (swapped < errors[:, [j, i]]).all(axis=1).any():
+            yield _Hypothesis("swap", (j, i), swapped, np.full(len(r), np.nan))
+    lags, by_lag = _lag_errors(y, r, steps)
+    if len(lags) < 2:
+        return
+    for group in dict.fromkeys([*single, every]):
+        yield _best_lag("lag", group, by_lag, lags)
+    names = list(parts) if len(parts) > 1 else []
+    late = [(name,) for name in names] + [tuple(n for n in names if n != name) for name in names if len(names) > 2]
+    for supports in late:  # each one, and all but one
+        moving = np.sum([parts[name] for name in supports], axis=0)
+        yield _best_lag("input lag", every, _lag_errors(y, moving, steps, r - moving)[1], lags, supports)
+
+
+def _best_lag(
+    kind: str, group: tuple[int, ...], by_lag: np.ndarray, lags: np.ndarray, names: tuple[str, ...] = ()
+) -> _Hypothesis:
+    """A lag of some channels, the best one of each response; `by_lag` is (n, n_channels, n_lags)."""
+    chosen = by_lag[:, list(group)]
+    best = np.argmin(chosen.sum(axis=1), axis=1)
+    return _Hypothesis(kind, group, np.take_along_axis(chosen, best[:, None, None], axis=2)[..., 0], lags[best], names)
+
+
+def _lag_errors(
+    y: np.ndarray, moving: np.ndarray, steps: np.ndarray, fixed: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lags (n_lags,) [s], and logarithms of the errors (n, n_channels, n_lags) of ``fixed + moving(t - lag)``.
+
+    Before its first sample a response is at rest; where a shifted response has ended, nothing is compared.
+    """
+    n, coarse = y.shape[1], float(steps.max())
+    count = int(min(LONGEST_LAG, LONGEST_SHARE * n * float(steps.min())) / coarse)
+    lags = coarse * np.arange(-count, count + 1)
+    found, size = np.empty((*moving.shape[:2], len(lags))), 2 ** (2 * n - 1).bit_length()
+    for c, step in enumerate(steps):
+        k = np.rint(lags / step).astype(int)
+        target = np.broadcast_to(y[c] if fixed is None else y[c] - fixed[:, c], (len(moving), n))
+        products = np.fft.irfft(np.fft.rfft(target, size) * np.fft.rfft(moving[:, c], size).conj(), size)[:, k % size]
+        ends, power, own = n - np.maximum(-k, 0), _sums(moving[:, c]), _sums(y[None, c])[0]
+        squares = _sums(target)[:, ends] + power[:, n - np.maximum(k, 0)] - power[:, np.maximum(-k, 0)] - 2.0 * products
+        own = np.where(own[ends] < 0.5 * own[-1], 0.0, own[ends])  # too little is left to compare
+        with np.errstate(divide="ignore"):
+            shares = np.maximum(squares, 0.0) / np.where(own > 0.0, own, 1.0)
+            found[:, c] = 0.5 * np.log(np.where(own > 0.0, shares, np.inf))
+    return lags, np.maximum(found, math.log(FLOOR))
+
+
+def _sums(values: np.ndarray) -> np.ndarray:
+    """Sums of squares (n, n_samples + 1) of the first 0, 1, ... samples."""
+    return np.concatenate([np.zeros((len(values), 1)), np.cumsum(np.square(values), axis=1)], axis=1)
+
+
+def _corrected(fault: _Hypothesis, value: float, given: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Responses (n, n_channels, n_samples) as they would be compared with measurements that have the fault."""
+    out, c = given.copy(), list(fault.channels)
+    if fault.kind == "factor":
+        out[:, c] *= value
+    elif fault.kind == "swap":
+        out[:, c] = given[:, c[::-1]]
+    else:
+        for row in c:
+            k, n = round(value / steps[row]), given.shape[-1]
+            out[:, row] = 0.0
+            out[:, row, max(k, 0) : n + min(k, 0)] = given[:, row, max(-k, 0) : n - max(k, 0)]
+    return out

@@ -1,0 +1,69 @@
+"""Findings as a judgement, and findings as warnings."""
+
+import warnings
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
+
+__all__ = [
+    "CARE",
+    "CORRELATED",
+    "NOTE",
+    "SMALL_PROBABILITY",
+    "WRONG",
+    "Finding",
+    "Judgement",
+    "by_severity",
+    "judge",
+    "labelled",
+    "percent",
+    "warn",
+]
+
+SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
+CORRELATED = "The errors are correlated"
+STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
+
+
+class Judgement(NamedTuple):
+    """Whether a result can be used, from all that was found; ``str`` gives it in one sentence."""
+
+    status: str  # "use", "use with care" or "do not use"
+    findings: tuple[Finding, ...]  # the most severe first
+    tests: tuple[tuple[str, str], ...] = ()  # names of the tests, and what was tested or why it was not
+
+    def __str__(self) -> str:
+        reasons = [each.kind for each in self.findings if STATUS[each.severity] == self.status != "use"]
+        if self.width_factor > 1.0:
+            reasons.append(f"standard deviations count {self.width_factor:.2g} times, because errors are correlated")
+        text = f"{self.status[0].upper()}{self.status[1:]}"
+        return f"{text}: {'; '.join(f'{kind[0].lower()}{kind[1:]}' for kind in reasons)}." if reasons else f"{text}."
+
+    @property
+    def width_factor(self) -> float:
+        """Factor of standard deviations from the data, for the effective number of samples; 1 for white errors."""
+        return next((each.numbers["factor"] for each in self.findings if each.kind == CORRELATED), 1.0)
+
+
+def judge(findings: Iterable[Finding], tests: Iterable[tuple[str, str]] = ()) -> Judgement:
+    """The judgement that follows from findings: the most severe one decides."""
+    ordered = by_severity(findings)
+    return Judgement(STATUS[ordered[0].severity] if ordered else "use", ordered, tuple(tests))
+
+
+def warn(findings: Iterable[Finding], stacklevel: int = 2) -> None:
+    """Warn of the findings that are more than a note; `stacklevel` as seen from the caller."""
+    for each in findings:
+        if each.severity != NOTE:
+            warnings.warn(each.message, stacklevel=stacklevel + 1)
+
+
+def labelled(findings: Iterable[Finding]) -> list[str]:
+    """Findings as lines of a text, which begin with CAUTION unless they are notes."""
+    return [f"{'Note' if each.severity == NOTE else 'CAUTION'}: {each}" for each in findings]
+
+
+def percent(share: float) -> str:
+    """A share in words: "12.3 %"."""
+    return f"{100.0 * share:.3g} %"

@@ -1,0 +1,318 @@
+"""Findings about a fit: does the model follow the measurements at all, and what would explain it if not?"""
+
+from collections.abc import Iterable, Sequence
+from math import comb
+from typing import Any
+
+import numpy as np
+
+from ..likelihood.posterior import Posterior
+from ..noise.residuals import ResidualChecks
+from ..priors.points import as_points
+from ..signals.error_measures import relative_errors
+from ..text_tables import listed
+from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
+from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
+from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
+from .table import Moments, ParameterRow, rows_of
+
+__all__ = [
+    "SAME_AS_PRIOR",
+    "check_fit",
+    "check_parameters",
+    "check_residuals",
+    "check_responses",
+    "describe_residuals",
+    "residual_sentence",
+]
+
+SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
+NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
+FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
+# RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of a response that is clearly worse
+# than zero
+LARGE_ERROR, USELESS_ERROR = 0.5, 1.2
+WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
+FEWEST = 10  # samples that the tests of correlation and distribution need
+# Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
+OFFSET = 0.5
+
+
+def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
+    """Look for wrong units, signs, clocks and channels, for a poor fit and for parameters at their bounds.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    samples : (n, ndim) array_like or mapping, optional
+        Samples of the posterior, whose mean is the fit. Default: before a run, the data are compared with draws of the
+        prior alone.
+
+    Returns
+    -------
+    tuple of Finding
+        Empty if nothing was found. ``str`` of a finding gives it in words. The mean and up to 100 draws of the prior
+        are simulated where they are not cached; fewer draws if a simulation takes longer than 0.1 s.
+
+    Examples
+    --------
+    >>> for finding in check_fit(posterior, sampler.get_chain(flat=True)):
+    ...     print(finding.severity, finding)
+    """
+    points, rows = draws_to_compare(posterior), []
+    if samples is not None:
+        samples = as_points(samples, posterior.prior.names)
+        points = np.concatenate([samples.mean(axis=0)[None], points])
+        none = np.full(posterior.ndim, np.nan)
+        rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none), none)
+    compared: list[Compared] = []
+    for key, likelihood, columns in data_sets_of(posterior):
+        compared += compare(likelihood, points[:, columns], samples is not None, key)
+    return (*check_responses(compared), *check_parameters(rows))
+
+
+def check_responses(compared: Iterable[Compared]) -> list[Finding]:
+    """What responses show of the data and of the fit, if there is one: faults of the data, and missed channels.
+
+    A fault that draws of the prior show before a run is named after it as well: a fit may make up for it.
+    """
+    found, compared = [], list(compared)
+    for each in compared:
+        faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
+        found += [_of_a_fault(each, fault, WRONG) for fault in faults]
+        if each.fitted:
+            parts = {name: values[each.draws] for name, values in each.parts.items()}
+            before = find_faults(each.measurements, each.responses[each.draws], parts)
+            known = {fault.kind for fault in faults}
+            found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
+    far = not found
+    for each in compared:
+        found += _check_offset(each) if each.fitted else []
+    return found + _check_errors(compared, far)
+
+
+def _where(names: Sequence[str], compared: Compared | Fit) -> str:
+    return f"{listed(list(names))}{f' ({compared.title})' if compared.title else ''}"
+
+
+def _of_a_fault(compared: Compared, fault: Fault, severity: str) -> Finding:
+    """A fault in words; one that limits a fit was seen among draws of the prior alone."""
+    where, numbers = _where(fault.names, compared), {"before": fault.before, "after": fault.after}
+    better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}"
+    better += "" if severity == WRONG else " for the best draw of the prior; the fit may make up for it"
+    which = "measurements" if len(fault.names) > 1 else "measurement"
+    late = f"{abs(fault.value):.3g} s {'later' if fault.value > 0.0 else 'earlier'}"
+    if fault.kind == "factor":
+        dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
+        units = " or ".join(filter(None, dict.fromkeys(describe_unit(fault.value, each) for each in dimensions)))
+        kind = "A unit may be wrong"
+        text = (
+            f"Responses times {fault.value:.3g} fit the {which} of {where} much better: {better}. The {which} and the "
+            f"model differ by this factor{f', about the ratio of {units}' if units else ''}."
+        )
+        action = "Check the unit of the file, of the model (it returns SI units) and of the base motion."
+    elif fault.kind == "sign":
+        kind = "A sign may be wrong"
+        text = f"Response and measurements have opposite signs: {where}; with the other sign, {better}."
+        action = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
+    elif fault.kind == "swap":
+        kind = "Channels may be swapped"
+        text = f"The channels {where} may be exchanged: the other way round, {better}."
+        action = "Check the columns of the file and the places of sensors."
+    elif fault.kind == "input lag":  # a motion that is recorded late must be shifted to earlier times
+        kind = "Clocks of input recorders may differ"
+        text = (
+            f"The motion of {where} seems to be {late} than the other motions and the measured response: without this "
+            f"lag, {better}. The clocks of recorders may differ."
+        )
+        action = (
+            "Compare the clocks of the recorders, with `align`, and shift the record before you use the result, or "
+            "make the lag a parameter (lags= of LinearStructure)."
+        )
+    else:
+        kind = "Clocks may differ"
+        verb = "are" if len(fault.names) > 1 else "is"
+        text = f"The {which} of {where} {verb} {late} than the response: with this lag, {better}."
+        text += " The clock of a support's recorder may be the wrong one as well." if compared.parts else ""
+        action = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
+    return Finding(kind, severity, text, action, numbers | {fault.kind: fault.value})
+
+
+def _check_offset(compared: Compared) -> list[Finding]:
+    """Channels whose residuals are mostly a constant, a slope or a parabola."""
+    shares = {}
+    for channel, measured, response in zip(
+        compared.measurements.channels, compared.measurements.values, compared.responses[0], strict=True
+    ):
+        residuals = (measured - response)[np.isfinite(measured - response)]
+        if len(residuals) >= FEWEST and residuals.any():
+            smooth = np.polynomial.Legendre.fit(np.arange(len(residuals)), residuals, 2)(np.arange(len(residuals)))
+            shares[channel.name] = float(np.square(smooth).sum() / np.square(residuals).sum())
+    large = {name: share for name, share in shares.items() if share > OFFSET}
+    if not large:
+        return []
+    text = (
+        f"What the fit leaves of {_where(list(large), compared)} is mostly an offset or a drift: a parabola has "
+        f"{percent(max(large.values()))} of the power of the residuals. The noise takes it for scatter."
+    )
+    action = "Correct the baseline of the measurement, or let the model have the residual displacement."
+    return [Finding("A measurement may have an offset or a drift", CARE, text, action, large)]
+
+
+def _check_errors(compared: Sequence[Compared], far_matters: bool) -> list[Finding]:
+    """Channels that the fit, or the best of several draws of the prior, does not reproduce."""
+    found: list[Finding] = []
+    useless, poor, far = {}, {}, {}
+    for each in compared:
+        errors = np.nan_to_num(relative_errors(each.measurements.values - each.responses, each.measurements.values))
+        levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
+        closest = int(np.argmin(levels))
+        best = errors[0 if each.fitted else closest]
+        if each.fitted and levels[closest] < BETTER_THAN_A_FIT * levels[0] and (errors[0] > LARGE_ERROR).any():
+            text = (
+                f"Another response that was simulated fits much better{f' ({each.title})' if each.title else ''}: its "
+                f"error (RRMSE) is {percent(levels[closest])}, and {percent(levels[0])} at the fit (geometric means "
+                "of the channels)."
+            )
+            action = "The sampler or the search may have missed the best fit, or the noise prefers another one."
+            found.append(Finding("The fit is not the best one known", CARE, text, action))
+        for channel, error in zip(each.measurements.channels, best.tolist(), strict=True):
+            place = _where([channel.name], each)
+            if not each.fitted:
+                far |= {place: error} if error > EXPLAINED else {}
+            elif error > LARGE_ERROR:
+                (useless if error > USELESS_ERROR else poor)[place] = error
+
+    def shown(errors: dict[str, float]) -> str:
+        return listed([f"{place} ({percent(error)})" for place, error in errors.items()])
+
+    action = (
+        "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
+        "the model before you interpret the parameters."
+    )
+    if useless:
+        text = f"After the update, the error (RRMSE) is larger than that of a response of zero: {shown(useless)}."
+        found.append(Finding("The model does not follow the measurements", WRONG, text, action, useless))
+    if poor:
+        text = f"After the update, the relative error (RRMSE) is still large: {shown(poor)}."
+        found.append(Finding("A channel is hardly reproduced", CARE, text, action, poor))
+    if far and far_matters:
+        text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown(far)}."
+        action = (
+            "Check the model and the priors. A model of your own must return SI units (m, m/s², N, Pa, rad), whatever "
+            "the units in [model.channels], and zero in [measurements] is the time at which the base motion begins."
+        )
+        found.append(Finding("The prior does not reach the measurements", CARE, text, action, far))
+    return found
+
+
+def check_parameters(rows: Sequence[ParameterRow]) -> list[Finding]:
+    """Parameters at bounds, far from their prior or not informed, and missed true values."""
+    found, edges = [], []
+    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
+    for row in (row for row in rows if row not in flat):  # where the data say little, the prior is at its own edge
+        near = NEAR_BOUND * np.nanmin([row.high - row.low, row.prior_sd])
+        edges += [f"{row.label} at {row.lower:.4g}"] if row.low - row.lower < near else []
+        edges += [f"{row.label} at {row.upper:.4g}"] if row.upper - row.high < near else []
+    if edges:
+        text = f"The posterior reaches the edge of its prior: {listed(edges)}. The bound, not the data, ends it there."
+        action = (
+            "If the bound is physical, nothing is wrong. Otherwise widen the prior, and ask what the parameter makes "
+            "up for in the model."
+        )
+        found.append(Finding("At the edge of the prior", CARE, text, action))
+    if flat:
+        names = listed([row.label for row in flat])
+        text = f"The posterior of {names} is nearly as wide as its prior: these data say little about it."
+        action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
+        found.append(Finding("Not informed by the data", NOTE, text, action))
+    far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
+    far = {name: distance for name, distance in far.items() if abs(distance) > FAR_FROM_PRIOR}
+    if far:
+        text = (
+            f"The posterior mean of {listed(list(far))} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the "
+            "prior away from the mean of the prior: prior and data disagree."
+        )
+        action = (
+            "Check the nominal value and the width of the prior; the parameter may make up for an error of the model."
+        )
+        found.append(Finding("Far from the prior", CARE, text, action, far))
+    return found + _check_truth(rows)
+
+
+def _check_truth(rows: Sequence[ParameterRow]) -> list[Finding]:
+    """A finding if fewer true values are within their intervals than chance explains."""
+    known = [row for row in rows if np.isfinite(row.truth)]
+    outside = [row.label for row in known if not row.low <= row.truth <= row.high]
+    # probability that so many 90 % intervals or more miss, if they were independent
+    n, k = len(known), len(outside)
+    if not k or sum(comb(n, j) * 0.1**j * 0.9 ** (n - j) for j in range(k, n + 1)) >= SMALL_PROBABILITY:
+        return []
+    text = (
+        f"The true values of {listed(outside)} are outside of their 90 % intervals, {k} of {n}; about one in ten is "
+        "usual. The model that was updated is not the one that made the data."
+    )
+    action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
+    return [Finding("True values are missed", CARE, text, action)]
+
+
+def check_residuals(fits: Fits) -> list[Finding]:
+    """How much successive errors depend on each other, which widens standard deviations, and whether they are normal.
+
+    Residuals of real measurements are always correlated, so that this alone limits no result.
+    """
+    checked = [(fit, each) for fit in fits.fits for each in fit.channels if each.checks is not None]
+    coloured = [_where([each.channel.name], fit) for fit, each in checked if _is_coloured(each)]
+    # the information of independent samples is proportional to their number
+    assumed = sum(each.assumed for _, each in checked)
+    independent = [min(each.checks.n_effective[0], each.assumed) for _, each in checked if _is_coloured(each)]
+    worth = sum(independent) + sum(each.assumed for _, each in checked if not _is_coloured(each))
+    found = []
+    factor = float(np.sqrt(assumed / worth)) if coloured else 1.0
+    if round(factor, 1) > 1.0:
+        text = (
+            f"The errors of {listed(coloured)} are correlated: where the noise takes {assumed:.0f} samples for "
+            f"independent, they are worth {worth:.0f}, so that standard deviations from the data are too small by a "
+            f"factor of about {factor:.2g}."
+        )
+        action = (
+            "Use the wider standard deviations. Compare with AutoregressiveNoise (in a TOML file: kind = "
+            '"autoregressive" in [noise]), with GaussianNoise with bands of frequency (groups = [1.0, 5.0]) or with '
+            "effective_samples=, and look at the residuals for an effect that the model lacks."
+        )
+        found.append(Finding(CORRELATED, NOTE, text, action, {"factor": factor}))
+    strange = [_where([each.channel.name], fit) for fit, each in checked if each.checks.normal[0] < SMALL_PROBABILITY]
+    if strange:
+        text = f"The residuals of {listed(strange)} have heavier tails, or are more skew, than a normal distribution."
+        action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
+        found.append(Finding("The errors are not normal", NOTE, text, action))
+    return found
+
+
+def _is_coloured(each: ChannelFit) -> bool:
+    return each.checks.white[0] < SMALL_PROBABILITY and abs(each.checks.lag_one[0]) > WEAK
+
+
+def describe_residuals(checks: ResidualChecks) -> list[str]:
+    """What the residuals of each channel look like, in words."""
+    found = []
+    for lag, worth, white, normal, n in zip(*checks[2:7], strict=True):
+        if n < FEWEST:
+            found.append(f"Not checked: {n:.0f} samples are too few, {FEWEST} are needed.")
+            continue
+        text = f"Correlated ({lag:.2f} from sample to sample): {n:.0f} samples are worth {worth:.0f} independent ones."
+        if white >= SMALL_PROBABILITY:
+            text = "White: no correlation from sample to sample was found."
+        elif abs(lag) < WEAK:
+            text = f"Nearly white: the correlation from sample to sample, {lag:.2f}, changes intervals little."
+        found.append(f"{text} Not normal: look at the tails." if normal < SMALL_PROBABILITY else text)
+    return found
+
+
+def residual_sentence(fit: Fit, each: ChannelFit) -> str:
+    """What the residuals of one channel look like, in a sentence."""
+    where = _where([each.channel.name], fit)
+    if each.checks is None:
+        return f"{where}: the residuals could not be checked (too few samples, or an exact fit)."
+    left = "what the noise model leaves (innovations, or whitened residuals): "
+    return f"{where}: {left if fit.noise in ('autoregressive', 'bands') else ''}{describe_residuals(each.checks)[0]}"

@@ -1,0 +1,262 @@
+"""One judgement over the result of a run: sampling, fit, residuals, failures, priors, data, and what was not tested."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from samplers.judgement.failures import check_failed_region
+
+from ..cache.simulation_cache import SimulationCache
+from ..simulation.model import SimulationBatch, simulate_batch
+from .compared import Fits, fit_data_sets
+from .failed_simulations import Failures, failures
+from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
+from .fit import check_parameters, check_residuals, check_responses
+from .run import FinishedRun, read_run
+from .screening import check_data, check_gaps
+from .steps import (
+    StepTest,
+    check_stronger_motion,
+    halve_steps,
+    motions_to_replace,
+    not_tested,
+    simulations_of_the_test,
+)
+from .table import ParameterRow, parameter_rows
+
+__all__ = ["JudgedRun", "check_result", "check_run", "judge_run"]
+
+FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
+LARGE_FAILURE_SHARE = 0.05  # as much as a tail of a 90 % interval
+LARGEST_TEST, TEST_SECONDS = 0.05, 10.0  # of step and mesh: share of the simulations of the run, below which it is made
+
+
+class JudgedRun(NamedTuple):
+    """A judgement of a run, and what it is made from."""
+
+    rows: list[ParameterRow]
+    fits: Fits
+    failures: Failures
+    judgement: Judgement
+
+
+def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Judgement:
+    """Judge the result of a run: sampling, fit, residuals, failures, priors and data.
+
+    The report and ``fe-likelihoods run`` give the same judgement.
+
+    Parameters
+    ----------
+    sampler : SMCSampler, TMCMCSampler or emcee.EnsembleSampler
+        A sampler that has run.
+    posterior : Posterior, optional
+        Default: what was sampled.
+    discard : int
+        Iterations to leave out at the beginning of a Markov chain.
+
+    Returns
+    -------
+    Judgement
+        The mean, and draws of the prior, are simulated where they are not cached (`check_fit`).
+
+    Raises
+    ------
+    ValueError
+        If the sampler has no chain.
+
+    Examples
+    --------
+    >>> judgement = check_result(sampler)
+    >>> print(judgement)
+    >>> for finding in judgement.findings:
+    ...     print(finding)
+    """
+    return judge_run(read_run(sampler, posterior, discard=discard)).judgement
+
+
+def judge_run(run: FinishedRun) -> JudgedRun:
+    """Judge a run; simulates the points that `check_result` names, where they are not cached."""
+    rows, fits = parameter_rows(run), fit_data_sets(run)
+    model, made = _check_model(run)
+    failed = failures(run)  # those of the fits included
+    fits = fits._replace(simulations=fits.simulations + made)
+    return JudgedRun(rows, fits, failed, check_run(run, rows, fits, failed, model))
+
+
+def check_run(
+    run: FinishedRun, rows: Sequence[ParameterRow], fits: Fits, failed: Failures, model: StepTest | None = None
+) -> Judgement:
+    """The judgement of a run, with all that a reader has to know; `model` is about its motion, step and mesh.
+
+    A run that says nothing about the parameters gets no findings that compare its samples with prior, truth or noise.
+    """
+    model = StepTest([], {}) if model is None else model
+    found = _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
+    for text in fits.failures:
+        found.append(Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model."))
+    found += check_responses(fits.compared) + ([] if run.is_inconclusive else check_parameters(rows)) + model.findings
+    for likelihood, _ in [] if run.likelihood is None else run.likelihood.parts():
+        found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
+        found += check_gaps(likelihood.noise) + _check_range(likelihood)
+    if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
+        found += check_residuals(fits)
+    unique = dict.fromkeys(found)  # data sets may share a description or a motion
+    return judge(unique, (*_tests(run, fits, failed), *model.tests.items()))
+
+
+def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, str]]:
+    """Names of the tests of a run, and what was tested or why it was not."""
+    checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
+    sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
+    responses = max((len(each.responses) for each in fits.compared), default=0)
+    return [
+        ("Sampling", sampling),
+        ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
+        (
+            "Units, signs, clocks, swapped channels",
+            f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
+        ),
+        ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
+    ]
+
+
+def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
+    """Whether the model reads its motion, and the error of step and mesh, at the centre of the samples.
+
+    Also returns the number of simulations that this took. The derivatives take one simulation for each parameter. Where
+    these are more than a twentieth of the run's simulations and take longer than ten seconds, they are left out.
+    """
+    if run.likelihood is None or run.prior is None:
+        return StepTest([], {}), 0
+    known = {likelihood.model.fingerprint: likelihood for likelihood, _ in run.likelihood.parts()}
+    before, others = run.likelihood.simulations, 0
+
+    def simulate(model: Any, points: np.ndarray) -> SimulationBatch:
+        nonlocal others
+        if model.fingerprint in known:
+            return known[model.fingerprint].simulate(points)
+        others += len(points)
+        return simulate_batch(model, points)
+
+    unread, motion = [], "not tested: no model has a motion that can be replaced"
+    for likelihood, columns in run.likelihood.parts():
+        theta = run.centre[columns][: len(likelihood.model.parameter_names)]
+        batch = likelihood.simulate(theta[None])
+        if not batch.reasons[0] and motions_to_replace(likelihood.model):
+            motion = "twice the motion was simulated"
+            found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
+            unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
+    test = StepTest([], {})
+    if not unread and not run.is_inconclusive:
+        test = _test_steps(run, simulate)
+    test = StepTest(unread + test.findings, {"Motion": motion} | test.tests)
+    return test, run.likelihood.simulations - before + others
+
+
+def _test_steps(run: FinishedRun, simulate: Any) -> StepTest:
+    """The error of step and mesh, or why it was not tested."""
+    if run.n_modes > 1:
+        return not_tested("the samples have several modes, which have no common standard deviation")
+    needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
+    seconds = report["seconds"] / max(report["simulations"], 1)
+    if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
+        return not_tested(f"the test takes {needed} simulations of {seconds:.2g} s")
+    return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
+
+
+def _check_sampling(run: FinishedRun) -> list[Finding]:
+    """What the sampler has found, as it has said it."""
+    if not run.tempered:
+        return []
+    if run.verdict is None:
+        text = "The file of this run holds no verdict, so nothing is known about its convergence."
+        return [Finding("No verdict", CARE, text, "Run it again with this version.")]
+    found, more = list(run.verdict.findings), run.verdict.more_simulations
+    if run.verdict.status != "converged" and not found:  # stored by version 0.2
+        text = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
+        severity = WRONG if run.verdict.status == "not usable" else CARE
+        found = [Finding("The sampling has limits", severity, text)]
+    if found and more is None:
+        action = "Compare with a second run of another seed and more walkers before you use the numbers."
+        found.append(Finding("More simulations", NOTE, "How many more simulations are needed is not known.", action))
+    elif found and more > 0.0:
+        text = f"At least about {more:.0f} more simulations are needed, possibly several times as many."
+        found.append(Finding("More simulations", NOTE, text, "Raise max_simulations and run again."))
+    return found
+
+
+def _check_chain(run: FinishedRun) -> list[Finding]:
+    """Whether the samples are many enough, for a Markov chain too, and have one mode."""
+    found = [] if run.tempered else _check_markov_chain(run)
+    size = run.effective_sample_size
+    if not size >= FEW_SAMPLES:
+        text = (
+            f"The {len(run.samples)} samples are worth about {size:.0f} independent ones: interval ends are rough, and "
+            f"standard deviations have an error of about {100.0 / np.sqrt(2.0 * max(size, 1.0)):.0f} %."
+        )
+        if not np.isfinite(size):
+            text = f"How many independent samples the {len(run.samples)} samples are worth is not known."
+        found.append(Finding("Few independent samples", CARE, text, "Make more iterations, or use more walkers."))
+    if run.n_modes > 1 and not run.is_inconclusive:
+        shares = ", ".join(f"{mode.share:.2f} ± {mode.share_error:.2g}" for mode in run.verdict.modes)
+        text = (
+            f"The posterior has {run.n_modes} separate regions, with shares {shares}. Mean and standard deviation "
+            "describe none of them, and the fit below is shown for the best sample."
+        )
+        action = "Look at the corner figure. Data of another kind, or a narrower prior, may tell the regions apart."
+        found.append(Finding("Several modes", CARE, text, action))
+    return found
+
+
+def _check_markov_chain(run: FinishedRun) -> list[Finding]:
+    iterations, time, found = run.sampler.iteration - run.discard, run.autocorrelation_time, []
+    if run.is_inconclusive:
+        known = f"its autocorrelation time is about {time:.0f} iterations"
+        if not np.isfinite(time):
+            known = "its autocorrelation time is not known"
+        text = (
+            f"The chain has {iterations} iterations, and {known}. A chain of fewer than 50 autocorrelation times gives "
+            "no reliable error, and may still be on its way to the posterior."
+        )
+        action = "Continue it, or use SMCSampler for the same posterior."
+        found.append(Finding("The chain is short", WRONG, text, action))
+    if run.discard == 0:
+        text = "All iterations are used, the first ones included, which depend on where the walkers started."
+        action = "Give report(..., discard=n) the number of iterations of the burn-in, if there was one."
+        found.append(Finding("No burn-in was left out", CARE, text, action))
+    return found
+
+
+def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
+    """How many simulations failed, and where a sampler has not said it, whether they border on the samples."""
+    if not failed.count:
+        return []
+    share = failed.count / max(failed.attempts, 1)
+    of_prior = f", among them {failed.prior_failed} of {failed.prior_draws} draws of the prior"
+    text = (
+        f"{failed.count} of {failed.attempts} simulations failed ({100.0 * share:.2g} %)"
+        f"{of_prior if failed.prior_draws else ''}. A failed simulation counts as impossible: the posterior has no "
+        "samples there."
+    )
+    action = (
+        "See the table of failures. If the parameters there are plausible, mend the model and run again; if they are "
+        "not, a narrower prior saves these simulations."
+    )
+    largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
+    severity = CARE if largest > LARGE_FAILURE_SHARE else NOTE
+    found = [Finding("Simulations failed", severity, text, action, {"share": largest})]
+    said = run.verdict is not None and run.verdict.near_failures is not None
+    return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)
+
+
+def _check_range(likelihood: Any) -> list[Finding]:
+    """What a model has said about simulations beyond the range of its laws, here or in a stored run."""
+    if not hasattr(likelihood.model, "range_remark"):
+        return []
+    text, cache = likelihood.model.range_remark, likelihood.simulator.cache
+    text = text or (cache.look_up_remark(likelihood.model) if isinstance(cache, SimulationCache) else "")
+    if not text:
+        return []
+    action = "See whether samples of the posterior are concerned, or only draws far from it."
+    return [Finding("Beyond the range of a law of the model", CARE, f"{text[0].upper()}{text[1:]}.", action)]

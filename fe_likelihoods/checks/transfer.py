@@ -1,0 +1,222 @@
+"""Findings about predictions, from numbers: what goes beyond the calibration, and what a result cannot show."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from ..signals.channels import Channel
+from ..units import DIMENSIONS, to_si
+from .finding import CARE, WRONG, Finding
+from .steps import NOTHING, UNREAD
+
+__all__ = [
+    "check_bandwidth",
+    "check_coverage",
+    "check_emulated",
+    "check_failed_samples",
+    "check_final_values",
+    "check_interval_samples",
+    "check_peaks",
+    "check_same_response",
+    "check_scores",
+    "check_unit_of_threshold",
+    "check_widening",
+    "is_narrow",
+    "note_assumed_noise",
+]
+
+# of a predicted peak to the calibrated ones: named in 1 of 100 right runs, and in 96 of 100 at three times the strength
+PEAK_RATIO = 2.0
+NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
+UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
+NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
+# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands; and of the
+# variance that an emulator leaves, which then saves less than half of the simulations
+HALF = 0.5
+FAR = 10.0  # factor beyond all values: no reader asks for a probability so close to 0 or 1
+
+
+def check_peaks(
+    predicted: Mapping[str, float], calibrated: Sequence[Mapping[str, float]], alone: bool
+) -> list[Finding]:
+    """Peaks [SI] beyond the calibrated events' by a factor of two; `alone`: the parameters belong to one likelihood."""
+    far, numbers = [], {}
+    for name, value in predicted.items():
+        measured = [event[name] for event in calibrated if name in event]
+        if not measured or not max(measured) > 0.0:
+            continue
+        if value > PEAK_RATIO * max(measured):
+            numbers[name] = value / max(measured)
+            far.append(f"{name} ({numbers[name]:.2g} times the largest calibrated one)")
+        elif value < min(measured) / PEAK_RATIO:
+            numbers[name] = value / min(measured)
+            far.append(f"{name} ({numbers[name]:.2g} times the smallest calibrated one)")
+    if not far:
+        return []
+    text = (
+        f"The predicted peaks are outside of the range of the calibration by more than a factor of {PEAK_RATIO:g}: "
+        f"{', '.join(far)}. The parameters were calibrated at other amplitudes; where stiffness and damping depend on "
+        "the amplitude, the prediction is beside the truth, and its spread does not show it."
+    )
+    # several events show how parameters vary between them, but not at amplitudes that none of them had
+    other = ", or let parameters vary between events (in Python, Hierarchy)" if alone and len(calibrated) == 1 else ""
+    action = f"Calibrate with events of this amplitude{other}."
+    return [Finding("Beyond the calibrated amplitude", CARE, text, action, numbers)]
+
+
+def is_narrow(bandwidth: float | None, calibrated: float | None) -> bool:
+    """Whether a motion has a much narrower band [Hz] than the motion of the calibration; not if one is not known."""
+    return bandwidth is not None and calibrated is not None and bandwidth < NARROW * calibrated
+
+
+def check_bandwidth(bandwidth: float | None, calibrated: float | None) -> list[Finding]:
+    """Whether the power of a motion is in a much narrower band [Hz] than in the calibration."""
+    if not is_narrow(bandwidth, calibrated):
+        return []
+    text = (
+        f"This motion has its power in a band of {bandwidth:.2g} Hz, as a harmonic has; {calibrated:.2g} Hz in the "
+        "calibration. Near a resonance the response depends on frequency and damping far more than in the calibration, "
+        "which hardly speaks for it: the spread of the posterior is too narrow."
+    )
+    action = (
+        "Calibrate with a motion of this kind, or predict with the spread between several events (in Python, "
+        "predict_new_event)."
+    )
+    return [Finding("A narrow-band motion", CARE, text, action, {"ratio": bandwidth / calibrated})]
+
+
+def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
+    """Final values that still move: half the range in the last two seconds, value, and largest response, by name."""
+    numbers = {
+        name: half / value
+        for name, (half, value, largest) in ends.items()
+        if value > 0.0 and half > max(UNSETTLED * value, NO_MOTION * largest)
+    }
+    if not numbers:
+        return []
+    text = (
+        "The structure still moves in the last 2 s, by a part of its final value: "
+        f"{', '.join(f'{name} (+- {share:.0%})' for name, share in numbers.items())}. A residual value is what is left "
+        "after free vibration."
+    )
+    action = (
+        'Append rest to the record, record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0), or take the '
+        "mean over whole periods, final_value(channel, samples=...) or damage_measures(settle=...)."
+    )
+    return [Finding("A final value still moves", CARE, text, action, numbers)]
+
+
+def check_same_response(difference: float | None) -> list[Finding]:
+    """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
+    if difference is None or difference > NOTHING:
+        return []
+    text = (
+        "The response equals the response to the motion of the calibration, so that the prediction repeats the "
+        "calibration."
+    )
+    action = f"{UNREAD} `check_model`, or `fe-likelihoods check`, finds this before a run."
+    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
+
+
+def note_assumed_noise(of_quantity: Mapping[Sequence[str], Sequence[str]]) -> list[Finding]:
+    """Channels that were not measured have the mean noise of others, the keys."""
+    if not of_quantity:
+        return []
+    parts = [f"{', '.join(others)} (mean of {', '.join(known)})" for known, others in of_quantity.items()]
+    text = (
+        f"The noise of channels that were not measured is assumed: {'; '.join(parts)}. The calibration made the error "
+        "of the model small at the measured channels only, so that it may be larger elsewhere."
+    )
+    action = "Hold a measured channel out of a calibration to see how much."
+    return [Finding("The noise is assumed", CARE, text, action)]
+
+
+def check_coverage(shares: Mapping[str, float], level: float) -> list[Finding]:
+    """Channels whose measured strong part is mostly outside of the band of a probability `level`."""
+    missed = {name: share for name, share in shares.items() if share < HALF}
+    if not missed:
+        return []
+    text = (
+        f"The {100.0 * level:.0f} % band contains less than half of the strong part of {', '.join(missed)}: its spread "
+        "leaves out differences of events."
+    )
+    action = (
+        "Calibrate with several events (in Python, predict_new_event has their spread), or with a noise that follows "
+        "the response; and look for what the model lacks."
+    )
+    return [Finding("The measurements are outside of the band", CARE, text, action, missed)]
+
+
+def check_widening(widening: Mapping[str, float]) -> list[Finding]:
+    """The scatter between events that was widened for a motion of another kind, by quantity; 1 where it was not."""
+    if not max(widening.values(), default=1.0) > 1.0:
+        return []
+    text = (
+        "The calibration hardly speaks for this motion, which is nearly a harmonic. The scatter between events is "
+        "widened by what the response depends on the parameters more than in all calibrated events: "
+        f"{', '.join(f'{name} {times:.1f} times' for name, times in widening.items())}."
+    )
+    return [Finding("A narrow-band motion", CARE, text, "Calibrate with a motion of this kind.", widening)]
+
+
+def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: int) -> list[Finding]:
+    """What few simulations cannot show: equal numbers, and variances that are unknown or unexplained."""
+    found = []
+    if equal:
+        text = (
+            f"All {simulations} simulated values of a number are equal, so nothing is known of its scatter: a rare "
+            f"event with a probability below about {3.0 / simulations:.0%} may not be among them."
+        )
+        found.append(Finding("No scatter was seen", CARE, text, "Use more simulations."))
+    if unknown:
+        text = (
+            f"The signed sample does not determine the standard deviation of {unknown} numbers, whose variance by it "
+            "is negative."
+        )
+        action = "Use more simulations, or propagate with the chain."
+        found.append(Finding("A standard deviation is not determined", CARE, text, action))
+    if unexplained > HALF:
+        text = (
+            f"The emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "
+            "more than as many draws."
+        )
+        action = "Use more simulations, or propagate with the chain."
+        found.append(Finding("The emulator is rough", CARE, text, action, {"unexplained": unexplained}))
+    return found
+
+
+def check_interval_samples(n_samples: int, needed: int, level: float) -> list[Finding]:
+    """Whether the ends of intervals with this probability are beyond all samples."""
+    if n_samples >= needed:
+        return []
+    text = f"The intervals are from {n_samples} samples and do not have their level of {level:g}."
+    return [Finding("Few samples", CARE, text, f"Coverage and interval score need {needed} samples or more.")]
+
+
+def check_failed_samples(reasons: Mapping[str, int], nothing: str = "") -> list[Finding]:
+    """Samples that failed and were left out, by reason; or why there is no prediction at all."""
+    if nothing:
+        return [Finding("No prediction", CARE, f"All simulations failed: {nothing}.")]
+    if not reasons:
+        return []
+    known = "; ".join(f"{count}: {reason}" for reason, count in reasons.items())
+    return [Finding("Samples failed", CARE, f"{sum(reasons.values())} samples failed and are left out ({known}).")]
+
+
+def check_scores(texts: Iterable[str]) -> list[Finding]:
+    """What was said while a prediction was scored, or why it has no scores."""
+    return [Finding("Scores of the prediction", CARE, text) for text in texts]
+
+
+def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
+    """Thresholds that are far from all values [SI], and among them in the unit of the channel."""
+    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
+    low, high = np.abs(values).min() / FAR, np.abs(values).max() * FAR
+    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
+    if not np.all(inside & outside):
+        return []
+    text = (
+        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all predicted "
+        f"values (up to {np.abs(values).max():.3g}): is it in {channel.unit}?"
+    )
+    return [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]

@@ -1,0 +1,139 @@
+"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from samplers.estimates.pareto import pareto_shape
+
+from ..checks.finding import Finding
+from ..checks.stored_tests import check_reweighting
+from ..text_tables import number, text_table
+from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
+from .stored_posterior import resampled_description
+
+if TYPE_CHECKING:
+    from .hierarchical_posterior import HierarchicalPosterior
+
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "ends_within"]
+
+_HYPER_SAMPLES = 100
+_RESAMPLINGS = 12
+_DRAWS = 500
+_QUANTILE = 0.9  # of the Pareto shapes over the hyper-samples
+_ROUND_OFF = 1e-9  # of the width of a prior, by which equal bounds may differ
+
+
+class ReweightingCheck(NamedTuple):
+    """How well the stored samples of one test serve the hierarchical model.
+
+    Effective samples are NaN with common parameters, whose exact value is not among the samples. The Pareto shape
+    belongs to the upper tail of the inverse prior density over the posterior of the test in the hierarchy: where it is
+    large, this posterior reaches values that the prior of the test, and therefore its samples, leave out.
+    """
+
+    effective_samples: float  # of the weights, median over the hyper-samples
+    sample_share: float  # of the marginal likelihood, mean; the rest is from the fitted mixture
+    pareto_shape: float  # 90 % quantile over the hyper-samples
+    error: float  # standard, of the log marginal likelihood: root mean square, from resampled samples
+    shift: float  # largest standard error that this test causes in a hyper-parameter's mean [posterior sd]
+
+
+class HierarchyChecks(NamedTuple):
+    """Reliability of a hierarchical result; errors from sampling the hyper-parameters are not included."""
+
+    tests: dict[str, ReweightingCheck]
+    mean_errors: dict[str, float]  # standard, from the finite samples of all tests [posterior sd]
+    log_evidence_error: float  # standard, from the finite samples and the errors of the tests' evidences
+    findings: tuple[Finding, ...]  # what is not reliable and what to do
+
+    def __str__(self) -> str:
+        rows = [("test", "effective", "of samples", "Pareto", "error", "shift")]
+        for name, each in self.tests.items():
+            effective, share = number(each.effective_samples, 4), f"{each.sample_share:.0%}"
+            others = f"{each.pareto_shape:.2f}", f"{each.error:.2f}", f"{each.shift:.2f}"
+            rows.append((name, effective, share, *others))
+        lines = [text_table(rows)]
+        worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
+        lines.append(f"largest error of a mean: {self.mean_errors[worst]:.2f} posterior sd ({worst})")
+        lines.append(f"error of the log-evidence: {self.log_evidence_error:.2f}")
+        return "\n".join([*lines, *map(str, self.findings)])
+
+
+def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, seed: int = 0) -> HierarchyChecks:
+    """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""
+    rng = np.random.default_rng(seed)
+    used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
+    center, factor = posterior.population(used)
+    weighted = not posterior.common
+    found, changes = {}, []
+    for name, described in posterior.described.items():
+        marginal = population_marginal(described, center, factor)
+        change = np.empty((_RESAMPLINGS, len(used)))
+        for row in change:
+            row[:] = population_marginal(resampled_description(described, rng), center, factor).log_value
+        change -= marginal.log_value
+        changes.append(change)
+        sizes = np.full(2, np.nan)
+        drawn = draw_products(described, center, factor, _DRAWS, rng)
+        with np.errstate(divide="ignore"):
+            shapes = [pareto_shape(row) for row in np.log(inverse_prior(described, drawn))]
+        if weighted:
+            weights = sample_weights(described, center, factor)
+            square = np.square(weights).sum(axis=1)
+            independent = described.effective_sample_size * np.exp(2.0 * described.log_weights).sum()
+            sizes = np.where(square > 0.0, min(independent, 1.0) / np.where(square > 0.0, square, 1.0), 0.0)
+        found[name] = ReweightingCheck(
+            float(np.median(sizes)),
+            float(marginal.sample_share.mean()),
+            float(np.sort(shapes)[int(_QUANTILE * (len(shapes) - 1))]),
+            float(np.sqrt(np.mean(np.var(change, axis=0, ddof=1)))),
+            float(_mean_errors(used, change)[0].max()),
+        )
+    errors, evidence = _mean_errors(used, np.sum(changes, axis=0))
+    evidences = sum(test.log_evidence_error**2 for test in posterior.tests.values())
+    return HierarchyChecks(
+        found,
+        dict(zip(posterior.parameter_names, errors.tolist(), strict=True)),
+        float(np.sqrt(evidence**2 + evidences)),
+        tuple(check_reweighting(found, float(errors.max()), list(posterior.varying))),
+    )
+
+
+def _mean_errors(samples: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, float]:
+    """Standard errors of the means, in standard deviations, and of the log-evidence, if log-likelihoods change.
+
+    `change` (n_resamplings, n) is added to the log-likelihood of the samples (n, ndim).
+    """
+    largest = change.max(axis=1, keepdims=True)
+    weights = np.exp(change - largest)
+    evidence = largest[:, 0] + np.log(weights.mean(axis=1))
+    means = (weights / weights.sum(axis=1, keepdims=True)) @ samples
+    deviations = samples.std(axis=0)
+    return np.std(means, axis=0, ddof=1) / np.where(deviations > 0.0, deviations, 1.0), float(np.std(evidence, ddof=1))
+
+
+def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
+    """Prior bounds of a test that leave out values of common parameters which the other tests' priors permit.
+
+    Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
+    """
+    first = posterior.ndim - len(posterior.common)
+    permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]
+    low, high = np.max(permitted, axis=0)[:, 0], np.min(permitted, axis=0)[:, 1]
+    own = _common_bounds(posterior, name)
+    widths = np.diff(own)
+    # of the width, and of the bound itself where the other one is infinite
+    round_off = _ROUND_OFF * np.where(np.isfinite(widths), widths, np.where(np.isfinite(own), np.abs(own), 0.0))
+    left_out = np.stack([own[:, 0] - round_off[:, 0] > low, own[:, 1] + round_off[:, 1] < high], axis=1)
+    return {
+        common: bounds[is_within].tolist()
+        for common, bounds, is_within in zip(posterior.common, own, left_out, strict=True)
+        if is_within.any()
+    }
+
+
+def _common_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
+    """Prior bounds (n_common, 2) of the common parameters in a test."""
+    return posterior.described[name].prior.bounds[len(posterior.varying) :]

@@ -1,0 +1,90 @@
+"""Offsets are named, correlated errors widen standard deviations, and a fault before a run is one after it."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, Measurements
+from fe_likelihoods.checks.compared import ChannelFit, Compared, Fit, Fits
+from fe_likelihoods.checks.finding import judge
+from fe_likelihoods.checks.fit import check_residuals, check_responses, describe_residuals
+from fe_likelihoods.checks.table import ParameterRow
+from fe_likelihoods.noise.residuals import residual_checks
+
+TOP, TIME = (Channel("top", "displacement", "mm"),), 0.02 * np.arange(400)
+OSCILLATION = 0.05 * np.exp(-0.1 * TIME) * np.cos(6.5 * TIME)
+
+
+def compared(values, responses, fitted=True):
+    measured = Measurements(TOP, 0.02, np.atleast_2d(values))
+    return Compared("", measured, np.array(responses)[:, None], fitted, {}, slice(int(fitted), None))
+
+
+def kinds(found):
+    return {each.kind: each.severity for each in found}
+
+
+@pytest.mark.parametrize(
+    "spoiled", [0.005, 0.02 * TIME / 8.0, 0.01 * (TIME / 8.0) ** 2], ids=["offset", "drift", "parabola"]
+)
+def test_an_offset_or_a_drift_of_a_displacement_is_named(spoiled, rng):
+    noise = 0.002 * rng.standard_normal(400)
+    (found,) = check_responses([compared(OSCILLATION + noise + spoiled, [OSCILLATION])])
+    assert found.kind == "A measurement may have an offset or a drift" and found.numbers["top"] > 0.5
+
+
+def test_white_errors_and_errors_of_a_model_have_no_offset(rng):
+    slower = 0.3 * 0.05 * np.exp(-0.1 * TIME) * np.cos(6.0 * TIME)
+    for errors in (
+        0.002 * rng.standard_normal(400),
+        slower,
+        0.01 * np.convolve(rng.standard_normal(430), np.ones(31) / 5, "valid"),
+    ):
+        assert check_responses([compared(OSCILLATION + errors, [OSCILLATION])]) == []
+
+
+def test_a_fault_that_draws_show_before_a_run_is_named_after_it():
+    """A fit makes up for half of the gain: alone it is better by no factor that is named."""
+    draws = [OSCILLATION, 0.9 * OSCILLATION, np.roll(OSCILLATION, 3)]
+    measured = 1000.0 * OSCILLATION
+    assert kinds(check_responses([compared(measured, draws, False)])) == {"A unit may be wrong": "wrong"}
+    assert kinds(check_responses([compared(measured, [0.99 * measured, *draws])]))["A unit may be wrong"] == "care"
+    assert check_responses([compared(OSCILLATION, [0.99 * OSCILLATION, *draws])]) == []
+
+
+def fits_of(errors, noise="white", assumed=None):
+    checks = residual_checks(errors[None])
+    channel = ChannelFit(TOP[0], errors.size, 0.5, 0.1, checks, float(errors.size if assumed is None else assumed))
+    return Fits((Fit("", Measurements(TOP, 0.02, errors[None]), {}, errors[None], (channel,), noise),), "", "", 0, ())
+
+
+def test_correlated_errors_are_a_note_with_the_factor_in_the_first_sentence(rng):
+    white, slow = rng.standard_normal(4000), np.zeros(4000)
+    for i in range(1, 4000):
+        slow[i] = 0.9 * slow[i - 1] + white[i]
+    assert check_residuals(fits_of(white)) == []
+    (found,) = check_residuals(fits_of(slow))
+    factor = np.sqrt((1 + 0.9**2) / (1 - 0.9**2))  # n_eff of an AR(1) process
+    assert found.severity == "note" and found.numbers["factor"] == pytest.approx(factor, rel=0.15)
+    judgement = judge([found])
+    assert judgement.status == "use" and judgement.width_factor == found.numbers["factor"]
+    assert (
+        str(judgement)
+        == f"Use: standard deviations count {found.numbers['factor']:.2g} times, because errors are correlated."
+    )
+    assert check_residuals(fits_of(slow, "effective", found.numbers["factor"] ** -2 * 4000)) == []
+    assert describe_residuals(residual_checks(white[None]))[0].startswith("White: ")
+    assert describe_residuals(residual_checks(slow[None]))[0].startswith("Correlated (0.9")
+    assert describe_residuals(residual_checks(np.array([[1.0, -2.0]])))[0].startswith("Not checked: 2 samples")
+
+
+def test_a_wider_standard_deviation_is_between_that_of_the_data_and_the_prior():
+    nan = float("nan")
+
+    def row(sd, prior_sd):
+        return ParameterRow("k", "k", "", "", 1.0, prior_sd, 1.0, nan, sd, sd, 0.0, 2.0, nan, nan, 0.0, np.inf)
+
+    assert row(0.01, 1e6).widened(3.0) == pytest.approx(0.03)
+    assert row(0.01, nan).widened(3.0) == pytest.approx(0.03)
+    assert row(0.99, 1.0).widened(100.0) == pytest.approx(1.0, abs=1e-3)
+    assert row(0.5, 1.0).widened(1.0) == pytest.approx(0.5)
+    assert row(1.2, 1.0).widened(3.0) == 1.2 and row(0.0, 1.0).widened(3.0) == 0.0

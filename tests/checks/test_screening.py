@@ -1,0 +1,47 @@
+"""What measurements and motions show by themselves is named before any simulation, and good ones are left alone."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import Channel, Events, Measurements, Record, check_data
+from fe_likelihoods.checks.screening import check_noise_prior, check_steps_of_mass
+
+TOP, DECK = Channel("top", "displacement", "mm"), Channel("deck", "acceleration", "g")
+VALUES = np.random.default_rng(1).standard_normal((2, 100)) * [[0.02], [3.0]]
+MOTION = Record("EQ", 0.02, 2.0 * np.random.default_rng(2).standard_normal(100))
+
+
+def kinds(values=VALUES, record=MOTION, description=""):
+    return [each.kind for each in check_data(Measurements([TOP, DECK], 0.02, values, description), record)]
+
+
+def test_plausible_data_are_left_alone():
+    assert kinds() == [] and kinds(record=None) == [] and kinds(record=[MOTION, MOTION.scale(0.5)]) == []
+    assert kinds(record=Events([MOTION, MOTION.scale(0.5)], rest=1.0)) == []
+    gappy = VALUES.copy()
+    gappy[0, 10:20] = np.nan
+    assert kinds(gappy) == []
+
+
+@pytest.mark.parametrize(
+    ("factors", "scale"),
+    [((1000.0, 1.0), 1.0), ((1.0, 100.0), 1.0), ((1.0, 1.0), 9.80665 * 9.80665), ((1.0, 1.0), 1e-8)],
+)
+def test_sizes_that_no_structure_has_are_named(factors, scale):
+    (found,) = check_data(Measurements([TOP, DECK], 0.02, VALUES * np.array(factors)[:, None]), MOTION.scale(scale))
+    assert found.kind == "A size is not plausible" and found.severity == "care" and found.numbers["peak"] > 0.0
+
+
+def test_a_channel_that_never_changes_is_named_and_synthetic_data_are_a_note():
+    silent = VALUES.copy()
+    silent[0] = 0.01
+    assert kinds(silent) == ["A sensor was silent"]
+    (found,) = check_data(Measurements([TOP, DECK], 0.02, VALUES, "SYNTHETIC: a column"))
+    assert (found.kind, found.severity) == ("Synthetic data", "note")
+
+
+def test_noise_priors_and_steps_are_judged_by_numbers():
+    assert check_noise_prior("top", "mm", 0.02, 0.05) == []
+    assert "half-normal(5 mm)" in check_noise_prior("top", "mm", 5.0, 0.05)[0].action
+    assert check_steps_of_mass(["acceleration@1"], 5e-4) == check_steps_of_mass([], 0.01) == []
+    assert "48 %" in check_steps_of_mass(["acceleration@1"], 0.004)[0].text
