@@ -1,6 +1,6 @@
 """Modal data from files and from programs of operational modal analysis."""
 
-import warnings
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from .modal_data import ModalData, real_shapes
 
 __all__ = ["read_modal_data"]
 
+logger = logging.getLogger(__name__)
+
 _FREQUENCY, _DAMPING, _MODE, _SET = ("frequency", "freq", "f"), ("damping", "xi"), ("mode",), ("set", "identification")
-_SCATTER = 10.0  # of phases [deg] above which the real part of a shape loses part of it
 
 
 def read_modal_data(
@@ -159,14 +160,9 @@ def _in_hertz(values: np.ndarray, stated: str | None, given: str | None, where: 
 
 
 def _real(shapes: np.ndarray) -> np.ndarray:
-    """Real shapes; warns if complex ones lose much."""
+    """Real shapes: those of complex ones, after a rotation by the mean phase."""
     if not np.iscomplexobj(shapes):
         return shapes
     real, scatter = real_shapes(shapes)
-    if (bad := np.flatnonzero(scatter > _SCATTER)).size:
-        warnings.warn(
-            f"the phases of the shapes of modes {(bad + 1).tolist()} scatter by {scatter[bad].round(1).tolist()} "
-            "degrees, so their real parts are poor shapes: look at the identification, or leave these shapes out",
-            stacklevel=4,
-        )
+    logger.info("complex shapes: their real parts are taken; the phases scatter by %s degrees", scatter.round(1))
     return real
