@@ -64,7 +64,7 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
         samples = as_points(samples, posterior.prior.names)
         points = np.concatenate([samples.mean(axis=0)[None], points])
         none = np.full(posterior.ndim, np.nan)
-        rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none), none)
+        rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none, none), none)
     compared: list[Compared] = []
     for key, likelihood, columns in data_sets_of(posterior):
         compared += compare(likelihood, points[:, columns], samples is not None, key)

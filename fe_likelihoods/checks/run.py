@@ -36,7 +36,8 @@ class FinishedRun(NamedTuple):
     parameters: tuple[Parameter, ...]
     samples: np.ndarray  # (n, ndim) of the posterior [unit of the parameter]
     log_prob: np.ndarray  # (n,)
-    mean_error: np.ndarray  # (ndim,) Monte Carlo standard error; NaN where it is not known
+    mean_error: np.ndarray  # (ndim,) Monte Carlo standard error of the mean; NaN where it is not known
+    sd_error: np.ndarray  # (ndim,) the same of the standard deviation
     effective_sample_size: float  # independent samples with the same error of the mean, the smallest
     truth: np.ndarray  # (ndim,), NaN where none is known
     discard: int  # iterations left out at the beginning of the chain
@@ -109,7 +110,7 @@ def read_run(
         )
     tempered = hasattr(sampler, "ladder") and bool(sampler.ladder)
     autocorrelation = np.nan if tempered else _autocorrelation_time(sampler, discard)
-    mean_error, size = _errors(sampler, samples, tempered, autocorrelation, discard, thin)
+    mean_error, sd_error, size = _errors(sampler, samples, tempered, autocorrelation, discard, thin)
     likelihood, prior = getattr(posterior, "likelihood", None), getattr(posterior, "prior", None)
     return FinishedRun(
         sampler=sampler,
@@ -120,6 +121,7 @@ def read_run(
         samples=samples,
         log_prob=sampler.get_log_prob(flat=True, discard=discard, thin=thin),
         mean_error=mean_error,
+        sd_error=sd_error,
         effective_sample_size=size,
         truth=_truth(truth, [each.name for each in parameters]),
         discard=discard,
@@ -181,13 +183,17 @@ def _autocorrelation_time(sampler: EnsembleSampler, discard: int) -> float:
 
 def _errors(
     sampler: EnsembleSampler, samples: np.ndarray, tempered: bool, autocorrelation: float, discard: int, thin: int
-) -> tuple[np.ndarray, float]:
-    """Standard errors of the means (ndim,), and the effective sample size of the worst parameter."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Standard errors of means and standard deviations (ndim,), and the effective sample size of the worst parameter.
+
+    For emcee's own sampler, those of as many independent draws.
+    """
     spread = samples.std(axis=0)
     if tempered:
         error = sampler.mean_error(discard=discard, thin=thin)
         size = float(np.min((spread[error > 0.0] / error[error > 0.0]) ** 2, initial=len(samples)))
-        return error, size
+        return error, sampler.sd_error(discard=discard, thin=thin), size
     iterations = sampler.iteration - discard
     size = min(iterations * sampler.nwalkers / autocorrelation, float(len(samples)))  # min keeps a first NaN
-    return spread / np.sqrt(size), float(size)
+    of_variance = np.square(samples - samples.mean(axis=0)).std(axis=0)
+    return spread / np.sqrt(size), 0.5 * of_variance / np.where(spread > 0.0, spread, 1.0) / np.sqrt(size), float(size)

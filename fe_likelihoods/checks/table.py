@@ -14,21 +14,21 @@ __all__ = ["Moments", "ParameterRow", "describe_prior", "moments_of", "parameter
 
 
 class Moments(NamedTuple):
-    """Means, their Monte Carlo standard errors, standard deviations, 5 %, 50 % and 95 % quantiles (ndim,)."""
+    """Means and standard deviations, their Monte Carlo errors, 5 %, 50 % and 95 % quantiles (ndim,)."""
 
     mean: np.ndarray
     mean_error: np.ndarray
     sd: np.ndarray
+    sd_error: np.ndarray
     low: np.ndarray
     median: np.ndarray
     high: np.ndarray
 
     @classmethod
-    def of_samples(cls, samples: np.ndarray, mean_error: np.ndarray) -> "Moments":
+    def of_samples(cls, samples: np.ndarray, mean_error: np.ndarray, sd_error: np.ndarray) -> "Moments":
         """Moments of samples (n, ndim)."""
-        return cls(
-            samples.mean(axis=0), mean_error, samples.std(axis=0), *np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
-        )
+        quantiles = np.quantile(samples, [0.05, 0.5, 0.95], axis=0)
+        return cls(samples.mean(axis=0), mean_error, samples.std(axis=0), sd_error, *quantiles)
 
 
 def moments_of(run: FinishedRun) -> Moments:
@@ -38,11 +38,11 @@ def moments_of(run: FinishedRun) -> Moments:
     """
     signed = getattr(run.sampler, "signed_sample", None)
     if signed is not None:
-        (mean, error), sd = signed.expectation(), signed.standard_deviation().value
-        if np.all(error < run.mean_error) and np.all(sd > 0.0):
+        mean, sd = signed.expectation(), signed.standard_deviation()
+        if np.all(mean.error < run.mean_error) and np.all(sd.value > 0.0):
             quantiles = (signed.quantile(probability).value for probability in (0.05, 0.5, 0.95))
-            return Moments(mean, error, sd, *quantiles)
-    return Moments.of_samples(run.samples, run.mean_error)
+            return Moments(*mean, *sd, *quantiles)
+    return Moments.of_samples(run.samples, run.mean_error, run.sd_error)
 
 
 class ParameterRow(NamedTuple):
@@ -89,7 +89,7 @@ def rows_of(
     truth: np.ndarray,
 ) -> list[ParameterRow]:
     """One row for each parameter; errors of the means and true values (ndim,) may be NaN."""
-    mean, mean_error, sd, low, _, high = moments
+    mean, mean_error, sd, _, low, _, high = moments
     rows, known = [], [] if prior is None else prior.table()[1]
     for i, parameter in enumerate(parameters):
         text, of_prior, bounds = "", (np.nan, np.nan), (-np.inf, np.inf)

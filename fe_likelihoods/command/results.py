@@ -26,11 +26,11 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     from samplers import ladder_table, summary
 
     posterior, factors = run.posterior, np.array([p.factor for p in run.parameters])
-    mean, errors, sd, low, median, high = (values / factors for values in moments_of(run))
+    mean, errors, sd, of_sd, low, median, high = (values / factors for values in moments_of(run))
     labels = [parameter.label for parameter in run.parameters]
     with np.errstate(divide="ignore", invalid="ignore"):
         cv = sd / np.abs(mean)
-    moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors)
+    moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
     fit = _fit_rows(posterior, run.samples)
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
@@ -45,9 +45,9 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     ]
     lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    columns = ("parameter", "mean", "mean_error", "sd", "cv", "q05", "median", "q95", "nominal")
+    columns = ("parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal")
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
-    values = (labels, moments.mean, errors, moments.sd, moments.cv, low, median, high, nominal)
+    values = (labels, moments.mean, errors, moments.sd, of_sd, moments.cv, low, median, high, nominal)
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     write_csv(folder / "summary.csv", rows)
     files = ["summary.txt", "summary.csv"]

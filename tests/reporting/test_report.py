@@ -235,10 +235,11 @@ def test_moments_are_those_of_the_more_accurate_sample(rng):
     points = rng.standard_normal((20_000, 2))
     signed = SignedSample(points, np.full(20_000, 1.0 / 20_000), np.zeros(20_000, dtype=int), 0.0, 0.0)
     chain, errors = 1.2 * rng.standard_normal((100, 2)), np.full(2, 0.12)
-    finished = SimpleNamespace(sampler=SimpleNamespace(signed_sample=signed), samples=chain, mean_error=errors)
+    numbers = {"samples": chain, "mean_error": errors, "sd_error": np.full(2, 0.08)}
+    finished = SimpleNamespace(sampler=SimpleNamespace(signed_sample=signed), **numbers)
     moments = moments_of(finished)
     assert moments.sd == pytest.approx(np.ones(2), abs=0.03) and moments.high == pytest.approx(1.645, abs=0.06)
-    assert np.all(moments.mean_error < 0.01)
+    assert np.all(moments.mean_error < 0.01) and np.all(moments.sd_error < 0.01)
     undetermined = np.where(np.arange(20_000) == 0, -1e3, 1.0) / 20_000  # of a point in a tail
     weights = undetermined / undetermined.sum()
     finished.sampler.signed_sample = signed._replace(coords=np.vstack([[1e3, 0.0], points[1:]]), weights=weights)
@@ -358,10 +359,12 @@ def test_identical_samples_have_an_effective_sample_size_without_a_warning():
         def mean_error(self, discard, thin):
             return np.array([0.0, 0.5])
 
+        sd_error = mean_error
+
     samples = np.column_stack([np.ones(100), np.arange(100.0)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        _, size = _errors(Stuck(), samples, True, np.nan, 0, 1)
+        *_, size = _errors(Stuck(), samples, True, np.nan, 0, 1)
     assert size == pytest.approx((samples[:, 1].std() / 0.5) ** 2) or size == 100.0
 
 
