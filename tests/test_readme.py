@@ -23,14 +23,15 @@ PAGES = [
     *sorted(p for p in (ROOT / "docs").rglob("*.rst") if p.relative_to(ROOT / "docs").parts[0] not in GENERATED),
 ]
 # two CPU seconds or more
-SAMPLING = {f"docs/{page}.rst" for page in ("arviz", "events", "faq", "few_simulations", "information", "parallel")} | {
-    "docs/predictions.rst"
-}
+SAMPLING = {
+    f"docs/{page}.rst" for page in ("arviz", "events", "faq", "few_simulations", "information", "modes", "parallel")
+} | {"docs/predictions.rst"}
 MARKDOWN = re.compile(r"(?P<slow><!-- slow -->\n)?```(?P<language>\w+)\n(?P<code>.*?)```", re.DOTALL)
 RESTRUCTURED = re.compile(
     r"(?P<slow>^\.\. slow\n\n)?^\.\. code-block:: (?P<language>\w+)\n(?:   :.*\n)*\n(?P<code>(?:   .*\n|\n)+)",
     re.MULTILINE,
 )
+SHOWN_FILE = re.compile(r"^\.\. code-block:: text\n   :caption: (\S+)\n\n((?:   .*\n|\n)+)", re.MULTILINE)
 
 
 def blocks(page: Path, language: str, slow: bool = True) -> list[str]:
@@ -48,7 +49,9 @@ def name_of(page: Path) -> str:
 
 
 def run(page: Path, folder: Path, slow: bool) -> None:
-    """Run the Python blocks of a page as one script in `folder`."""
+    """Run the Python blocks of a page as one script in `folder`, which has the files that are shown with their name."""
+    for name, content in SHOWN_FILE.findall(page.read_text()):
+        (folder / name).write_text(textwrap.dedent(content).strip() + "\n")
     script = folder / "page.py"
     script.write_text("\n\n".join(blocks(page, "python", slow)))
     run_script(script)

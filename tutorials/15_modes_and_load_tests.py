@@ -39,7 +39,7 @@ from fe_likelihoods import (
     stiffness_loss,
     to_si,
 )
-from fe_likelihoods.modal.load_test import LoadTest
+from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
 from samplers import SMCSampler
 

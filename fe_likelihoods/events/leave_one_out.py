@@ -35,7 +35,7 @@ from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
 from ..checks.finding import warn
-from ..checks.stored_tests import check_chain_length
+from ..checks.stored_posteriors import check_chain_length
 from ..priors.points import as_points
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior

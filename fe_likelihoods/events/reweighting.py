@@ -8,7 +8,7 @@ import numpy as np
 from samplers.estimates.pareto import pareto_shape
 
 from ..checks.finding import Finding
-from ..checks.stored_tests import check_reweighting
+from ..checks.stored_posteriors import check_reweighting
 from ..text_tables import number, text_table
 from .population_marginal import draw_products, inverse_prior, population_marginal, sample_weights
 from .stored_posterior import resampled_description

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks.finding import warn
-from ..checks.stored_tests import check_impossible_draws
+from ..checks.stored_posteriors import check_impossible_draws
 from ..checks.transfer import check_widening, is_narrow
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios

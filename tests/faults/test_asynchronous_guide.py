@@ -134,6 +134,6 @@ def test_what_cannot_be_asynchronous_is_refused():
     emulated = symmetric()
     emulated.likelihood.simulator.response_memory.max_bytes = 1000
     sampler = SMCSampler(N, 2, emulated, vectorize=True, guide=emulated.guide(), asynchronous=True)
-    with pytest.raises(ValueError, match="memory_bytes of 76800 or more"):
+    with pytest.raises(ValueError, match="memory_bytes of 57600 or more"):
         sampler.run_mcmc(None, 0)
     assert emulated.likelihood.simulations == 0

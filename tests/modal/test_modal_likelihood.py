@@ -24,7 +24,7 @@ from fe_likelihoods import (
     SimulationCache,
     SimulationFailed,
 )
-from fe_likelihoods.modal.load_test import LoadTest
+from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
 from fe_likelihoods.models.undamped_modes import undamped_modes
 

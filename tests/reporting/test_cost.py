@@ -80,10 +80,10 @@ def test_the_run_begins_with_the_timed_points():
     made = posterior.report()["simulations"]
     assert made == estimate.evaluated == 4 and len(estimate.seconds) == 3  # one to start, three that count
     sampler = SMCSampler(64, posterior.ndim, posterior, vectorize=True, seed=4)
-    posterior(sampler._functions.draw_prior(64, sampler._random))
+    posterior(sampler._target.sample_prior(64, sampler._random))
     assert posterior.report()["simulations"] == 64
     # another seed has other points
-    posterior(SMCSampler(64, posterior.ndim, posterior, seed=5)._functions.draw_prior(64, np.random.RandomState(5)))
+    posterior(SMCSampler(64, posterior.ndim, posterior, seed=5)._target.sample_prior(64, np.random.RandomState(5)))
     assert posterior.report()["simulations"] == 128
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, to_si
-from fe_likelihoods.modal.load_test import LoadTest
+from fe_likelihoods.modal.load_cases import LoadTest
 
 CHANNELS = Channel("midspan", "displacement", "mm"), Channel("bottom", "strain", "microstrain")
 CASES = ("one truck", "two trucks", "four trucks")
