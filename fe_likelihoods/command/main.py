@@ -134,7 +134,7 @@ def _say_assumed(problem: Any) -> None:
 @click.option("--out", type=_FILE, help="PNG file of the prior predictive picture.", show_default="check-NAME.png")
 @click.option("--quiet", is_flag=True, help="Show no progress bars.")
 def check(file: Path, out: Path | None, quiet: bool) -> None:
-    """Read FILE and its data, rehearse with about 100 simulations, and say what a run will do and cost.
+    """Read FILE and its data, test with about 100 simulations, and say what a run will do and cost.
 
     It tries whether the model is repeatable and follows its motion, whether units, signs, clocks and channels are
     right, and whether step and mesh are fine enough for the data. A picture compares the measurements with simulations

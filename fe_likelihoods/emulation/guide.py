@@ -183,9 +183,12 @@ class ResponseGuide:
         return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
 
     def _of_few_ends(self) -> tuple[str, ...]:
-        """A sentence if one mode was found, by fewer starts than wanted: another one may not have been found."""
+        """A sentence if one mode was found, by fewer starts than wanted: another one may not have been found.
+
+        On a growing record most starts are given up on its first part, in right runs as well.
+        """
         n = 0 if self.search is None else ended(self.search)
-        if not 0 < n < self._starts or len(self.search.modes) > 1:
+        if not 0 < n < self._starts or len(self.search.modes) > 1 or hasattr(self._target.model, "first"):
             return ()
         return (
             f"only {n} of {len(self.search.ends)} starts led to the one mode that was found, the others were given up "

@@ -161,10 +161,11 @@ def search_modes(
 ) -> Generator[float, None, ModeSearch]:
     """Search from starts (n, n_structural) [standard normal coordinates], on growing parts of the record if possible.
 
-    `first` starts begin (default: all). Further ones follow until as many have reached a mode (ascents that are given
-    up may have been on their way to another one), and while `unseen_share` is large (modes that one start alone led to
-    say that others may have been missed). They begin in the order of their likelihoods, for which each of them is
-    simulated once on the first part of the record: high ones are given up less often.
+    `first` starts begin (default: all). Further ones follow until enough have reached a mode (ascents that are given up
+    may have been on their way to another one; on a growing record, some follow once), and while `unseen_share` is large
+    (modes that one start alone led to say that others may have been missed). They begin in the order of their
+    likelihoods, for which each of them is simulated once on the first part of the record: high ones are given up less
+    often.
 
     `remember` stores responses for a resumed run, ``fits(n)`` says whether n more simulations of the whole record fit
     into the budget, and `remaining` how many are left of it. With `overlap`, ascents begin together, and go on as soon
@@ -199,8 +200,10 @@ def search_modes(
             _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
         )
         search = _modes_of(parts[-1], standing_for, spent, finished)
-        missing = max(first - ended(search), _further(first) if unseen_share(search) > UNSEEN else 0)
-        if not finished or missing == 0 or following == most or not remember("starts", affordable)[0]:
+        # on a growing record most starts are given up early, in right runs as well: others follow once
+        few = _enough(search, first) - ended(search) if begin == 0 or len(parts) == 1 else 0
+        missing = max(few, _further(first) if unseen_share(search) > UNSEEN else 0)
+        if not finished or missing <= 0 or following == most or not remember("starts", affordable)[0]:
             return search
         if begin == 0:
             heights = yield from counted(_heights(parts[0], starts, remember, fits, overlap))
@@ -253,6 +256,16 @@ def unseen_share(search: ModeSearch) -> float:
     """
     alone = sum(search.ends.count(number) == 1 for number in range(len(search.modes)))
     return alone / max(ended(search), 1)
+
+
+def _enough(search: ModeSearch, first: int) -> int:
+    """Number of starts that shall lead to the modes found: `first` to one mode, and more to several ones.
+
+    If as many starts lead to another mode as to each of k modes found, n starts miss it with the probability
+    (k / (k + 1))^n, which shall be 1 / 2^first.
+    """
+    k = max(len(search.modes), 1)
+    return int(np.ceil(first * np.log(2.0) / np.log((k + 1.0) / k) - 1e-9))
 
 
 def ended(search: ModeSearch) -> int:

@@ -66,7 +66,8 @@ def _forget_lock() -> None:
     _lock = threading.RLock()
 
 
-os.register_at_fork(after_in_child=_forget_lock)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_lock)
 
 
 def without_addresses(message: str) -> str:

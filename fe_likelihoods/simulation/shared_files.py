@@ -8,7 +8,6 @@ happens twice, the model is refused.
 """
 
 import contextlib
-import fcntl
 import os
 import shutil
 import stat
@@ -21,6 +20,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from .faults import UnusableModel
+
+try:
+    import fcntl
+except ImportError:  # Windows: simulations that write one file at once are not kept apart there
+    fcntl = None
 
 __all__ = [
     "RunningSimulation",
@@ -172,6 +176,8 @@ class RunningSimulation:
             )
             raise self._refusal
         self.shared = worse(shown, self.shared)
+        if fcntl is None:
+            return
         lock = os.path.join(temporary, f"fe_likelihoods_{os.getuid()}.lock")
         self._lock = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:

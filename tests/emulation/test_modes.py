@@ -110,17 +110,14 @@ def _equal_modes(n):
     return Posterior(FELikelihood(model, measured), prior)
 
 
-@pytest.mark.parametrize(
-    ("n", "most"), [(2, 24), *(pytest.param(n, most, marks=pytest.mark.slow) for n, most in ((1, 12), (6, 32)))]
-)
-def test_starts_are_added_until_few_unseen_modes_are_expected(n, most):
-    """And while few ascents have reached a mode: with one mode, four of eight are given up in some of the searches."""
+@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 6))])
+def test_starts_are_added_until_few_unseen_modes_are_expected(n):
+    """And until so many have reached the modes found that another one is missed in one of 64 cases."""
     found = [find_modes(_equal_modes(n), seed=seed) for seed in range(1, 6)]
     for search in found:
-        assert len(search.ends) <= most
-        assert unseen_share(search) <= UNSEEN or len(search.ends) == 32
-        assert ended(search) >= 6 or len(search.ends) >= 12
-        assert len(search.modes) >= n - 1
+        k, most = len(search.modes), len(search.ends) == 24
+        assert len(search.ends) <= 24 and (most or unseen_share(search) <= UNSEEN)
+        assert most or (k / (k + 1.0)) ** ended(search) <= 2.0**-6
     # a share of UNSEEN is expected to be missed: of 30, 1.5 with a standard deviation of 1.2
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
 
