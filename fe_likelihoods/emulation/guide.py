@@ -185,10 +185,11 @@ class ResponseGuide:
     def _of_few_ends(self) -> tuple[str, ...]:
         """A sentence if one mode was found, by fewer starts than wanted: another one may not have been found.
 
-        On a growing record most starts are given up on its first part, in right runs as well.
+        On a growing record most starts are given up on its first part, in right runs as well: two are enough there.
         """
         n = 0 if self.search is None else ended(self.search)
-        if not 0 < n < self._starts or len(self.search.modes) > 1 or hasattr(self._target.model, "first"):
+        wanted = 2 if hasattr(self._target.model, "first") else self._starts
+        if not 0 < n < wanted or len(self.search.modes) > 1:
             return ()
         return (
             f"only {n} of {len(self.search.ends)} starts led to the one mode that was found, the others were given up "
@@ -199,15 +200,16 @@ class ResponseGuide:
 
     def _of_unseen_modes(self, least: float, most: float) -> tuple[str, ...]:
         """A sentence if the expected share of unseen modes is above `least` and not above `most`."""
-        unseen = 0.0 if self.search is None else unseen_share(self.search)
-        if not least < unseen <= most:
+        if (
+            self.search is None
+            or len(self.search.modes) < 2
+            or not least < (unseen := unseen_share(self.search)) <= most
+        ):
             return ()
-        n = len(self.search.modes)
-        reached = f"{n} modes, to some of them only once" if n > 1 else "one mode, to which only one of them led"
         return (
-            f"{len(self.search.ends)} starts led to {reached}, so "
-            f"about {100.0 * unseen:.0f} % of further starts would lead to modes that were not found: use more starts, "
-            "or a larger limit of simulations",
+            f"{ended(self.search)} starts led to {len(self.search.modes)} modes, to some of them only once, so about "
+            f"{100.0 * unseen:.0f} % of further starts would lead to modes that were not found: use more starts, or a "
+            "larger limit of simulations",
         )
 
     @property
