@@ -8,11 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import emcee
+import numpy as np
 import pytest
 
 import samplers
 from tests.faults.kills import evaluated_again
-from tests.faults.resumable_run import STEPS, go_on, make, outcome, points_of
+from tests.faults.resumable_run import STEPS, N, go_on, make, outcome, points_of
 
 FOLDERS = tuple(str(Path(package.__file__).parent) for package in (samplers, emcee))
 
@@ -64,13 +65,13 @@ def run(path, kind, log, lines=()):
 
 @cache
 def whole_run(kind):
-    """Outcome of a run without interrupts, the points that it evaluates, and the number of lines that it traces."""
+    """A run without interrupts, the points that it evaluates, and the number of lines that it traces."""
     with TemporaryDirectory() as folder:
         whole, _ = run(None, kind, Path(folder) / "log")
         points = set(points_of(Path(folder) / "log"))
     with Interrupt() as counted:
         go_on(make(None, kind), kind)
-    return outcome(whole), points, counted.count
+    return whole, points, counted.count
 
 
 @pytest.mark.parametrize("stored", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["file", "memory"])
@@ -78,7 +79,7 @@ def whole_run(kind):
     "kind",
     ["smc", *(pytest.param(k, marks=pytest.mark.slow) for k in ("guided", "map", "moves", "asynchronous", "thin"))],
 )
-def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored, tmp_path):
+def test_the_missing_steps_are_those_of_a_run_without_interrupt(kind, stored, tmp_path):
     whole, evaluated, lines_traced = whole_run(kind)
     choose, interrupts = random.Random(kind), 0
     for trial in range(2):
@@ -87,8 +88,16 @@ def test_the_missing_steps_have_the_bits_of_a_run_without_interrupt(kind, stored
         lines = [choose.randint(1, lines_traced), int((0.7 + 0.3 * choose.random()) * lines_traced)]
         sampler, more = run(path, kind, tmp_path / f"log {trial}", lines)
         interrupts += more
-        assert sampler.iteration == STEPS and outcome(sampler) == whole
-        assert set(points_of(tmp_path / f"log {trial}")) == evaluated
+        assert sampler.iteration == STEPS
+        if kind == "asynchronous":  # which points have arrived at a decision that Ctrl-C prevents is a matter of chance
+            error = np.hypot(sampler.log_evidence_error, whole.log_evidence_error)
+            assert abs(sampler.log_evidence - whole.log_evidence) < 4.0 * error
+            points = points_of(tmp_path / f"log {trial}")
+            # at most a submission for each interrupt, since this pool evaluates points when they are submitted
+            assert len(points) - len(set(points)) <= 4 * N * more
+        else:
+            assert outcome(sampler) == outcome(whole)
+            assert set(points_of(tmp_path / f"log {trial}")) == evaluated
     assert interrupts >= 2
 
 
