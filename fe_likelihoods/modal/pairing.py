@@ -46,7 +46,7 @@ def best_scale(shape: np.ndarray, measured: np.ndarray) -> float:
 
 
 def shape_misfit(shape: np.ndarray, measured: np.ndarray) -> float:
-    """Squared distance of a measured shape (n_sensors,) from the best multiple of a computed one, |m|² (1 - MAC)."""
+    """Squared distance ``|m|² (1 - MAC)`` of a measured shape (n_sensors,) from the best multiple of a computed one."""
     return float(np.square(measured - best_scale(shape, measured) * shape).sum())
 
 
