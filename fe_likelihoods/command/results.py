@@ -64,7 +64,7 @@ def _of_the_sampler(run: FinishedRun) -> list[str]:
     """Evidence and verdict, or the length of a Markov chain, as lines of text."""
     if run.tempered:
         value, error = run.sampler.log_evidence, run.sampler.log_evidence_error
-        return [f"log-evidence {value:.2f} +- {error:.2f}", str(run.verdict)]
+        return [f"log-evidence {value:.2f} +- {error:.2g}", str(run.verdict)]
     used = run.sampler.iteration - run.discard
     worth = (
         f"worth about {run.effective_sample_size:.0f} independent ones (longest autocorrelation time "
