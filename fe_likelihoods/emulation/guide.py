@@ -31,6 +31,7 @@ from .modes import (
     ModeSearch,
     approach,
     check_starts,
+    counted,
     draw_starts,
     ended,
     search_from,
@@ -183,13 +184,9 @@ class ResponseGuide:
         return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
 
     def _of_few_ends(self) -> tuple[str, ...]:
-        """A sentence if one mode was found, by fewer starts than wanted: another one may not have been found.
-
-        On a growing record most starts are given up on its first part, in right runs as well: two are enough there.
-        """
+        """A sentence if one mode was found, by fewer starts than wanted, or by one on a growing record."""
         n = 0 if self.search is None else ended(self.search)
-        wanted = 2 if hasattr(self._target.model, "first") else self._starts
-        if not 0 < n < wanted or len(self.search.modes) > 1:
+        if n == 0 or n >= (2 if self.search.grown else self._starts) or len(self.search.modes) > 1:
             return ()
         return (
             f"only {n} of {len(self.search.ends)} starts led to the one mode that was found, the others were given up "
@@ -454,15 +451,12 @@ class ResponseGuide:
                     f"{part.simulator.response_memory.max_bytes}"
                 )
 
-    def _counted(self, search: Generator[float, None, Any]) -> Generator[None, None, Any]:
+    def _counted(self, search: Generator[float, None, Any]) -> Generator[float, None, Any]:
         """Result of a search; simulations are counted batch by batch, as soon as they are made."""
-        while True:
-            try:
-                cost = next(search)
-            except StopIteration as end:
-                return end.value
-            self.simulations += cost
-            yield
+        return counted(search, self._spend)
+
+    def _spend(self, simulations: float) -> None:
+        self.simulations += simulations
 
     def _add_concern(self, text: str) -> None:
         if text not in self._concerns:

@@ -20,6 +20,7 @@ __all__ = [
     "ModeSearch",
     "approach",
     "check_starts",
+    "counted",
     "draw_starts",
     "ended",
     "find_modes",
@@ -88,12 +89,15 @@ class ModeSearch(NamedTuple):
         Simulations run, parts of a record counted as fractions; a call of the model's ``jacobian`` counts as one.
     finished : bool
         False if `max_simulations` ended the search.
+    grown : bool
+        Whether it began with the first part of the record, where most starts are given up, in right runs as well.
     """
 
     modes: tuple[Mode, ...]
     ends: tuple[int, ...]
     simulations: float
     finished: bool
+    grown: bool = False
 
 
 def laplace(target: ResponseTarget, end: Ascent, starts: tuple[int, ...] = ()) -> Mode:
@@ -178,16 +182,9 @@ def search_modes(
     standing_for: list[int] = []  # start that has taken the place of each; -1 for none
     spent = 0.0
 
-    def counted(steps: Generator[float, None, Any]) -> Generator[float, None, Any]:
-        """The steps of another generator, whose costs are added."""
+    def spend(cost: float) -> None:
         nonlocal spent
-        while True:
-            try:
-                cost = next(steps)
-            except StopIteration as end:
-                return end.value
-            spent += cost
-            yield cost
+        spent += cost
 
     def affordable() -> list[np.ndarray]:  # the search is worth nothing without draws after it
         return [np.array(remaining() > 2.0 * spent)]
@@ -196,28 +193,31 @@ def search_modes(
     while True:
         fresh = range(begin, following)
         standing_for.extend(fresh)
-        finished = yield from counted(
-            _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
-        )
-        search = _modes_of(parts[-1], standing_for, spent, finished)
-        # on a growing record most starts are given up early, in right runs as well: others follow once
-        few = _enough(search, first) - ended(search) if begin == 0 or len(parts) == 1 else 0
+        ascents = _ascend_from(parts, {k: starts[k] for k in fresh}, standing_for, remember, fits, overlap)
+        finished = yield from counted(ascents, spend)
+        search = _modes_of(parts, standing_for, spent, finished)
+        few = _enough(search, first) - ended(search) if begin == 0 or not search.grown else 0
         missing = max(few, _further(first) if unseen_share(search) > UNSEEN else 0)
         if not finished or missing <= 0 or following == most or not remember("starts", affordable)[0]:
             return search
         if begin == 0:
-            heights = yield from counted(_heights(parts[0], starts, remember, fits, overlap))
+            heights = yield from counted(_heights(parts[0], starts, remember, fits, overlap), spend)
+            if heights is None:
+                return search._replace(simulations=spent, finished=False)
             starts = np.concatenate([starts[:following], starts[_in_order(starts, heights, following)]])
             most = min(most, len(starts))
             if following == most:  # every simulation has failed
-                return search
+                return search._replace(simulations=spent)
         begin, following = following, min(following + missing, most)
 
 
 def _heights(
     part: _Part, starts: np.ndarray, remember: Remember, fits: Callable[[float], bool], overlap: bool
-) -> Generator[float, None, np.ndarray]:
-    """Log-likelihoods (n,) of starts (n, n_structural) on the first part of the record; -inf where one failed."""
+) -> Generator[float, None, np.ndarray | None]:
+    """Log-likelihoods (n,) of starts (n, n_structural) on the first part of the record; -inf where one failed.
+
+    None if the budget ended it.
+    """
 
     def simulate(start: np.ndarray) -> Generator[np.ndarray, Any, float]:
         runs = yield start[None]
@@ -227,7 +227,18 @@ def _heights(
     batches = Batches(part.target, remember, lambda points: fits(part.share * points), overlap)
     for points in batches.complete({k: simulate(start) for k, start in enumerate(starts)}, heights.__setitem__):
         yield part.share * points
-    return heights
+    return None if batches.interrupted else heights
+
+
+def counted(steps: Generator[float, None, Any], spend: Callable[[float], None]) -> Generator[float, None, Any]:
+    """The steps of a search, and its result; `spend` is told the cost of each step as soon as it is made."""
+    while True:
+        try:
+            cost = next(steps)
+        except StopIteration as end:
+            return end.value
+        spend(cost)
+        yield cost
 
 
 def _in_order(starts: np.ndarray, heights: np.ndarray, begun: int) -> np.ndarray:
@@ -341,8 +352,9 @@ def _ascend_from(
     return True
 
 
-def _modes_of(part: _Part, standing_for: list[int], spent: float, finished: bool) -> ModeSearch:
+def _modes_of(parts: list[_Part], standing_for: list[int], spent: float, finished: bool) -> ModeSearch:
     """The modes at the ends on the whole record, and which of them each start led to."""
+    part = parts[-1]
     modes = sorted((laplace(part.target, end, (k,)) for k, end in part.ends.items()), key=lambda m: -m.log_evidence)
     modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
     number_of = {mode.starts[0]: number for number, mode in enumerate(modes)}
@@ -354,7 +366,8 @@ def _modes_of(part: _Part, standing_for: list[int], spent: float, finished: bool
 
     ends = tuple(end_of(k) for k in range(len(standing_for)))
     led = [tuple(k for k, end in enumerate(ends) if end == number) for number in range(len(modes))]
-    return ModeSearch(tuple(m._replace(starts=s) for m, s in zip(modes, led, strict=True)), ends, spent, finished)
+    modes = [mode._replace(starts=starts) for mode, starts in zip(modes, led, strict=True)]
+    return ModeSearch(tuple(modes), ends, spent, finished, len(parts) > 1)
 
 
 def _further(first: int) -> int:
@@ -366,7 +379,8 @@ def draw_starts(target: ResponseTarget, n: int, random: Any) -> np.ndarray:
     """Starts (m, n_structural) in standard normal coordinates, of which a search begins with the first n.
 
     These are the median of the prior, then a Latin hypercube: every parameter has one start in each of n - 1 intervals
-    of equal prior probability, in random order. Further Latin hypercubes follow; none for n = 1.
+    of equal prior probability, in random order. A larger one follows, from which further starts are chosen; none for
+    n = 1.
     """
     from scipy.special import ndtri
 

@@ -152,11 +152,15 @@ def test_a_mode_that_draws_found_counts_as_the_end_of_a_start():
     assert with_mode(search, _mode(100.0)).ends == (-1, -1, -1, -1, -1, 2)
 
 
-@pytest.mark.parametrize(("ends", "doubted"), [((0,) * 5, True), ((0,) * 6, False), ((0, 0, 1, 1), False)])
-def test_one_mode_that_few_starts_led_to_is_doubted(ends, doubted):
+@pytest.mark.parametrize(
+    ("ends", "grown", "doubted"),
+    [((0,) * 5, False, True), ((0,) * 6, False, False), ((0, 0, 1, 1), False, False)]
+    + [((0,), True, True), ((0,) * 2, True, False)],
+)
+def test_one_mode_that_few_starts_led_to_is_doubted(ends, grown, doubted):
     """With two modes, the starts that are alone in one say how many are missing."""
     guide = _equal_modes(1).guide(starts=6)
-    guide.search = ModeSearch((_mode(0.0),) * len(set(ends)), ends + (-1,) * 12, 100.0, True)
+    guide.search = ModeSearch((_mode(0.0),) * len(set(ends)), ends + (-1,) * 12, 100.0, True, grown)
     assert any("starts led to the one mode that was found" in text for text in guide.concerns) == doubted
     assert not guide.refusals
 
@@ -215,7 +219,9 @@ def test_a_search_in_which_everything_fails_finds_nothing():
     def fails(theta):
         raise RuntimeError("diverged")
 
-    search = find_modes(vibration(function=fails), starts=3, seed=2)
+    posterior = vibration(function=fails)
+    search = find_modes(posterior, starts=3, seed=2)
+    assert search.simulations == posterior.report()["simulations"]
     assert search.modes == () and search.ends == (-1, -1, -1) and search.finished
 
 
