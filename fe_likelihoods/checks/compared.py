@@ -16,6 +16,7 @@ from ..likelihood.failure_log import TooManyFailures
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..noise.autoregressive import AutoregressiveNoise
+from ..noise.known import KnownNoise
 from ..noise.marginal import sampled_noise
 from ..noise.residuals import ResidualChecks, innovations, residual_checks
 from ..signals.channels import Channel, Measurements
@@ -267,6 +268,8 @@ def _split(
 ) -> list[Fit]:
     """One fit per event, from residuals (n_channels, n_samples) by name; `values` are the parameters of the fit."""
     sampled = sampled_noise(likelihood.noise)
+    if isinstance(sampled, KnownNoise):
+        sampled, values = sampled.noise, {**values, **sampled.known}
     fewer = getattr(sampled, "effective_samples", None)
     noise = "autoregressive" if isinstance(sampled, AutoregressiveNoise) else "white"
     noise = "bands" if getattr(sampled, "n_bands", 1) > 1 else noise
