@@ -616,10 +616,10 @@ class TemperedSampler(RunResults, EnsembleSampler):
 
     def _finished(self, result: AnnealingResult, population: Population, guidance: Guidance | None) -> AnnealingResult:
         """The result of an annealing, with what is known of it as a whole."""
-        stored = self._output.result.ladder
-        if [stage._replace(seconds=0.0) for stage in stored] == [
-            stage._replace(seconds=0.0) for stage in result.ladder
-        ]:
+        stored, made = (
+            [stage._replace(seconds=0.0) for stage in each.ladder] for each in (self._output.result, result)
+        )
+        if stored == made:
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
         said = check_likelihood(log_prob, self._target.log_prior(coords))

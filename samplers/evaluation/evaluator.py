@@ -91,9 +91,8 @@ class Evaluator:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
 
         `observe` is called with known points, in the parts in which they were evaluated, and with the others directly
-        before they are evaluated. Raises
-        ValueError if a coordinate is not finite, and BudgetExhausted if the points do not fit into the limit of
-        simulations. With `evaluates_parts`, the first points that fit are evaluated.
+        before they are evaluated. Raises ValueError if a coordinate is not finite, and BudgetExhausted if the points do
+        not fit into the limit of simulations. With `evaluates_parts`, the first points that fit are evaluated.
         """
         log_prior, inside = self._prior_of(coords)
         asked, known, batches = self._look_up(coords, inside)
