@@ -108,7 +108,9 @@ class CacheFile:
             raise ValueError(f"{self.path} cannot be created: there is no folder {folder}; create it first")
         if not self.path.exists() and not os.access(folder, os.W_OK | os.X_OK):
             raise ValueError(f"{self.path} cannot be created: {folder} is not writable; give another path")
-        if self.path.exists() and not os.access(self.path, os.R_OK):
+        with self._exclusive():  # another process may move a damaged file aside between the two questions
+            is_unreadable = self.path.exists() and not os.access(self.path, os.R_OK)
+        if is_unreadable:
             raise ValueError(f"{self.path} is not readable for this user; change its permissions or give another path")
         with _lock:
             try:
@@ -222,11 +224,12 @@ class CacheFile:
             n = 1
             while (aside := self.path.with_name(f"{self.path.name}.damaged-{n}")).exists():
                 n += 1
-            # the log first, because SQLite would use it for a new file with the same name
-            for suffix in ("-wal", "-shm", ""):
-                part = self.path.with_name(self.path.name + suffix)
-                if part.exists():
-                    os.rename(part, aside.with_name(aside.name + suffix))
+            # the log first, because SQLite would use it for a new file with the same name; the last process that closes
+            # the file removes it
+            for suffix in ("-wal", "-shm"):
+                with contextlib.suppress(FileNotFoundError):
+                    os.rename(f"{self.path}{suffix}", f"{aside}{suffix}")
+            os.rename(self.path, aside)
             self._aside = aside
             logger.warning("%s is damaged (%s): set aside as %s, and a new cache created", self.path, why, aside.name)
 

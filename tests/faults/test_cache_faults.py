@@ -499,6 +499,26 @@ def test_programs_that_find_a_damaged_file_at_once(filled):
     assert all(cache.look_up(FINGERPRINT, batch_of(2, n), 2).known.all() for n in range(6))
 
 
+def test_no_other_program_sets_a_file_aside_while_it_is_asked_whether_it_is_readable(filled, monkeypatch):
+    """Else the file that is there no more would be called unreadable."""
+    fcntl, access, locked = pytest.importorskip("fcntl"), os.access, []
+
+    def sees_the_lock(path, mode):
+        if mode == os.R_OK:
+            folder = os.open(filled.parent, os.O_RDONLY)
+            try:
+                with pytest.raises(BlockingIOError):
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                locked.append(path)
+            finally:
+                os.close(folder)
+        return access(path, mode)
+
+    monkeypatch.setattr(os, "access", sees_the_lock)
+    SimulationCache(filled)
+    assert len(locked) == 1
+
+
 def test_a_damaged_file_that_another_program_sets_aside_at_that_moment(filled, monkeypatch):
     zeros(filled)
     opens = CacheFile._open
