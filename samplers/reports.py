@@ -167,10 +167,8 @@ class AnnealingResult(NamedTuple):
     start: GuidedStart | None = None  # result of the rounds; None without a guide
     signed: SignedSample | None = None  # known and evaluated points of the rounds; None if the guide knows no density
     early_stop: EarlyStop | None = None  # how the limit of simulations ended the annealing; None if it did not
-    concerns: tuple[str, ...] = ()  # reasons of the guide why parts of the posterior may be missing
-    refusals: tuple[str, ...] = ()  # reasons of the guide why the result is not to be used
     basis: str = ""  # how the guide searched for parts of the posterior; empty if it does not say
-    findings: tuple[Finding, ...] = ()  # of the checks
+    findings: tuple[Finding, ...] = ()  # of the checks and of the guide
     # effective sample size of the walkers when beta = 1 was reached; None for a result read from a backend
     independent_points: float | None = None
 

@@ -596,8 +596,6 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._record.is_complete = False
         recording.check_evidence(population.coords)
         self._result = self._finished(recording.result, population, guidance)
-        for concern in (*self._result.concerns, *self._result.refusals):
-            warn(f"the result may miss a part of the posterior: {concern}")
         if self._result.start is not None and self._result.start.used:
             moves = with_fast_sweeps([GuideMove(self._guide)], self._fast, self.ndim, self.settings.fast_sweeps)
             calibrate_move(moves[0], population.coords, np.full(self.nwalkers, 1.0 / self.nwalkers))
@@ -623,12 +621,11 @@ class TemperedSampler(RunResults, EnsembleSampler):
             result = result._replace(ladder=self._output.result.ladder)  # with the wall times of the evaluations
         coords, log_prob = self._record.first(self.nwalkers)
         said = check_likelihood(log_prob, self._target.log_prior(coords))
+        said += [] if guidance is None else list(guidance.guide.findings)
         for finding in said:
             warn(finding.message)
         return result._replace(
             findings=(*result.findings, *said),
-            concerns=() if guidance is None else guidance.guide.concerns,
-            refusals=() if guidance is None else guidance.guide.refusals,
             basis="" if guidance is None else guidance.guide.basis,
             independent_points=independent_points(result, population.coords),
         )

@@ -113,7 +113,7 @@ measured = {name: measure(factors, records[name], k) for k, (name, factors) in e
 # The parameters are one stiffness factor per storey and one damping ratio for all modes. Lognormal priors make the
 # comparison exact in its priors. The errors of a wrong model are correlated in time; under white noise the
 # posterior would be much too narrow, and the search could end in wrong modes. `find_modes` returns the modes
-# with their Laplace approximations, and `StoredPosterior.from_search` keeps draws of the highest one, with concerns
+# with their Laplace approximations, and `StoredPosterior.from_search` keeps draws of the highest one, with findings
 # where something speaks against it. The approximation is not checked by simulated draws. A run of a sampler is, with
 # ``StoredPosterior.from_run(sampler, posterior)``: with 20 storeys and eight noise parameters, 800 simulations of a
 # guided run were not enough.
@@ -137,7 +137,8 @@ def calibrate(name: str) -> tuple[StoredPosterior, float]:
 calibrated, simulations = {}, {}
 for name in states:
     calibrated[name], simulations[name] = calibrate(name)
-    print(f"{name}: {simulations[name]:.0f} simulations; concerns: {'; '.join(calibrated[name].concerns) or 'none'}")
+    findings = "; ".join(map(str, calibrated[name].findings)) or "none"
+    print(f"{name}: {simulations[name]:.0f} simulations; findings: {findings}")
 
 # %%
 # Presence, location and extent
@@ -157,7 +158,7 @@ print(f"\nAfter the strong event (true losses: {LOSSES})\n{found}")
 # The same comparison for the state without damage, in a third earthquake.
 
 control = stiffness_loss(calibrated["before"], calibrated["colder, no damage"], STIFFNESSES)
-print(f"\nWithout damage\nP(any loss above 10 %) = {control.presence():.3f}; concerns: {control.concerns or 'none'}")
+print(f"\nWithout damage\nP(any loss above 10 %) = {control.presence():.3f}; findings: {control.findings or 'none'}")
 
 # %%
 # Two calibrations alone
@@ -217,6 +218,6 @@ summary = {
     "common": float(np.median(found.common)),
     "error": float(np.median(found.error)),
     "alone": {name: (each[1] > 0.1).mean(axis=0).tolist() for name, each in losses.items()},
-    "concerns": {"after": found.concerns, "control": control.concerns},
+    "findings": {"after": found.findings, "control": control.findings},
 }
 (args.out / "summary.json").write_text(json.dumps(summary, indent=1))

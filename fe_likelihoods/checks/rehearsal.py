@@ -38,7 +38,6 @@ from .steps import (
 
 __all__ = ["ModelCheck", "check_model", "refuse_chance"]
 
-EQUAL = 1e-9  # difference of two responses, relative to their norm: sums in another order differ by less
 LATE_SHARE = 0.05  # of a motion, by which it is shifted
 SECONDS = 60.0  # of the search for the best fit
 MOST_SEARCHED = 150  # simulations of this search
@@ -181,7 +180,7 @@ def _check_chance(response: np.ndarray, later: SimulationBatch) -> list[Finding]
         share = np.inf if reason else relative_difference(again - response, response)
         if reason:
             text = f"The first simulation at the mean of the prior succeeded, a later one failed: {reason}."
-        elif share > EQUAL:
+        elif share > NOTHING:
             text = (
                 f"Two simulations of the same parameters differ by {100.0 * share:.2g} % of the response: the "
                 "likelihood of a point is another one each time, no sampler converges, and stored simulations are "

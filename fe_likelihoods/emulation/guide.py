@@ -20,13 +20,20 @@ import numpy as np
 from scipy.linalg import eigh
 
 from samplers.estimates.importance import KnownDensity
+from samplers.finding import Finding
+from samplers.judgement.guides import (
+    check_draws_in_memory,
+    check_ends,
+    check_reach,
+    check_unseen_modes,
+    find_missing_part,
+)
 from samplers.proposals.mixture import Mixture, draw, log_density
 
 from .density import EmulatedPosterior, Region, factor_of, student_mixture
 from .emulator import ResponseEmulator, TrainingSet, fit_emulator
 from .levenberg_marquardt import POINTS_PER_STEP
 from .modes import (
-    UNSEEN,
     Mode,
     ModeSearch,
     approach,
@@ -58,7 +65,6 @@ _WITHIN = 36.0  # squared Mahalanobis distance per dimension within which runs t
 _DEPTH = 40.0, 8.0  # log-density below the best within which runs train an emulator: constant, per dimension
 _ALWAYS = 5  # best runs per dimension that train in any case
 _IMPLAUSIBLE = 10.0  # emulated log-density above all runs, besides 1 per dimension, at which a fit is refused
-_MOST_UNSEEN = 0.3  # `unseen_share` above which a result is refused
 _SURPRISE = 10.0  # a far point starts an ascent if its log-density is above any known mode minus this
 _MOST_ASCENTS = 2  # of these, per refinement
 _NOT_A_MODE = (
@@ -72,14 +78,8 @@ _SINGLE = 0.95  # share of one parameter in a direction from which it is not a c
 _SMOOTH = 0.5  # mean error of the emulated log-likelihood, below which a response is smooth
 _WIDER = 4.0  # variance of the draws over the variance at the mode, from which a direction may be a curved ridge
 _SETTLED = 3  # runs at the ends without growth after which a ridge is not followed further
-_REACHED = 0.05  # variance of the draws, as a share of the mode's, below which they are short of a ridge
 _LONGEST = 4  # such directions at whose ends runs are made
 _MOST_EXTENSIONS, _GROWTH = 12, 0.05  # of an emulator along these, while the log-evidence grows by as much
-_SHORT_OF_THE_RIDGE = (
-    "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what the "
-    "prior allows: fix one of the parameters that the data do not tell apart, or use their product as the parameter"
-)
-_HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
 _MOST_BENT = 10  # parameters of a posterior that is followed beyond its ends
 _MOST_CURVES, _ENDS = 24, 2  # steps along a curved posterior, and its ends from which each step is made
 _OPEN_ENDS = (
@@ -130,7 +130,8 @@ class ResponseGuide:
         self._posterior, self._starts = posterior, starts
         self.search: ModeSearch | None = None
         self.simulations = 0.0
-        self._concerns: tuple[str, ...] = ()
+        self._missing: tuple[str, ...] = ()  # why parts of the posterior may be missing, as the search met them
+        self._reach = 1.0  # of the draws along directions that the data leave to the prior, see `check_reach`
         self._regions: list[Region] = []
         self._modes: list[Mode] = []
         self._best = -np.inf  # largest log-density of a run, in standard normal coordinates
@@ -159,59 +160,20 @@ class ResponseGuide:
         return f"{type(self).__name__}({self._posterior.fingerprint}, starts={self._starts}{derivatives})"
 
     @property
-    def concerns(self) -> tuple[str, ...]:
+    def findings(self) -> tuple[Finding, ...]:
         """Why parts of the posterior may be missing."""
-        return (
-            *self._concerns,
-            *self._of_unseen_modes(UNSEEN, _MOST_UNSEEN),
-            *self._of_few_ends(),
-            *self._of_heavy_weights(),
-        )
-
-    def _of_heavy_weights(self) -> tuple[str, ...]:
-        """A sentence if the draws in memory do not cover the emulated posterior, as of a banana in 8 dimensions."""
-        if self._emulated is None or self._emulated.largest_weight <= _HEAVY:
-            return ()
-        return (
-            "the emulated posterior is curved and its draws in memory cover it badly (one of them has "
-            f"{100.0 * self._emulated.largest_weight:.2g} % of their weight): standard deviations and tails may be too "
-            "small, by much more than their stated errors. Compare with a run without a guide, or with another seed",
-        )
-
-    @property
-    def refusals(self) -> tuple[str, ...]:
-        """Why parts of the posterior are probably missing."""
-        return self._of_unseen_modes(_MOST_UNSEEN, np.inf)
-
-    def _of_few_ends(self) -> tuple[str, ...]:
-        """A sentence if one mode was found, by fewer starts than wanted, or by one on a growing record."""
-        n = 0 if self.search is None else ended(self.search)
-        if n == 0 or n >= (2 if self.search.grown else self._starts) or len(self.search.modes) > 1:
-            return ()
-        return (
-            f"only {n} of {len(self.search.ends)} starts led to the one mode that was found, the others were given up "
-            f"far below it: {1.0 - 0.05 ** (1.0 / n):.0%} of such starts may lead to modes that were not found. Use "
-            "more starts; where the model is a function, let it take n_steps, so that the search begins with the first "
-            "part of the record",
-        )
-
-    def _of_unseen_modes(self, least: float, most: float) -> tuple[str, ...]:
-        """A sentence if the expected share of unseen modes is above `least` and not above `most`."""
-        if (
-            self.search is None
-            or len(self.search.modes) < 2
-            or not least < (unseen := unseen_share(self.search)) <= most
-        ):
-            return ()
-        return (
-            f"{ended(self.search)} starts led to {len(self.search.modes)} modes, to some of them only once, so about "
-            f"{100.0 * unseen:.0f} % of further starts would lead to modes that were not found: use more starts, or a "
-            "larger limit of simulations",
-        )
+        found = [find_missing_part(text) for text in self._missing]
+        if self.search is not None and len(self.search.modes) > 1:
+            found += check_unseen_modes(unseen_share(self.search), ended(self.search), len(self.search.modes))
+        elif self.search is not None:
+            found += check_ends(ended(self.search), len(self.search.ends), self._starts, self.search.grown)
+        if self._emulated is not None:
+            found += check_draws_in_memory(self._emulated.largest_weight)
+        return (*found, *check_reach(self._reach))
 
     @property
     def basis(self) -> str:
-        """What a verdict without concerns rests on."""
+        """What a verdict without such findings rests on."""
         if self.search is None or not self.search.modes:
             return ""
         n, modes = ended(self.search), len(self._modes)
@@ -261,11 +223,11 @@ class ResponseGuide:
                 "and whether an old file of results is read"
             )
         if not self.search.finished:
-            self._add_concern("the budget ended the search for modes")
+            self._add_missing("the budget ended the search for modes")
         elif not self.search.modes:
-            self._add_concern("no start of the search led to a mode: the simulations of all starts fail")
+            self._add_missing("no start of the search led to a mode: the simulations of all starts fail")
         elif not all(mode.converged for mode in self.search.modes):
-            self._add_concern(_NOT_AT_THE_TOP)
+            self._add_missing(_NOT_AT_THE_TOP)
         self._emulate(session.random)
         yield from self._follow_ridges(session)
 
@@ -376,10 +338,7 @@ class ResponseGuide:
             yield
             self._emulate(session.random)
         yield from self._follow_curves(session)
-        self._concerns = tuple(concern for concern in self._concerns if concern != _SHORT_OF_THE_RIDGE)
-        reached = self._free_directions()[1]
-        if np.any(reached < _REACHED):
-            self._add_concern(_SHORT_OF_THE_RIDGE)
+        self._reach = float(min(self._free_directions()[1], default=1.0))
 
     def _follow_curves(self, session: Any) -> Iterator[None]:
         """Simulate beyond the ends of a curved posterior until it ends there.
@@ -394,14 +353,14 @@ class ResponseGuide:
             if not len(points):
                 break
             if self._curves == _MOST_CURVES:
-                self._add_concern(_OPEN_ENDS)
+                self._add_missing(_OPEN_ENDS)
                 break
             self._curves += 1
             self._beyond = np.concatenate([self._beyond, points])
             finished = yield from self._counted(approach(self._target, points, session.remember, session.fits))
             self._emulate(session.random)
             if not finished:
-                self._add_concern(_OPEN_ENDS)
+                self._add_missing(_OPEN_ENDS)
                 break
 
     def _plausible(self) -> np.ndarray:
@@ -458,9 +417,9 @@ class ResponseGuide:
     def _spend(self, simulations: float) -> None:
         self.simulations += simulations
 
-    def _add_concern(self, text: str) -> None:
-        if text not in self._concerns:
-            self._concerns = (*self._concerns, text)
+    def _add_missing(self, text: str) -> None:
+        if text not in self._missing:
+            self._missing = (*self._missing, text)
 
     def _shares(self) -> tuple[float, float]:
         """Shares of the wide mixture and of the prior in the draws."""
@@ -535,7 +494,7 @@ class ResponseGuide:
             search = search_from(self._target, structural[row], session.remember, session.fits)
             found = yield from self._counted(search)
             if found is None:
-                self._add_concern("the budget ended an ascent to a mode that the search had missed")
+                self._add_missing("the budget ended an ascent to a mode that the search had missed")
             elif not self._modes or self._far(found.coords[None, : self._target.n_structural])[0]:
                 self._add_modes([found])
                 self.search, self._emulated = with_mode(self.search, found), None
@@ -546,11 +505,11 @@ class ResponseGuide:
         """Enter a mode instead of the nearest one, whose ascent ended early, such as where simulations fail."""
         number = int(np.argmin(self._distances(mode.coords[None, : self._target.n_structural])[:, 0]))
         if self._modes[number].converged:
-            self._add_concern(_NOT_A_MODE)
+            self._add_missing(_NOT_A_MODE)
         self._modes[number], self._regions[number] = mode, self._region_of(mode)
         self._emulated, self._wide = None, self._wide_mixture()
         if all(mode.converged for mode in self._modes):
-            self._concerns = tuple(concern for concern in self._concerns if concern != _NOT_AT_THE_TOP)
+            self._missing = tuple(text for text in self._missing if text != _NOT_AT_THE_TOP)
 
     def _fit_emulators(self) -> None:
         archive, d = self._target.archive, self._target.n_structural

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from samplers.judgement.guides import DOUBTED_SHARE
+
 from .levenberg_marquardt import FIRST_DIFFERENCE, TOLERANCE, Ascent, Batches, Jacobians, ascend, axes_of, distinct_ends
 from .target import Remember, ResponseTarget, run_at_once
 
 __all__ = [
-    "UNSEEN",
     "Mode",
     "ModeSearch",
     "approach",
@@ -39,7 +40,6 @@ _FLATTEST = 0.2  # smallest curvature of the Laplace approximation: five times t
 _APART = 0.25  # prior standard deviations in one coordinate from which ends on a part of the record are different
 _APART_OF_ALL = 2.0  # the same, times the number of starts
 _FEW = 6  # parameters whose differences cost about as much as two steps
-UNSEEN = 0.05  # `unseen_share` above which further starts follow
 _MOST_STARTS = 4  # times the number of the first ones
 _DRAWN = 8  # the same for those of which the highest begin: a simulation each is cheaper than ascents given up
 _HOPELESS = 1.6  # log-density per measured number below the best end of a part: residuals five times as large
@@ -197,7 +197,7 @@ def search_modes(
         finished = yield from counted(ascents, spend)
         search = _modes_of(parts, standing_for, spent, finished)
         few = _enough(search, first) - ended(search) if begin == 0 or not search.grown else 0
-        missing = max(few, _further(first) if unseen_share(search) > UNSEEN else 0)
+        missing = max(few, _further(first) if unseen_share(search) > DOUBTED_SHARE else 0)
         if not finished or missing <= 0 or following == most or not remember("starts", affordable)[0]:
             return search
         if begin == 0:

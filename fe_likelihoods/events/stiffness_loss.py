@@ -26,6 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks.finding import Finding, judge, labelled
+from ..checks.stiffness import check_most, check_normal
 from ..priors.distributions import Distribution, HalfNormal, LogNormal
 from ..priors.priors import Prior
 from ..text_tables import text_table
@@ -35,10 +37,7 @@ from .stored_posterior import StoredPosterior, on_scale
 __all__ = ["StiffnessLoss", "stiffness_loss"]
 
 _LEAST_INFORMATION = 1.0  # of the data about a direction, relative to the prior, below which it is left to the prior
-_FEWEST_SAMPLES = 5.0  # effective samples per stiffness for a covariance
-_MOST_SKEWED, _KURTOSIS = 1.0, (-1.2, 3.0)  # of the logarithms, beyond which a normal distribution is doubted
-_LARGEST_ERROR = 2.5  # median factor of the errors from which the calibrations contradict each other
-_MANY = 0.1  # probability of as many damaged stiffnesses as are allowed, from which there may be more
+_FEWEST_SAMPLES = 5  # effective ones per stiffness, for their covariance
 _NODES = 8, 12  # of the distributions of the spread and of the factor of the errors
 _PRIOR_DRAWS = 20_000  # for the moments of a joint prior
 _BATCH = 50_000  # sets of damaged stiffnesses at a time
@@ -59,8 +58,8 @@ class StiffnessLoss(NamedTuple):
         Number of damaged stiffnesses.
     error : ndarray[n_draws]
         Factor by which the errors of the calibrations exceed the stated ones [-].
-    concerns : tuple of str
-        Why the result may be wrong; empty if nothing was found.
+    findings : tuple of Finding
+        What speaks against the result; empty if nothing was found.
     """
 
     names: tuple[str, ...]
@@ -68,12 +67,12 @@ class StiffnessLoss(NamedTuple):
     common: np.ndarray
     count: np.ndarray
     error: np.ndarray
-    concerns: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def status(self) -> str:
-        """ "usable", or "use with care" if there are concerns."""
-        return "use with care" if self.concerns else "usable"
+        """ "use", "use with care" or "do not use", by the most severe finding."""
+        return judge(self.findings).status
 
     def probability(self, limit: float = 0.1) -> np.ndarray:
         """Probability (n,) of each stiffness that its loss exceeds a limit."""
@@ -103,7 +102,7 @@ class StiffnessLoss(NamedTuple):
             f"Probability of a loss above 10 % anywhere: {self.presence():.2f}; common factor {median:.3f} ({low:.3f} "
             f"to {high:.3f}); errors of the calibrations as stated times {np.median(self.error):.1f}.",
         ]
-        return "\n".join([*lines, *(f"Use with care: {concern}." for concern in self.concerns)])
+        return "\n".join([*lines, *labelled(self.findings)])
 
 
 def stiffness_loss(
@@ -151,13 +150,13 @@ def stiffness_loss(
     Returns
     -------
     StiffnessLoss
-        With the concerns of both calibrations.
+        With the findings of both calibrations.
 
     Raises
     ------
     ValueError
         If a stiffness is unknown, not positive or constant, has a joint prior with other parameters, an argument is out
-        of range, or there are fewer effective samples than stiffnesses and three more.
+        of range, or there are fewer than five effective samples per stiffness.
 
     Examples
     --------
@@ -176,19 +175,12 @@ def stiffness_loss(
     evidence = np.array([each.log_evidence + _log_evidence_of_sets(each, sets, damaged) for each in nodes])
     weights = np.exp(evidence - evidence.max())
     drawn = _draw(nodes, sets, weights / weights.sum(), damaged, n_draws, np.random.default_rng(seed))
-    concerns = [
-        f"{when}: {text}" for when, each in zip(("before", "after"), states, strict=True) for text in each.doubts
+    findings = [
+        each._replace(text=f"In the calibration {when}: {each.text}")
+        for when, state in zip(("before", "after"), states, strict=True)
+        for each in state.findings
     ]
-    if isinstance(error, Distribution) and (factor := np.median(drawn[3])) > _LARGEST_ERROR:
-        concerns.append(
-            f"the states differ {factor:.1f} times as much as the calibrations state, in a way that damage of "
-            f"{most} stiffnesses cannot explain: the model or the noise is wrong, or more stiffnesses changed"
-        )
-    if most < len(names) and (many := (drawn[2] == most).mean()) > _MANY:
-        concerns.append(
-            f"the probability of {most} damaged stiffnesses is {many:.2f}: there may be more, increase most"
-        )
-    return StiffnessLoss(names, *drawn, tuple(concerns))
+    return StiffnessLoss(names, *drawn, (*findings, *check_most(drawn[2], most, len(names))))
 
 
 # ---------------------------------------------------------------------- the calibrations
@@ -205,7 +197,7 @@ class _State(NamedTuple):
     seen: int
     center: np.ndarray
     covariance: np.ndarray
-    doubts: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
@@ -216,11 +208,8 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     covariance = (weights * apart.T) @ apart
     if constant := [name for name, each in zip(names, np.diag(covariance), strict=True) if not each > 0.0]:
         raise ValueError(f"stiffness_loss: all samples have the same value of {', '.join(constant)}")
-    doubts = list(stored.concerns)
-    if n < d + 3:
-        raise ValueError(f"stiffness_loss: {d} stiffnesses need at least {d + 3} effective samples; got {n:.0f}")
-    if n < _FEWEST_SAMPLES * d:
-        doubts.append(f"the covariance of {d} stiffnesses is estimated from {n:.0f} effective samples")
+    if n < (fewest := _FEWEST_SAMPLES * d):
+        raise ValueError(f"stiffness_loss: {d} stiffnesses need at least {fewest} effective samples; got {n:.0f}")
     covariance *= (n - 1.0) / (n - d - 2.0)  # so that its inverse is right on average
     center, prior_covariance = _prior_moments(prior)
     factor = np.linalg.cholesky(prior_covariance)
@@ -233,9 +222,10 @@ def _state(stored: StoredPosterior, names: tuple[str, ...]) -> _State:
     peak = center + factor @ directions @ np.where(seen, offset * precisions / np.where(seen, gained, 1.0), 0.0)
     back = np.linalg.solve(factor.T, directions)
     scores = np.column_stack([apart, apart @ back[:, seen]])
-    if odd := _oddest(weights, scores / np.sqrt(weights @ np.square(scores))):
-        doubts.append(odd)
-    return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, tuple(doubts))
+    scores /= np.sqrt(weights @ np.square(scores))
+    normal = check_normal(weights @ scores**3, weights @ scores**4 - 3.0)
+    findings = (*stored.findings, *normal)
+    return _State(peak, back * gained @ back.T, int(seen.sum()), center, prior_covariance, findings)
 
 
 def _prior_moments(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
@@ -248,18 +238,6 @@ def _prior_moments(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
         return center, np.diag(weights @ np.square(logs - center))
     logs = np.log(prior.rvs(_PRIOR_DRAWS, random_state=0))
     return logs.mean(axis=0), np.cov(logs.T)
-
-
-def _oddest(weights: np.ndarray, scores: np.ndarray) -> str:
-    """A sentence if a standardised column (n, k) is far from normal; an empty text otherwise."""
-    skewness = np.abs(weights @ scores**3)
-    kurtosis = weights @ scores**4 - 3.0
-    if skewness.max() < _MOST_SKEWED and _KURTOSIS[0] < kurtosis.min() and kurtosis.max() < _KURTOSIS[1]:
-        return ""
-    return (
-        f"the logarithms of the stiffnesses are not normal (skewness {skewness.max():.1f}, excess kurtosis "
-        f"{kurtosis.min():.1f} to {kurtosis.max():.1f}): ridges and several modes are not represented"
-    )
 
 
 # ---------------------------------------------------------------------- the change between them

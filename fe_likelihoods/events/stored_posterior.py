@@ -14,6 +14,8 @@ import numpy as np
 from samplers.estimates.weights import effective_sample_size
 from samplers.resampling import systematic
 
+from ..checks.finding import NOTE, Finding
+from ..checks.stiffness import check_laplace
 from ..priors.distributions import TruncatedNormal
 from ..priors.mixture_prior import MixtureDistribution, fit_mixture
 from ..priors.points import as_points
@@ -60,8 +62,8 @@ class StoredPosterior:
         or for weighted samples the effective sample size of the weights.
     measurements : Measurements, optional
         What was measured in the test. `predict_new_event` warns of predictions outside the range of all tests.
-    concerns : sequence of str
-        Why the samples may be wrong, which `stiffness_loss` passes on.
+    findings : sequence of Finding
+        What speaks against the samples, which `stiffness_loss` passes on.
 
     Raises
     ------
@@ -81,14 +83,14 @@ class StoredPosterior:
     log_evidence_error: float = 0.0
     effective_sample_size: float | None = None
     measurements: Measurements | None = None
-    concerns: Sequence[str] = ()
+    findings: Sequence[Finding] = ()
 
     @classmethod
     def from_run(cls, sampler: Any, posterior: Any) -> "StoredPosterior":
         """Posterior of a finished run of `samplers.SMCSampler` or `samplers.TMCMCSampler`, with its evidence.
 
         After a run with a guide that has an emulator, the samples are the many draws of the emulated posterior, whose
-        covariances are more accurate than covariances of the chain. A verdict other than "converged" is a concern.
+        covariances are more accurate than covariances of the chain. What the verdict found is kept, but for notes.
 
         Parameters
         ----------
@@ -101,7 +103,7 @@ class StoredPosterior:
         StoredPosterior
         """
         verdict, signed = sampler.verdict, sampler.signed_sample
-        concerns = () if verdict.status == "converged" else (f"{verdict.status}: {'; '.join(verdict.reasons)}",)
+        findings = [each for each in verdict.findings if each.severity != NOTE]
         evidence = float(sampler.log_evidence), float(sampler.log_evidence_error)
         if signed is None or verdict.status == "not usable":
             samples, weights = sampler.get_chain(flat=True), None
@@ -110,7 +112,7 @@ class StoredPosterior:
             known = (signed.rounds == 0) & (signed.weights > 0.0)
             samples, weights = signed.coords[known], np.log(signed.weights[known])
             size = None
-        return cls(samples, posterior.prior, weights, *evidence, size, concerns=concerns)
+        return cls(samples, posterior.prior, weights, *evidence, size, findings=findings)
 
     @classmethod
     def from_search(cls, search: "ModeSearch", posterior: Any, n: int = 5000, seed: int = 0) -> "StoredPosterior":
@@ -121,7 +123,7 @@ class StoredPosterior:
         Parameters
         ----------
         search : ModeSearch
-            Result of `fe_likelihoods.emulation.modes.find_modes`. What it says against one mode is a concern.
+            Result of `fe_likelihoods.emulation.modes.find_modes`. What it says against one mode is a finding.
         posterior : Posterior
             The posterior that was searched.
         n, seed : int
@@ -138,17 +140,9 @@ class StoredPosterior:
         """
         if not search.modes:
             raise ValueError("the search found no mode: use more starts, or a larger limit of simulations")
-        mode, concerns = search.modes[0], []
-        if not search.finished:
-            concerns.append("the limit of simulations ended the search for modes")
-        if not mode.converged:
-            concerns.append("the search ended before the top of the mode")
-        if len(search.modes) > 1:
-            concerns.append(f"the search found {len(search.modes)} modes, of which the highest is used")
-        if sum(end == 0 for end in search.ends) < 2:
-            concerns.append(f"only one of {len(search.ends)} starts led to the mode")
+        mode = search.modes[0]
         coords = np.random.default_rng(seed).multivariate_normal(mode.coords, mode.covariance, n, method="cholesky")
-        return cls(posterior.prior.from_normal(coords), posterior.prior, concerns=concerns)
+        return cls(posterior.prior.from_normal(coords), posterior.prior, findings=check_laplace(search))
 
     def __post_init__(self) -> None:
         if not isinstance(self.prior, Prior):
@@ -190,7 +184,7 @@ class StoredPosterior:
             ("samples", points),
             ("log_weights", weights),
             ("effective_sample_size", float(effective)),
-            ("concerns", tuple(self.concerns)),
+            ("findings", tuple(self.findings)),
         ):
             object.__setattr__(self, name, value)
 

@@ -29,6 +29,7 @@ from ..reports import AnnealingResult, EarlyStop, GuidedRound
 from .checks import find_unreached_part
 from .clusters import Cluster, find_clusters
 from .failures import NearFailures, check_failed_region
+from .guides import UNSEEN
 
 __all__ = [
     "CONVERGED",
@@ -48,7 +49,6 @@ NOT_USABLE = "not usable"
 STATUSES = (CONVERGED, USABLE, NOT_USABLE)
 SEVERITIES = (NOTE, CARE, WRONG)
 LIMIT = "The limit of simulations ended the run"
-UNSEEN = "A part of the posterior may be missing"
 
 
 class EvidenceEstimate(NamedTuple):
@@ -268,9 +268,7 @@ def judge(
         text = f"The draws of the guide were not used ({result.start.reason})."
         found.append(Finding("The guide was not used", CARE, text))
     if result.start is not None or (stop is not None and stop.from_guide):
-        found += [Finding(UNSEEN, CARE, f"The guide says: {text}.") for text in result.concerns]
-        found += [Finding(UNSEEN, WRONG, f"The guide says: {text}.") for text in result.refusals]
-        if not result.concerns and not result.refusals:
+        if all(each.kind != UNSEEN for each in found):
             reasons.append(result.basis or "parts of the posterior in which the guide makes no draws are not seen")
     if missing_steps > 0:
         reasons.append(

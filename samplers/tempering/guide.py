@@ -11,17 +11,18 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..judgement.guides import find_missing_part
+
 __all__ = ["AdaptedGuide", "Guide", "GuideSession", "check_guide", "guide_fingerprint"]
 
 
-UNKNOWN = "it has no attribute concerns, so it is not known whether the posterior has other modes"
+UNKNOWN = "it has no attribute findings, so it is not known whether the posterior has other modes"
 # The optional members of a guide (see `Guide`) that are not methods of the search, and their defaults. A guide that
-# does not say whether parts of the posterior may be missing is a reason for concern.
+# does not say whether parts of the posterior may be missing is doubted.
 DEFAULTS = {
     "simulations": 0.0,
     "log_density_error": 0.0,
-    "concerns": (UNKNOWN,),
-    "refusals": (),
+    "findings": (find_missing_part(UNKNOWN),),
     "basis": "",
     "observe": None,
     "learns_from_parts": False,
@@ -83,12 +84,10 @@ class Guide(Protocol):
         Simulations made by `prepare` and `refine`; parts of a simulation count as fractions.
     ``log_density_error`` : float
         Standard error of the density's log normalising constant.
-    ``concerns`` : sequence of str
-        Reasons why parts of the posterior may be missing, such as modes that were not searched for. With any concern,
-        the verdict is not better than usable. A missing attribute counts as a reason: set it to () if the guide is
-        known to miss nothing.
-    ``refusals`` : sequence of str
-        Graver reasons of the same kind, with which the verdict is "not usable". None by default.
+    ``findings`` : sequence of Finding
+        Reasons why parts of the posterior may be missing, such as modes that were not searched for
+        (`samplers.judgement.guides.find_missing_part`); their severity limits the verdict. A missing attribute counts
+        as a reason: set it to () if the guide is known to miss nothing.
     ``known_density`` : KnownDensity, optional
         A density close to the posterior with known expectations, such as an emulated posterior, as it is now
         (`samplers.estimates.importance.KnownDensity`). It makes expectations under the posterior more accurate

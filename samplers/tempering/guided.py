@@ -11,7 +11,7 @@ have short evaluations, and are not a fair sample. They may train a guide with `
 the next batch are weighted by their own density.
 
 A part of the posterior that a guide never proposes is not seen by its draws. Guides with a share of the prior in their
-density can find it; other guides depend on their search (`concerns`). Constants without a reference were chosen by
+density can find it; other guides depend on their search (`findings`). Constants without a reference were chosen by
 trials on posteriors with known answers.
 """
 

@@ -21,7 +21,6 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians, _at_least_one, _Climb, _Point, _valley
 from fe_likelihoods.emulation.modes import (
-    UNSEEN,
     Mode,
     ModeSearch,
     ended,
@@ -31,6 +30,7 @@ from fe_likelihoods.emulation.modes import (
 )
 from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning, SMCSampler
+from samplers.judgement.guides import DOUBTED_SHARE
 
 from .problems import acts_late, free_vibration, misleading, symmetric, vibration
 
@@ -116,9 +116,9 @@ def test_starts_are_added_until_few_unseen_modes_are_expected(n):
     found = [find_modes(_equal_modes(n), seed=seed) for seed in range(1, 6)]
     for search in found:
         k, most = len(search.modes), len(search.ends) == 24
-        assert len(search.ends) <= 24 and (most or unseen_share(search) <= UNSEEN)
+        assert len(search.ends) <= 24 and (most or unseen_share(search) <= DOUBTED_SHARE)
         assert most or (k / (k + 1.0)) ** ended(search) <= 2.0**-6
-    # a share of UNSEEN is expected to be missed: of 30, 1.5 with a standard deviation of 1.2
+    # a share of DOUBTED_SHARE is expected to be missed: of 30, 1.5 with a standard deviation of 1.2
     assert sum(len(search.modes) for search in found) >= 5 * n - (4 if n == 6 else 0)
 
 
@@ -161,8 +161,8 @@ def test_one_mode_that_few_starts_led_to_is_doubted(ends, grown, doubted):
     """With two modes, the starts that are alone in one say how many are missing."""
     guide = _equal_modes(1).guide(starts=6)
     guide.search = ModeSearch((_mode(0.0),) * len(set(ends)), ends + (-1,) * 12, 100.0, True, grown)
-    assert any("starts led to the one mode that was found" in text for text in guide.concerns) == doubted
-    assert not guide.refusals
+    assert any("starts led to the one mode that was found" in each.text for each in guide.findings) == doubted
+    assert all(each.severity == "care" for each in guide.findings)
 
 
 def test_a_result_with_many_modes_of_one_start_is_refused():

@@ -85,17 +85,17 @@ def test_two_standard_errors_cover(case, limit):
 
 @pytest.mark.slow
 def test_control_a_guide_that_misses_a_mode_is_wrong():
-    """Negative control: the criterion of the test above fails. The guide claims that it has no concerns."""
+    """Negative control: the criterion of the test above fails. The guide claims that it misses nothing."""
     deviations, statuses = outcomes(*two_modes(1, FixedGuide), 500, runs=5)
     assert np.all(np.abs(deviations[:, 0]) > 5.0) and np.mean(statuses == "converged") > 0.5
 
 
 def test_a_guide_that_does_not_say_how_it_searched_is_at_best_usable():
     class Silent(FixedGuide):
-        concerns = property()  # reading it raises AttributeError
+        findings = property()  # reading it raises AttributeError
 
     posterior, guide = two_modes(1, Silent)
-    assert not hasattr(guide, "concerns")
+    assert not hasattr(guide, "findings")
     _, statuses = outcomes(posterior, guide, 500, runs=3)
     assert np.all(statuses == "usable")
 
@@ -132,7 +132,7 @@ class Student:
 class DrawsOf:
     """A guide that draws from a distribution of scipy and does not learn."""
 
-    concerns = ()
+    findings = ()
 
     def __init__(self, law):
         self.law = law

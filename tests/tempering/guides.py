@@ -6,6 +6,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.estimates.weights import coarse_weights, effective_sample_size
+from samplers.judgement.guides import find_missing_part
 from samplers.proposals.mixture import draw, fit_mixture, log_density
 
 
@@ -16,7 +17,7 @@ class FixedGuide:
     """
 
     dof = 6.0
-    concerns = ()
+    findings = ()
 
     def __init__(self, posterior, means, covariances, weights=None, prior_share=0.0):
         self.posterior, self.prior_share = posterior, prior_share
@@ -113,7 +114,7 @@ class SearchingGuide(LearningGuide):
 
     def __init__(self, posterior):
         super().__init__(posterior, posterior.mean, [np.diag((2.5 * posterior.sd) ** 2)])
-        self.simulations, self.concerns, self.found, self.seen = 0.0, [], [], []
+        self.simulations, self.findings, self.found, self.seen = 0.0, [], [], []
 
     def fresh(self):
         """A posterior with a cache would be copied otherwise."""
@@ -121,7 +122,7 @@ class SearchingGuide(LearningGuide):
 
     def search(self, session):
         if not session.fits(self.batch):
-            self.concerns = ["the search was not finished"]
+            self.findings = [find_missing_part("the search was not finished")]
             return
         points = self.posterior.sample_prior(self.batch, session.random)
         (values,) = session.remember(digest("search", points), lambda: [np.asarray(self.posterior(points))])

@@ -326,7 +326,7 @@ class PartlyImpossible(Gaussian):
 
 
 class DrawsOfThePrior:
-    concerns = ()
+    findings = ()
 
     def __init__(self, posterior, shift=0.0):
         self.posterior, self.shift = posterior, shift

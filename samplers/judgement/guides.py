@@ -1,0 +1,73 @@
+"""Findings of guides: may a search, and the draws that follow from it, have missed a part of the posterior?"""
+
+from ..finding import CARE, WRONG, Finding
+
+__all__ = [
+    "DOUBTED_SHARE",
+    "UNSEEN",
+    "check_draws_in_memory",
+    "check_ends",
+    "check_reach",
+    "check_unseen_modes",
+    "find_missing_part",
+]
+
+UNSEEN = "A part of the posterior may be missing"
+DOUBTED_SHARE = 0.05  # of further starts that would lead to modes not seen yet; the search goes on above it
+REFUSED_SHARE = 0.3  # the same, from which a result is not usable
+GROWN_STARTS = 2  # that have to end at one mode, if the search grew with the record
+HEAVY = 0.01  # largest weight of a draw of the emulated posterior; 0.006 in right runs with 30 parameters
+REACHED = 0.05  # variance of the draws along a ridge, as a share of the mode's, below which they are short of it
+
+
+def find_missing_part(text: str, severity: str = CARE) -> Finding:
+    """A finding of a guide about parts of the posterior that may be missing."""
+    return Finding(UNSEEN, severity, f"The guide says: {text}.")
+
+
+def check_ends(ended: int, made: int, wanted: int, grown: bool) -> list[Finding]:
+    """Whether enough of the starts that were made led to the only mode; `grown`: on a record that grows."""
+    if ended == 0 or ended >= (GROWN_STARTS if grown else wanted):
+        return []
+    text = (
+        f"only {ended} of {made} starts led to the one mode that was found, the others were given up far below it: "
+        f"{1.0 - 0.05 ** (1.0 / ended):.0%} of such starts may lead to modes that were not found. Use more starts; "
+        "where the model is a function, let it take n_steps, so that the search begins with the first part of the "
+        "record"
+    )
+    return [find_missing_part(text)]
+
+
+def check_unseen_modes(share: float, ended: int, modes: int) -> list[Finding]:
+    """Whether further starts are expected to lead to more than the modes that were found."""
+    if share <= DOUBTED_SHARE:
+        return []
+    text = (
+        f"{ended} starts led to {modes} modes, to some of them only once, so about {100.0 * share:.0f} % of further "
+        "starts would lead to modes that were not found: use more starts, or a larger limit of simulations"
+    )
+    return [find_missing_part(text, WRONG if share > REFUSED_SHARE else CARE)]
+
+
+def check_draws_in_memory(largest_weight: float) -> list[Finding]:
+    """Whether the draws of an emulated posterior cover it; those of a banana in 8 dimensions do not."""
+    if largest_weight <= HEAVY:
+        return []
+    text = (
+        "the emulated posterior is curved and its draws in memory cover it badly (one of them has "
+        f"{100.0 * largest_weight:.2g} % of their weight): standard deviations and tails may be too small, by much "
+        "more than their stated errors. Compare with a run without a guide, or with another seed"
+    )
+    return [find_missing_part(text)]
+
+
+def check_reach(reach: float) -> list[Finding]:
+    """Whether draws reach along a ridge; `reach` is their smallest variance along one, as a share of the mode's."""
+    if reach >= REACHED:
+        return []
+    text = (
+        "the data leave a combination of the parameters to the prior, and the draws reach only a small part of what "
+        "the prior allows: fix one of the parameters that the data do not tell apart, or use their product as the "
+        "parameter"
+    )
+    return [find_missing_part(text)]
