@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,8 +32,9 @@ DEFAULT_TOLERANCE = 1e-9
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 
 
-class VerifyingRun(NamedTuple):
-    """What a simulation for verification needs."""
+@dataclass(frozen=True, eq=False)
+class VerifyingRun:
+    """What the simulations of one request need; the model has one `fingerprint` for all of them."""
 
     model: Model
     pool: Any  # where the simulations of the likelihood run
@@ -39,6 +42,11 @@ class VerifyingRun(NamedTuple):
     statistic: Statistic | None  # that is stored; None: sums of squares
     n_numbers: int  # length of the statistic
     tolerance: float | None = None  # as for `SimulationCache`
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Declared identity of the model, when it was first asked for."""
+        return self.model.fingerprint
 
     @property
     def accepted(self) -> float:

@@ -102,9 +102,9 @@ class Trust:
         self.verified: Counter[tuple[str, bool]] = Counter()
         self.session = secrets.randbits(62)
 
-    def find(self, file: CacheFile, model: Model) -> StoredLabel | None:
+    def find(self, file: CacheFile, fingerprint: str) -> StoredLabel | None:
         """The label in the file, with the present contents of the files that simulations opened; None if unknown."""
-        source = source_number(model.fingerprint)
+        source = source_number(fingerprint)
         if source not in self.stored:
             labels = labels_of(file, source)
             for each in labels:
@@ -128,13 +128,13 @@ class Trust:
             labels.append(self.stored[source])
         self._write(file, labels)
 
-    def begin(self, file: CacheFile, model: Model, used: set[int]) -> None:
+    def begin(self, file: CacheFile, fingerprint: str, used: set[int]) -> None:
         """Begin a generation, or continue the generation that another process has begun under the same label."""
         text = f"{self.label.code} {sorted(self.label.opened.items().items())}".encode()
         generation = int.from_bytes(blake2b(text, digest_size=8).digest()) >> 2 | 1
         if generation in used:  # it contains rows that differ
             generation = secrets.randbits(62) | 1
-        self.put(file, {*self.stored, source_number(model.fingerprint)}, generation, OWN)
+        self.put(file, {*self.stored, source_number(fingerprint)}, generation, OWN)
         self.generations.clear()
 
     def complete(self, file: CacheFile, opened: Opened | None) -> None:

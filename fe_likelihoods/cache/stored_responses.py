@@ -28,7 +28,6 @@ class StoredResponses:
         self.model, self.pool = model, pool
         self._verified = VerifiedCache(cache, model, pool, ModelLabel(model))
         self._shape = len(model.channels), model.n_steps
-        self._run = VerifyingRun(model, pool, np.zeros(self._shape), None, len(model.channels))
         self._least = getattr(pool, "n_workers", None) or os.cpu_count() or 1
         if pool is None and not has_batch_method(model):
             self._least = 1
@@ -36,7 +35,8 @@ class StoredResponses:
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses of distinct thetas (n, n_parameters), with reasons; `StaleCache` if a repeated one differs."""
-        outcomes = self._verified.look_up_responses(thetas, self._run)
+        run = VerifyingRun(self.model, self.pool, np.zeros(self._shape), None, len(self.model.channels))
+        outcomes = self._verified.look_up_responses(thetas, run)
         left = [row for row, outcome in enumerate(outcomes) if outcome is None]
         while left:
             rows, left = left[: self._size], left[self._size :]
@@ -46,7 +46,7 @@ class StoredResponses:
             if self.pool is None:
                 label.has_changed_itself(label.changed(self.model))
             seconds = max(time.perf_counter() - start, 1e-9)
-            self._verified.store("", thetas[rows], None, batch.reasons, batch.response, 0.0, self._run)
+            self._verified.store("", thetas[rows], None, batch.reasons, batch.response, 0.0, run)
             for row, response, reason in zip(rows, batch.response, batch.reasons, strict=True):
                 outcomes[row] = reason or response
             self._size = max(self._least, min(4 * self._size, int(_SECONDS * len(rows) / seconds)))

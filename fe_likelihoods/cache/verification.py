@@ -143,12 +143,12 @@ class VerifiedCache:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust = self._trust
         with trust.lock:
-            stored = trust.find(self.cache.file, run.model)
+            stored = trust.find(self.cache.file, run.fingerprint)
             if stored is None:
                 if not trust.generations and time.monotonic() < trust.pause_ends:  # it is not known which rows agree
                     return
-                trust.begin(self.cache.file, run.model, set())
-                stored = trust.find(self.cache.file, run.model)
+                trust.begin(self.cache.file, run.fingerprint, set())
+                stored = trust.find(self.cache.file, run.fingerprint)
             place = Place(stored.generation, trust.cpu, trust.session)
         rows = []
         if misfit is not None:
@@ -158,7 +158,7 @@ class VerifiedCache:
             values = np.zeros((len(thetas), 0)) if responses is None else responses
             chosen = [row for row, reason in enumerate(reasons) if reason or finite[row]]
             why = ["" if finite[row] else reasons[row] for row in chosen]
-            rows += pack_rows(run.model.fingerprint, thetas[chosen], values[chosen], why, 0.0, place, True)
+            rows += pack_rows(run.fingerprint, thetas[chosen], values[chosen], why, 0.0, place, True)
         self.cache.write(rows)
 
     def discard(self, thetas: np.ndarray, *fingerprints: str) -> None:
@@ -166,12 +166,12 @@ class VerifiedCache:
         for generation in {each.generation for each in self._trust.stored.values()}:
             self.cache.discard(thetas, *fingerprints, generation=generation)
 
-    def are_stored(self, fingerprints: tuple[str, ...], thetas: np.ndarray, model: Model) -> np.ndarray:
-        """Whether rows are stored (n,), in any generation that may be used; nothing is verified."""
+    def are_stored(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> np.ndarray:
+        """Whether statistics or responses are stored (n,), in any generation that may be used; nothing is verified."""
         with self._trust.lock:
-            stored = self._trust.find(self.cache.file, model)
+            stored = self._trust.find(self.cache.file, run.fingerprint)
         found = np.zeros(len(thetas), dtype=bool)
-        for name in fingerprints:
+        for name in (fingerprint, run.fingerprint):
             for generation in self.cache.generations_of(name) if stored is None else [stored.generation]:
                 found |= self.cache.are_stored(name, thetas, generation)
         return found
@@ -193,7 +193,7 @@ class VerifiedCache:
         as long as the limit.
         """
         shape, limit = (len(run.model.channels), run.model.n_steps), getattr(run.model, "time_limit", None)
-        rows = self._look_up(run.model.fingerprint, thetas, run, shape[0] * shape[1], limit).rows
+        rows = self._look_up(run.fingerprint, thetas, run, shape[0] * shape[1], limit).rows
         return [
             row and (reason_of(row) if row.reason else np.frombuffer(row.value, dtype="<f8").reshape(shape))
             for row in rows
@@ -232,8 +232,8 @@ class VerifiedCache:
     def _find(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
         trust, cache = self._trust, self.cache
-        stored, n = trust.find(cache.file, run.model), rows_to_compare(cache.verify)
-        before, source = 0 if stored is None else stored.compared, source_number(run.model.fingerprint)
+        stored, n = trust.find(cache.file, run.fingerprint), rows_to_compare(cache.verify)
+        before, source = 0 if stored is None else stored.compared, source_number(run.fingerprint)
         if before >= n > 0:
             return stored.generation
         present = cache.generations_of(fingerprint) if stored is None else [stored.generation]
@@ -272,8 +272,8 @@ class VerifiedCache:
         return trust.stored[source].generation
 
     def _begin(self, fingerprint: str, run: VerifyingRun) -> None:
-        used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.model.fingerprint)}
-        self._trust.begin(self.cache.file, run.model, used)
+        used = {*self.cache.generations_of(fingerprint), *self.cache.generations_of(run.fingerprint)}
+        self._trust.begin(self.cache.file, run.fingerprint, used)
         text = "%s: stored simulations of this %s differ from new ones; they stay in the file and are not used"
         logger.warning(text, self.cache.path, type(run.model).__name__)
 
@@ -395,7 +395,7 @@ class VerifiedCache:
             scatter, spread = _difference(new.misfit, new.reason, once_more, run, run.accepted, "first")
         served = trust.served.total()
         trust.start_again()
-        labels = labels_of(self.cache.file, source_number(run.model.fingerprint))
+        labels = labels_of(self.cache.file, source_number(run.fingerprint))
         if not scatter and sum(each.generation == generation for each in labels) > 1:
             # the label was adopted, but the model has changed in a part of the space where no row was compared
             self._begin(fingerprint, run)

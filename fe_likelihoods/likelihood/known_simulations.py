@@ -98,8 +98,8 @@ class KnownSimulations:
         """Fill in rows whose responses are cached, and their statistics where these are not known."""
         model, stored = run.model, self._checked.rows
         found: list[np.ndarray | str | None] = [None] * len(rows)
-        if len(self.responses):  # a fingerprint takes longer
-            found = self.responses.look_up(model.fingerprint, [requested.keys[row] for row in rows])
+        if len(self.responses):
+            found = self.responses.look_up(run.fingerprint, [requested.keys[row] for row in rows])
         outcomes = {row: outcome for row, outcome in zip(rows, found, strict=True) if outcome is not None}
         left = [row for row in rows if row not in outcomes]
         if stored is not None and left:
@@ -109,7 +109,7 @@ class KnownSimulations:
             outcomes |= from_disk
             if requested.responses is not None and from_disk:
                 keys = [requested.keys[row] for row in from_disk]
-                self.responses.store(model.fingerprint, keys, list(from_disk.values()))
+                self.responses.store(run.fingerprint, keys, list(from_disk.values()))
         if not outcomes:
             return
         requested.done[list(outcomes)] = True

@@ -222,11 +222,11 @@ class Simulator:
                 statistics[wanted] = self.statistics(thetas[wanted])
             return statistics
         else:
-            requested = self._look_up(keys, which, False)
+            requested, run = self._look_up(keys, which, False)
             left = np.flatnonzero(~requested.done)
             statistics = requested.statistics
             if len(left):
-                statistics[left] = [new.statistics for new in self._new([keys[row] for row in left], False)]
+                statistics[left] = [new.statistics for new in self._new([keys[row] for row in left], False, run)]
         return statistics if len(keys) == len(which) else statistics[which]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
@@ -237,9 +237,9 @@ class Simulator:
         `statistics`.
         """
         keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
-        requested = self._look_up(keys, which, True)
+        requested, run = self._look_up(keys, which, True)
         left = np.flatnonzero(~requested.done)
-        for row, new in zip(left, self._new([keys[row] for row in left], True), strict=True):
+        for row, new in zip(left, self._new([keys[row] for row in left], True, run), strict=True):
             requested.responses[row], requested.reasons[row] = new.response, new.reason
         if len(keys) == len(which):
             return SimulationBatch(requested.responses, requested.reasons)
@@ -252,23 +252,24 @@ class Simulator:
         or to `leave` if they are not needed any more. Raises the errors of `statistics`.
         """
         keys, which = distinct_keys(thetas)
-        requested = self._look_up(keys, which, full)
+        requested, run = self._look_up(keys, which, full)
         found: dict[int, Simulation] = {}
         for row in np.flatnonzero(requested.done).tolist():
             response = requested.responses[row] if full else None
             result = Simulated(requested.statistics[row], requested.reasons[row], response)
             found[row] = Simulation(keys[row], full, result=result)
         left = np.flatnonzero(~requested.done).tolist()
-        found |= dict(zip(left, self._send([keys[row] for row in left], full, arrived), strict=True))
+        found |= dict(zip(left, self._send([keys[row] for row in left], full, arrived, run), strict=True))
         return [found[row] for row in which]
 
     def are_stored(self, thetas: np.ndarray) -> np.ndarray:
         """Whether a response in memory or any result on disk exists (n,); it is neither read nor verified."""
         keys = [row.tobytes() for row in thetas + 0.0]
-        outcomes = self.response_memory.look_up(self.model.fingerprint, keys)
+        run = self._run
+        outcomes = self.response_memory.look_up(run.fingerprint, keys)
         stored = np.array([outcome is not None for outcome in outcomes], dtype=bool)
         if self._checked.rows is not None:
-            stored |= self._checked.rows.are_stored(self.cache_keys, thetas, self.model)
+            stored |= self._checked.rows.are_stored(self._key, thetas, run)
         return stored
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
@@ -290,13 +291,14 @@ class Simulator:
                 self.memory_cache.store([keys[place]], statistics[[row]])
                 self.failures.count_outcomes(thetas[[row]], [reasons[row]])
 
-    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> Requested:
+    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> tuple[Requested, VerifyingRun]:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        requested = self._known.look_up(keys, full, self._run)
+        run = self._run
+        requested = self._known.look_up(keys, full, run)
         counts = np.bincount(which, minlength=len(keys))
         self.cache_hits += int(counts[requested.done & requested.finite].sum())
         self.disk_hits += int(counts[requested.on_disk].sum())
-        return requested
+        return requested, run
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -309,13 +311,13 @@ class Simulator:
         """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""
         self.failures.check(len(self._running.simulations))
 
-    def _new(self, keys: list[bytes], full: bool) -> list[Simulated]:
+    def _new(self, keys: list[bytes], full: bool, run: VerifyingRun) -> list[Simulated]:
         """Results of new simulations of distinct keys: one by one as they arrive from the pool, or in parts."""
         if self.streams and keys:
-            return self._new_in_pool(keys, full)
+            return self._new_in_pool(keys, full, run)
         results: list[Simulated] = []
         while len(results) < len(keys):
-            self._check_before()
+            self._check_before(run)
             left = keys[len(results) :]
             some = left[: self._chunk(len(left), full)]
             thetas, start = thetas_of(some, self.n_structural), time.perf_counter()
@@ -324,7 +326,7 @@ class Simulator:
                     values, reasons = simulate_batch(self.model, thetas, self.pool)
                 else:
                     values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
-            results += self._record(some, thetas, full, values, reasons, time.perf_counter() - start)
+            results += self._record(some, thetas, full, values, reasons, time.perf_counter() - start, run)
             # the size grows by steps: the first simulations may be failures that took no time
             seconds = time.perf_counter() - start
             self.chunk_size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / seconds))
@@ -340,9 +342,9 @@ class Simulator:
         return min(max(smallest, self.chunk_size), most_responses(self.model) if self._returns_responses(full) else n)
 
     @interrupts_end_the_run()
-    def _new_in_pool(self, keys: list[bytes], full: bool) -> list[Simulated]:
+    def _new_in_pool(self, keys: list[bytes], full: bool, run: VerifyingRun) -> list[Simulated]:
         arrived: SimpleQueue = SimpleQueue()
-        simulations = self._send(keys, full, arrived)
+        simulations = self._send(keys, full, arrived, run)
         left = dict.fromkeys(simulations)
         try:
             while left:
@@ -359,11 +361,11 @@ class Simulator:
             raise
         return [simulation.result for simulation in simulations]
 
-    def _send(self, keys: list[bytes], full: bool, arrived: SimpleQueue) -> list[Simulation]:
+    def _send(self, keys: list[bytes], full: bool, arrived: SimpleQueue, run: VerifyingRun) -> list[Simulation]:
         """Submit simulations of n distinct keys to the pool."""
         if not keys:
             return []
-        self._check_before()
+        self._check_before(run)
         running = self._running
         with running.lock:
             if not running.simulations:
@@ -447,7 +449,7 @@ class Simulator:
                 row[...] = result
         keys, reasons = [each.key for each in ended], [reason for _, reason in outcomes]
         try:
-            results = self._record(keys, thetas_of(keys, self.n_structural), full, values, reasons, seconds)
+            results = self._record(keys, thetas_of(keys, self.n_structural), full, values, reasons, seconds, self._run)
         except BaseException as error:
             for each in ended:
                 each.error = error
@@ -456,7 +458,14 @@ class Simulator:
             each.result = result
 
     def _record(
-        self, keys: list[bytes], thetas: np.ndarray, full: bool, values: np.ndarray, reasons: list[str], seconds: float
+        self,
+        keys: list[bytes],
+        thetas: np.ndarray,
+        full: bool,
+        values: np.ndarray,
+        reasons: list[str],
+        seconds: float,
+        run: VerifyingRun,
     ) -> list[Simulated]:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
@@ -471,15 +480,15 @@ class Simulator:
         self.failures.count_outcomes(thetas, reasons)
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
-        self._check_after(thetas, misfit, reasons, seconds)
+        self._check_after(thetas, misfit, reasons, seconds, run)
         self._checked.has_results = True
         self.memory_cache.store(keys, misfit)
         if full:
             outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
-            self.response_memory.store(self.model.fingerprint, keys, outcomes)
+            self.response_memory.store(run.fingerprint, keys, outcomes)
         if self.cache is not None:
             response = None if batch is None else batch.response
-            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, self._run)
+            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, run)
             self.cache.store_remark(self.model)
         if not full:
             return [Simulated(row, reason, None) for row, reason in zip(misfit, reasons, strict=True)]
@@ -493,32 +502,34 @@ class Simulator:
         tolerance = None if self.cache is None else self.cache.tolerance
         return VerifyingRun(self.model, self.pool, self.measured, self.statistic, self.n_numbers, tolerance)
 
-    def _check_before(self) -> None:
+    def _check_before(self, run: VerifyingRun) -> None:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
         try:
-            self._checked.before(self._run, lambda: self._known.earlier_points(self._run))
+            self._checked.before(run, lambda: self._known.earlier_points(run))
         except ChangedModel:
-            self._drop_unchecked()
+            self._drop_unchecked(run)
             raise
 
-    def _check_after(self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float) -> None:
+    def _check_after(
+        self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float, run: VerifyingRun
+    ) -> None:
         """Compare the model after simulations, if that is due."""
         if self.streams:
             seconds = time.perf_counter() - self._running.since
         last = not self._running.simulations
         try:
-            self._checked.after(self._run, thetas, misfit, reasons, seconds, last)
+            self._checked.after(run, thetas, misfit, reasons, seconds, last)
         except ChangedModel:
-            self._drop_unchecked()
+            self._drop_unchecked(run)
             raise
 
-    def _drop_unchecked(self) -> None:
+    def _drop_unchecked(self, run: VerifyingRun) -> None:
         """Drop the simulations since the last comparison, which may be from before or after a change of the model."""
         self._known.clear()
         if self.cache is not None and self._checked.unchecked:
             unchecked = np.concatenate(self._checked.unchecked)
-            self._checked.rows.discard(unchecked, self._key, self.model.fingerprint)
+            self._checked.rows.discard(unchecked, self._key, run.fingerprint)
 
 
 def _arrive(arrived: SimpleQueue, simulation: Simulation, _: Any) -> None:
