@@ -22,48 +22,14 @@ from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column
-from fe_likelihoods.signals.channels import Channel, Measurements
+from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import label
-from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
+from fe_likelihoods.simulation.model import SimulationBatch, simulate_batch
 from tests.cache.stored import stored_outcomes
+from tests.lines import Batched, Line
 
 SINE = np.sin(np.arange(50.0))
-
-
-class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above `steepest`; counts its runs."""
-
-    parameter_names = ("offset", "slope")
-    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
-    dt = 0.5
-    n_steps = 8
-
-    def __init__(self, steepest=1.0, fingerprint="line"):
-        self.steepest = steepest
-        self.fingerprint = fingerprint
-        self.runs = 0
-
-    def simulate(self, theta):
-        self.runs += 1
-        if theta[1] > self.steepest:
-            raise SimulationFailed(f"too steep: {theta[1]:.3f} \N{GREEK SMALL LETTER THETA}")
-        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps)
-        return np.vstack([line, -line])
-
-
-class Batched(Line):
-    """The same model with a batch method."""
-
-    def __init__(self, *args):
-        super().__init__(*args)
-        self.sizes = []
-
-    def simulate_batch(self, thetas):
-        self.sizes.append(len(thetas))
-        self.runs += len(thetas)
-        line = thetas[:, :1] + thetas[:, 1:] * self.dt * np.arange(self.n_steps)
-        return SimulationBatch(np.stack([line, -line], axis=1), [""] * len(thetas))
 
 
 def likelihood_of(model, cache=None, data=1.0, **kwargs):
@@ -130,7 +96,7 @@ def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
 
 
 def test_a_batch_needs_two_queries_and_one_write(path, thetas):
-    likelihood = likelihood_of(Batched(), path)
+    likelihood = likelihood_of(Batched(np.inf), path)
     for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
         likelihood.misfit(thetas[:1] + shift)
     statements = []
@@ -148,7 +114,7 @@ def test_a_batch_needs_two_queries_and_one_write(path, thetas):
 
 def test_statistics_responses_and_failures_are_written_in_one_transaction(path, thetas):
     """Or a program that is killed in between would repeat simulations."""
-    likelihood = likelihood_of(Batched(), path)
+    likelihood = likelihood_of(Batched(np.inf), path)
     likelihood.misfit(thetas[:1] + 1.0)
     statements = []
     likelihood.simulator.cache.file.connection().set_trace_callback(statements.append)
@@ -302,7 +268,7 @@ def test_reasons_of_any_kind(path):
 def test_the_oldest_are_evicted(path, rng):
     cache = SimulationCache(path, max_rows=10)
     thetas = rng.normal(size=(25, 2))
-    likelihood = likelihood_of(Batched(), cache)
+    likelihood = likelihood_of(Batched(np.inf), cache)
     likelihood.misfit(thetas[:8])
     assert (len(likelihood.model.sizes), cache.evictions) == (1, 0)
     likelihood.misfit(thetas[8:14])
@@ -388,9 +354,10 @@ def test_invalid_bounds(path, name, value):
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
     monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-    for model in (Line(), Batched()):
+    for model in (Line(), Batched(np.inf)):
         likelihood = likelihood_of(model, path.with_name(type(model).__name__))
-        np.testing.assert_array_equal(likelihood.misfit(thetas), likelihood_of(type(model)()).misfit(thetas))
+        expected = likelihood_of(type(model)(model.steepest)).misfit(thetas)
+        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
     assert model.sizes[0] == min(300, 8 * (os.cpu_count() or 1))  # every worker is busy
     assert sum(model.sizes) == 300 + likelihood.simulator.verifications  # its own list changes, on a busy machine
 
@@ -552,8 +519,9 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
         True,
         0,
     )
+    before = likelihood.model.runs - likelihood.simulator.verifications
     copy.misfit(thetas)
-    runs = copy.model.runs - likelihood.model.runs - copy.simulator.verifications
+    runs = copy.model.runs - copy.simulator.verifications - before
     assert runs == likelihood.simulator.failures.count > 0
 
 
@@ -574,7 +542,7 @@ def test_the_key_is_the_same_in_another_process():
 
 def models():
     record = Record("pulse", 0.01, np.sin(np.arange(30) / 3))
-    return [Line(), Batched(), LinearOscillator(record), RCColumn.lhpost(record, mesh=10)]
+    return [Line(), Batched(np.inf), LinearOscillator(record), RCColumn.lhpost(record, mesh=10)]
 
 
 @pytest.mark.parametrize("model", models(), ids=lambda model: type(model).__name__)
@@ -601,11 +569,11 @@ def test_responses_are_bounded(path, rng, caplog):
     bytes_each = 2 * 8 * 8
     cache = SimulationCache(path, responses=True, max_response_bytes=10 * bytes_each)
     thetas = rng.normal(size=(25, 2)) * [1.0, 0.1]
-    likelihood = likelihood_of(Batched(), cache)
+    likelihood = likelihood_of(Batched(np.inf), cache)
     likelihood.misfit(thetas[:14])
     likelihood.misfit(thetas[14:])
     assert (cache.info().responses, cache.info().response_bytes) == (10, 10 * bytes_each)
-    kept = [response is not None for response in stored_outcomes(cache, Batched(), thetas)]
+    kept = [response is not None for response in stored_outcomes(cache, Batched(np.inf), thetas)]
     assert kept == [False] * 15 + [True] * 10
     assert cache.info().simulations == 25
     assert len([r for r in caplog.records if "max_response_bytes" in r.message]) == 1

@@ -20,38 +20,10 @@ from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, simulate_batch
+from fe_likelihoods.simulation.model import simulate_batch
+from tests.lines import Batched, Line
 
 RECORD = Record("pulse", 0.01, np.sin(np.arange(40) / 3))
-
-
-class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one; counts its runs."""
-
-    parameter_names = ("offset", "slope")
-    channels = (Channel("a", "acceleration", "m/s2"), Channel("b", "displacement", "m"))
-    dt = 0.5
-    n_steps = 8
-    fingerprint = "line"
-
-    def __init__(self):
-        self.runs = 0
-
-    def simulate(self, theta):
-        self.runs += 1
-        if theta[1] > 1.0:
-            raise SimulationFailed("too steep after 2 s")
-        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps) / 3.0
-        return np.vstack([line, -line])
-
-
-class Batched(Line):
-    """The same model with a batch method."""
-
-    def simulate_batch(self, thetas):
-        batch = [Line().simulate(np.append(theta[:1], min(theta[1], 1.0))) for theta in thetas]
-        self.runs += len(thetas)
-        return SimulationBatch(np.array(batch), ["too steep" if slope > 1.0 else "" for slope in thetas[:, 1]])
 
 
 class MapOnly:
@@ -131,9 +103,9 @@ def test_duplicates_and_rows_that_are_not_finite():
     np.testing.assert_array_equal(batch.response[0], batch.response[4])
     np.testing.assert_array_equal(batch.response[3], Line().simulate(thetas[3]))
     assert np.isnan(batch.response[[1, 5, 6]]).all()
-    reasons = ["", "the parameters are not finite", "", "", "", "too steep after 2 s", "too steep after 2 s"]
+    reasons = ["", "the parameters are not finite", "", "", "", Line.reason, Line.reason]
     assert batch.reasons == reasons
-    assert likelihood.simulator.failures.reasons == {"too steep": 1}
+    assert likelihood.simulator.failures.reasons == {"θ too steep": 1}
     assert likelihood.simulate(thetas[1:2]).reasons == reasons[1:2]
     assert likelihood.simulate(thetas[3]).response.shape == (1, 2, 8)
     empty = likelihood.simulate(np.empty((0, 2)))

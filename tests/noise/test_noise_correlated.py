@@ -20,7 +20,8 @@ from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uni
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed
+from fe_likelihoods.simulation.model import SimulationFailed
+from tests import lines
 
 CHANNELS = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
 
@@ -135,33 +136,16 @@ def test_effective_samples_weigh_the_channels(rng):
 # in a likelihood ------------------------------------------------------------------------------------------------------
 
 
-class Line:
-    """Response ``theta[0] + theta[1] t`` in two channels; fails for a slope above one; counts its runs."""
-
-    parameter_names = ("offset", "slope")
+class Line(lines.Line):
     channels = CHANNELS
-    dt = 0.5
     n_steps = 12
-    fingerprint = "line"
-
-    def __init__(self):
-        self.runs = 0
-
-    def simulate(self, theta):
-        self.runs += 1
-        if theta[1] > 1.0:
-            raise SimulationFailed("too steep")
-        line = theta[0] + theta[1] * self.dt * np.arange(self.n_steps)
-        return np.vstack([line, -line])
 
 
-class BatchLine(Line):
+class BatchLine(lines.Batched):
     """A model with its own sums of squares, which must not be used as another statistic."""
 
-    def simulate_batch(self, thetas):
-        self.runs += len(thetas)
-        line = thetas[:, :1] + thetas[:, 1:] * self.dt * np.arange(self.n_steps)
-        return SimulationBatch(np.stack([line, -line], axis=1), ["too steep" if t[1] > 1.0 else "" for t in thetas])
+    channels = CHANNELS
+    n_steps = 12
 
     def misfit_batch(self, thetas, measured):
         raise AssertionError("white noise only")
