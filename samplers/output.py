@@ -226,8 +226,7 @@ def _parsed(stored: dict[str, Any]) -> tuple[AnnealingResult, Verdict | None]:
     )
     if verdict is None:
         return result, None
-    status, reasons, *others = verdict[:6]
-    findings = verdict[6] if len(verdict) > 6 else ()  # version 0.2 stored none
+    status, reasons, *others, findings = verdict
     return result, Verdict(status, tuple(reasons), *others, tuple(Finding(*each) for each in findings))
 
 
@@ -276,10 +275,8 @@ def run_of_file(backend: HDFBackend) -> str | None:
             if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
                 return None  # emcee was killed while it made the group
             whole = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
-            if whole and CHECKSUM in group.attrs:
-                whole = group.attrs[CHECKSUM] == _checksum(group, _checksum_of_steps(group)[1])
-            elif whole and "tempering" in group:  # of an earlier version
-                json.loads(group["tempering"][...].tobytes())
+            if whole and ("run" in group.attrs or "tempering" in group):  # else a chain of emcee
+                whole = group.attrs.get(CHECKSUM) == _checksum(group, _checksum_of_steps(group)[1])
             return group.attrs.get("run", "") if whole else DAMAGED
     except FileHeld:
         raise
@@ -295,6 +292,8 @@ def make_group(backend: HDFBackend, nwalkers: int, ndim: int, run: str, damaged:
         made = HDFBackend(str(path), backend.name, dtype=backend.dtype if backend.dtype_set else None, **options)
         made.reset(nwalkers, ndim)
         with made.open("a") as file:
-            file[made.name].attrs["run"] = run
+            group = file[made.name]
+            group.attrs["run"] = run
+            group.attrs[CHECKSUM] = _checksum(group, _checksum_of_steps(group)[1])
 
     change_file(backend, make, damaged)

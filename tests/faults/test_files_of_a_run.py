@@ -156,8 +156,15 @@ def damage_ladder(group):
     group["tempering"][3:] = 0
 
 
+def damage_attributes(group):
+    """A kill while attributes are replaced: the checksum is gone, and another one will be there twice."""
+    del group.attrs["checksum"]
+    group.attrs["random_state_9"] = group.attrs["random_state_2"]
+
+
 @pytest.mark.parametrize(
-    "damage", [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder]
+    "damage",
+    [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder, damage_attributes],
 )
 def test_half_of_a_step_is_found_and_the_chain_made_again(whole, damage, tmp_path):
     """As a process leaves it that is killed in HDF5; nothing is evaluated but a comparison."""
@@ -165,6 +172,7 @@ def test_half_of_a_step_is_found_and_the_chain_made_again(whole, damage, tmp_pat
     path = copied(path, tmp_path)
     with h5py.File(path, "a") as file:
         damage(file["mcmc"])
+    path.write_bytes(path.read_bytes().replace(b"random_state_9", b"random_state_2"))
     sampler = go_on(make(path, kind, log=tmp_path / "log"))
     assert outcome(sampler) == expected and Path(f"{path}.damaged").exists()
     assert len(points_of(tmp_path / "log")) <= 2
