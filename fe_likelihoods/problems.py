@@ -1,4 +1,4 @@
-"""Ready-made posteriors with bundled data: a bridge column and a seismically isolated bridge.
+"""Ready-made posteriors with bundled data: a bridge column, a seismically isolated bridge, and a free vibration.
 
 `bridge_column` is the full-scale bridge column of the LHPOST tests, updated as in Ramancha et al. (2022): five
 multiples of nominal values with normal priors truncated at zero, and two noise levels with half-normal priors. The
@@ -36,6 +36,7 @@ from .likelihood.posterior import Posterior
 from .models.isolated_bridge_channels import CHANNEL_SETS
 from .noise.autoregressive import AutoregressiveNoise
 from .noise.gaussian import GaussianNoise
+from .priors.distributions import HalfNormal, TruncatedNormal
 from .priors.problem_priors import bridge_column_prior, correlation_priors, isolated_bridge_prior
 from .signals.channels import Channel, Measurements
 from .signals.datasets import Dataset, read_dataset
@@ -54,6 +55,7 @@ __all__ = [
     "bridge_column_data",
     "bridge_column_measurements",
     "bridge_column_prior",
+    "free_vibration",
     "isolated_bridge",
     "isolated_bridge_data",
     "isolated_bridge_measurements",
@@ -294,6 +296,43 @@ ISOLATED_BRIDGE_OUTPUTS = MappingProxyType(
 
 ISOLATED_BRIDGE_NOISE = MappingProxyType({"twin": 0.05, "means": 0.10})
 """Standard deviation of the noise of the two synthetic data sets, in root mean squares of each channel (assumed)."""
+
+
+def _vibrate(theta: np.ndarray, n_steps: int = 200) -> np.ndarray:
+    """Displacement [m] of a free vibration, (1, n_steps) at 0.01 s: multiples of 2 Hz squared and of 2 % damping."""
+    time = 0.01 * np.arange(n_steps)
+    omega = 2.0 * np.pi * 2.0 * np.sqrt(theta[0])
+    return 0.05 * np.exp(-0.02 * theta[1] * omega * time)[None] * np.cos(omega * time)
+
+
+def free_vibration() -> Posterior:
+    """Posterior of a free vibration, a first example whose simulation takes microseconds.
+
+    Its parameters are multiples of the nominal stiffness (2 Hz) and of the nominal damping (2 % of critical), and the
+    noise level of one measured displacement. The measurements are **synthetic**: stiffness 1.1, damping 0.8, and white
+    noise of 2 mm.
+
+    Returns
+    -------
+    Posterior
+        Parameters stiffness, damping and sigma_top [m].
+
+    Examples
+    --------
+    >>> from fe_likelihoods import problems
+    >>> problems.free_vibration().parameter_names
+    ['stiffness', 'damping', 'sigma_top']
+    """
+    from .models.function import FunctionModel
+
+    channels = [Channel("top", "displacement", "mm")]
+    model = FunctionModel(_vibrate, ["stiffness", "damping"], channels, dt=0.01, n_steps=200)
+    noise = 0.002 * np.random.default_rng(1).standard_normal((1, 200))
+    description = "SYNTHETIC: free vibration with stiffness 1.1 and damping 0.8, plus white noise of 2 mm (seed 1)"
+    measurements = Measurements(model.channels, model.dt, model.simulate([1.1, 0.8]) + noise, description)
+    multiple = TruncatedNormal(1.0, 0.3)
+    prior = {"stiffness": multiple, "damping": multiple, "sigma_top": HalfNormal(0.01)}
+    return Posterior(FELikelihood(model, measurements), prior)
 
 
 def table_motion(seed: int = 1994) -> Record:

@@ -5,9 +5,6 @@ import importlib.util
 import re
 from pathlib import Path
 
-import fe_likelihoods
-import samplers
-
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 SCRIPTS = sorted((ROOT / "tutorials").glob("[0-9]*.py"))
@@ -39,22 +36,6 @@ def test_api_pages_have_every_module(tmp_path):
         for path in (ROOT / package).rglob("*.py")
     }
     assert documented == {name for name in modules if not name.rpartition(".")[2].startswith("_")}
-
-
-def test_the_page_of_names_has_every_public_name_and_no_unknown_one():
-    named = re.findall(r"``(\w+)``", (DOCS / "names.rst").read_text())
-    public = {*fe_likelihoods.__all__, *samplers.__all__}
-    assert not public - set(named), "say in docs/names.rst, and on the page of its task, what they are for"
-    exported = {
-        name
-        for package in (fe_likelihoods, samplers)
-        for path in Path(package.__file__).parent.rglob("*.py")
-        for exports in re.findall(r"^__all__ = (\[[^\]]*\])", path.read_text(), re.MULTILINE)
-        for name in ast.literal_eval(exports)
-    }
-    assert not set(named) - public - exported
-    for module, names in re.findall(r"^   `([\w.]+)`, (.*)$", (DOCS / "names.rst").read_text(), re.MULTILINE):
-        assert all(hasattr(importlib.import_module(module), name) for name in re.findall(r"``(\w+)``", names)), module
 
 
 def test_tutorials_have_the_form_of_the_gallery():

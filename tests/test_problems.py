@@ -432,3 +432,11 @@ def test_bridge_column_with_other_sensors():
             assert posterior.prior.distributions[f"sigma_{name}"].sd == pytest.approx(0.3 * rms)
         assert posterior.prior.distributions["sigma_displacement"] == HalfNormal(1.2 * INCH)
         assert np.isfinite(posterior.log_prob(posterior.sample_prior(1, 1)[0]))
+
+
+def test_the_free_vibration_has_its_stated_truth():
+    posterior = problems.free_vibration()
+    residuals = posterior.likelihood.residuals([1.1, 0.8])
+    assert 0.0018 < np.sqrt(np.mean(residuals**2)) < 0.0022  # 2 mm within twice the standard error of 200 samples
+    assert posterior([1.1, 0.8, 0.002]) > posterior([[1.0, 1.0, 0.002], [1.1, 0.8, 0.004]]).max()
+    assert posterior.likelihood.first(0.5).model.n_steps == 51
