@@ -44,7 +44,6 @@ from .text_files import (
     check_peak,
     decimals_of,
     decode_text,
-    fixed_width_samples,
     is_number,
     number_cells,
     parse_count,
@@ -53,7 +52,7 @@ from .text_files import (
 )
 from .uneven_times import without_repeated_times
 
-__all__ = ["V2Channel", "find_v2_channels", "parse_at2", "parse_v2"]
+__all__ = ["V2Channel", "find_v2_channels", "fixed_width_samples", "parse_at2", "parse_v2"]
 
 # Expressions are searched from one place in a line, and their parts never match the same text: their time is linear.
 _AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
@@ -114,8 +113,34 @@ class V2Channel(NamedTuple):
     lines: list[str]
 
 
+def fixed_width_samples(
+    lines: list[str], start: int, count: int, form: tuple[int, int], file: str, first: int = 1
+) -> NDArray[np.float64]:
+    """Return `count` samples in Fortran columns, which may touch, from line index `start` on; `form` is (numbers per
+    line, columns per number), `first` the file's number of the first line.
+
+    Raises ValueError if a line has too few or too many numbers.
+    """
+    per_line, width = form
+    values: list[float] = []
+    for k in range(start, start - (-count // per_line)):
+        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {first + k}"
+        wanted = min(per_line, count - len(values))
+        if math.ceil(len(line) / width) != wanted:
+            raise ValueError(
+                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
+                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
+            )
+        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
+    if len(values) < 2:
+        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
+    if len(line) % width and len(lines[start].rstrip()) % width == 0:  # the last line ends within a number
+        raise ValueError(f"{where}: expected numbers of {width} columns, the last one is cut; the file is truncated")
+    return np.array(values)
+
+
 def parse_at2(text: str, file: str) -> Series:
-    """Return the samples of a PEER AT2 file (see `fe_likelihoods.signals.readers.read_at2`)."""
+    """Return the samples of a PEER AT2 file (see `fe_likelihoods.signals.read.read_at2`)."""
     lines = text.splitlines()
     index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
     if index is None:

@@ -15,7 +15,7 @@ _NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
 
 
 def parse_obspy(path: str | Path, channel: str | None) -> Series:
-    """Return the samples of one trace (see `fe_likelihoods.signals.readers.read_obspy`)."""
+    """Return the samples of one trace (see `fe_likelihoods.signals.read.read_obspy`)."""
     try:
         import obspy
     except ImportError as error:

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..units import from_si, to_si
+from .at2_v2_formats import fixed_width_samples
 from .clock_times import is_clock
 from .text_files import (
     LINE_END,
@@ -37,7 +38,6 @@ from .text_files import (
     check_count,
     check_peak,
     decimals_of,
-    fixed_width_samples,
     is_number,
     opening_text,
     parse_count,
@@ -144,7 +144,7 @@ def _name_of(lines: list[str], text: str) -> str:
 
 
 def parse_smc(text: str, file: str) -> Series:
-    """Return the samples of a USGS SMC file (see `fe_likelihoods.signals.readers.read_smc`)."""
+    """Return the samples of a USGS SMC file (see `fe_likelihoods.signals.read.read_smc`)."""
     lines = text.splitlines()
     title = lines[0].strip() if lines else ""
     number, _, kind = title.partition(" ")
@@ -184,7 +184,7 @@ def parse_smc(text: str, file: str) -> Series:
 
 
 def parse_geonet(text: str, file: str) -> list[GeonetComponent]:
-    """Return the components of a GeoNet V1A or V2A file (see `fe_likelihoods.signals.readers.read_geonet`)."""
+    """Return the components of a GeoNet V1A or V2A file (see `fe_likelihoods.signals.read.read_geonet`)."""
     lines, place, found = text.splitlines(), 0, []
     while place < len(lines) and any(line.strip() for line in lines[place : place + 3]):
         if len(found) >= _MOST_COMPONENTS:
@@ -237,7 +237,7 @@ def _geonet_component(lines: list[str], place: int, file: str) -> tuple[GeonetCo
 
 
 def parse_knet(text: str, file: str) -> Series:
-    """Return the samples of a K-NET or KiK-net file (see `fe_likelihoods.signals.readers.read_knet`)."""
+    """Return the samples of a K-NET or KiK-net file (see `fe_likelihoods.signals.read.read_knet`)."""
     lines = text.splitlines()
     header = {line[:_KNET_NAME].strip().rstrip("."): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
     names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor")
@@ -271,7 +271,7 @@ def parse_knet(text: str, file: str) -> Series:
 
 
 def parse_esm(text: str, file: str) -> Series:
-    """Return the samples of an ESM or ITACA file (see `fe_likelihoods.signals.readers.read_esm`)."""
+    """Return the samples of an ESM or ITACA file (see `fe_likelihoods.signals.read.read_esm`)."""
     lines = text.splitlines()
     header: dict[str, str] = {}
     for line in lines[:_ESM_TEXT]:

@@ -1,4 +1,4 @@
-"""Shared by the readers of text files: reading, numbers, units and series of samples."""
+"""Shared by the readers of files: bytes and text, numbers, units, and series of samples."""
 
 import codecs
 import itertools
@@ -22,7 +22,7 @@ __all__ = [
     "check_peak",
     "decimals_of",
     "decode_text",
-    "fixed_width_samples",
+    "dimension_of",
     "is_number",
     "number_cells",
     "opening_text",
@@ -37,7 +37,6 @@ NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 
 LARGEST_FILE = 256 * 2**20
 """Largest size of a text file or an archive [bytes]; long records have some MiB."""
-
 
 LINE_END = re.compile(r"\r+\n|\r")
 """Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
@@ -71,29 +70,24 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def decode_text(content: bytes) -> str:
-    """Return the text of a file without padding and a closing remark after its last line.
+    """Return the text of a file without padding and closing remarks after its last line.
 
     The text is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. A line such as ``*** End
     data ***`` is a closing remark: it has no number, and no separator of cells. Zero bytes directly after a number are
     kept, so that this number is refused: a table that a crash has cut and padded may have lost its last digits.
     """
-    if content.startswith(_UTF_16):
-        text = content.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("latin-1")
-    text = _without_padding(LINE_END.sub("\n", text))
-    while _CLOSING.fullmatch(text, text.rfind("\n") + 1):
-        text = _without_padding(text[: text.rfind("\n") + 1])
-    return text
-
-
-def _without_padding(text: str) -> str:
-    """A text up to the end of its last line, or ^Z; blanks at the end of this line may be empty cells."""
-    last = len(text.rstrip(_PADDING))
-    return text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
+    try:
+        text = content.decode("utf-8-sig") if not content.startswith(_UTF_16) else content.decode("utf-16", "replace")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = LINE_END.sub("\n", text)
+    while True:
+        last = len(text.rstrip(_PADDING))  # blanks at the end of this line may be empty cells
+        text = text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
+        start = text.rfind("\n") + 1
+        if not _CLOSING.fullmatch(text, start):
+            return text
+        text = text[:start]
 
 
 def opening_text(content: bytes) -> str:
@@ -138,16 +132,26 @@ def _aligned(lines: list[str]) -> list[list[str]] | None:
         return None
     width, after = most[1] - most[0], len(lines[0]) - points[0][-1]  # columns of a field, and from its point to its end
     starts = [point + after - width for point in most]
-    fields = [
-        [line[start : start + width].strip() for start in starts[: len(found)]]
-        for line, found in zip(lines, points, strict=True)
-    ]
-    whole = (
-        len(line) == starts[len(row) - 1] + width and not line[: starts[0]].strip()
-        for line, row in zip(lines, fields, strict=True)
-    )
-    even = all(b - a == width for a, b in itertools.pairwise(most)) and starts[0] >= 0
-    return fields if even and all(whole) and all(is_number(cell) for row in fields for cell in row) else None
+    if starts[0] < 0 or any(b - a != width for a, b in itertools.pairwise(most)):
+        return None
+    rows = []
+    for line, found in zip(lines, points, strict=True):
+        rows.append([line[start : start + width].strip() for start in starts[: len(found)]])
+        if (
+            len(line) != starts[len(found) - 1] + width
+            or line[: starts[0]].strip()
+            or not all(map(is_number, rows[-1]))
+        ):
+            return None
+    return rows
+
+
+def dimension_of(unit: str) -> str | None:
+    """Return the dimension of a unit, or None for other text."""
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
+        return None
 
 
 def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
@@ -183,6 +187,25 @@ def check_peak(found: float, stated: float, tolerance: float, where: str) -> Non
         )
 
 
+def _as_float(field: str) -> float:
+    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
+    if "_" in field:
+        raise ValueError
+    try:
+        return float(field)
+    except ValueError:
+        return float(_FORTRAN_EXPONENT.sub("e", field))
+
+
+def is_number(field: str) -> bool:
+    """Return whether a field of a file is a number."""
+    try:
+        _as_float(field)
+    except ValueError:
+        return False
+    return True
+
+
 def parse_number(field: str, where: str) -> float:
     """Return the finite number in a field of a file; raise ValueError for anything else."""
     try:
@@ -195,30 +218,11 @@ def parse_number(field: str, where: str) -> float:
     return value
 
 
-def fixed_width_samples(
-    lines: list[str], start: int, count: int, form: tuple[int, int], file: str, first: int = 1
-) -> NDArray[np.float64]:
-    """Return `count` samples in Fortran columns, which may touch, from line index `start` on; `form` is (numbers per
-    line, columns per number), `first` the file's number of the first line.
-
-    Raises ValueError if a line has too few or too many numbers.
-    """
-    per_line, width = form
-    values: list[float] = []
-    for k in range(start, start - (-count // per_line)):
-        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {first + k}"
-        wanted = min(per_line, count - len(values))
-        if math.ceil(len(line) / width) != wanted:
-            raise ValueError(
-                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
-                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
-            )
-        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
-    if len(values) < 2:
-        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
-    if len(line) % width and len(lines[start].rstrip()) % width == 0:  # the last line ends within a number
-        raise ValueError(f"{where}: expected numbers of {width} columns, the last one is cut; the file is truncated")
-    return np.array(values)
+def parse_count(digits: str, where: str) -> int:
+    """Return a number of samples, channels or columns; raise ValueError for more than 12 digits."""
+    if len(digits) > 12:
+        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
+    return int(digits)
 
 
 def decimals_of(field: str) -> int:
@@ -229,29 +233,3 @@ def decimals_of(field: str) -> int:
     mantissa, _, exponent = field.lower().replace("d", "e").partition("e")
     power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
     return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)
-
-
-def is_number(field: str) -> bool:
-    """Return whether a field of a file is a number."""
-    try:
-        _as_float(field)
-    except ValueError:
-        return False
-    return True
-
-
-def parse_count(digits: str, where: str) -> int:
-    """Return a number of samples, channels or columns; raise ValueError for more than 12 digits."""
-    if len(digits) > 12:
-        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
-    return int(digits)
-
-
-def _as_float(field: str) -> float:
-    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
-    if "_" in field:
-        raise ValueError
-    try:
-        return float(field)
-    except ValueError:
-        return float(_FORTRAN_EXPONENT.sub("e", field))

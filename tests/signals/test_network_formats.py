@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import read_record
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
+from fe_likelihoods.signals.read import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from fe_likelihoods.units import G0
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, write_at2

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.signals.measurement_readers import read_columns, read_imposed_test
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
+from fe_likelihoods.signals.read import read_at2, read_columns, read_csv, read_imposed_test, read_v2
 from fe_likelihoods.units import G0, to_si
 
 # Peak ground acceleration [g], number of samples and step [s]: the table in the README of the records.
