@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..signals.at2_v2_formats import find_v2_channels, parse_v2
 from ..signals.datasets import read_dataset
 from ..signals.read import read_record, recognise_reader
 from ..signals.records import Record
-from ..signals.smc_geonet_knet_esm_formats import parse_geonet
+from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
 from ..signals.tables import (
     Table,
     column_values,
@@ -128,9 +127,9 @@ def _v2(path: Path) -> _Lines:
 def _geonet(path: Path) -> _Lines:
     components = parse_geonet(read_text(path), str(path))
     rows = [("component", *_HEAD)]
-    for each in components:
-        rows.append((each.component, *_cells(to_si(each.series.values, each.series.unit), each.series.dt)))
-    given, taken = [each.component for each in components], set[str]()
+    for component, series in components:
+        rows.append((component, *_cells(to_si(series.values, series.unit), series.dt)))
+    given, taken = [component for component, _ in components], set[str]()
     names = [(_name_of_channel(name, taken), name) for name in given if given.count(name) == 1]
     text = [f"{len(components)} components of acceleration", text_table(rows)]
     text += [f"the component {name!r} is there {given.count(name)} times" for name in given if given.count(name) > 1][

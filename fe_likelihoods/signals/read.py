@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import to_si
-from . import at2_v2_formats, obspy_formats, smc_geonet_knet_esm_formats
+from . import strong_motion
 from .channels import Channel, Measurements
 from .records import DisplacementHistory, Record
 from .tables import (
@@ -213,7 +213,7 @@ def recognise_reader(path: str | Path) -> str | None:
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)):
         return None if Path(path).suffix.lower() in WORKBOOKS else "read_v2"
-    name, reader = smc_geonet_knet_esm_formats.recognise(content)
+    name, reader = strong_motion.recognise(content)
     if name and reader is None:
         raise ValueError(f"{path}: {_looks_like(name, None)}")
     return reader
@@ -226,7 +226,7 @@ def _named_format(path: str | Path, reader: str) -> Iterator[None]:
         yield
     except ValueError as error:
         try:
-            name, other = smc_geonet_knet_esm_formats.recognise(read_bytes(path))
+            name, other = strong_motion.recognise(read_bytes(path))
         except ValueError:
             raise error from None
         if name and other != reader:
@@ -254,25 +254,24 @@ def _read(
     with _named_format(path, reader):
         if reader == "read_v2":
             found = _v2_channel(path, channel, member)
-            series, file = at2_v2_formats.parse_v2(found), found.file
+            series, file = strong_motion.parse_v2(found), found.file
         elif reader == "read_obspy":
-            series = obspy_formats.parse_obspy(path, channel)
+            series = strong_motion.parse_obspy(path, channel)
         elif reader == "read_geonet":
             series = _geonet_component(path, channel)
         else:
-            home = at2_v2_formats if reader == "read_at2" else smc_geonet_knet_esm_formats
-            series = getattr(home, reader.replace("read", "parse"))(read_text(path), file)
+            series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
     if reader in ("read_v2", "read_geonet", "read_obspy"):
         name = series.title
     record = _record(series, units, file, name, resample, dt)
     return replace(record, source=file.removeprefix(f"{Path(path).parent}/")) if reader == "read_v2" else record
 
 
-def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> at2_v2_formats.V2Channel:
+def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> strong_motion.Block:
     """The channel with a number; a text is a number too, or the name of a file in the archive."""
     if isinstance(channel, str):
         channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
-    candidates = at2_v2_formats.find_v2_channels(path, member)
+    candidates = strong_motion.find_v2_channels(path, member)
     chosen = [each for each in candidates if channel is None or each.channel == channel]
     if len(chosen) != 1:
         listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
@@ -285,14 +284,14 @@ def _v2_channel(path: str | Path, channel: int | str | None, member: str | None)
 
 
 def _geonet_component(path: str | Path, component: int | str | None) -> Series:
-    found = smc_geonet_knet_esm_formats.parse_geonet(read_text(path), str(path))
-    chosen = [each for each in found if component is None or each.component.lower() == str(component).lower()]
+    found = strong_motion.parse_geonet(read_text(path), str(path))
+    chosen = [series for name, series in found if component is None or name.lower() == str(component).lower()]
     if len(chosen) != 1:
         raise ValueError(
             f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
-            f"{', '.join(each.component for each in found)}"
+            f"{', '.join(name for name, _ in found)}"
         )
-    return chosen[0].series
+    return chosen[0]
 
 
 def _read_table(
@@ -321,7 +320,7 @@ def _read_table(
                 f"excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
             )
         step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
-        if smc_geonet_knet_esm_formats.recognise(read_bytes(path))[1] not in (None, "read_at2"):
+        if strong_motion.recognise(read_bytes(path))[1] not in (None, "read_at2"):
             raise ValueError(f"{path}: expected a table")  # lines such as NPTS=3, DT=0.01 may stand above a table
     return _record(Series(table.title, step, unit, values, times), units, path, Path(path).stem, resample)
 

@@ -183,23 +183,25 @@ def read_table(
 
 def _workbook(path: str | Path) -> list[str]:
     """Lines of the first sheet, with tabs between cells; formulas have their stored values."""
-    import pandas  # slow to import
-
-    read_bytes(path)  # the checks of existence and size
     try:
-        rows = pandas.read_excel(path, header=None, na_filter=False, dtype=object, engine="openpyxl").to_numpy()
+        from openpyxl import load_workbook
     except ImportError as error:
         raise ValueError(
             f"reading {path} needs the package openpyxl: install it with pip install openpyxl, or save the sheet as CSV"
         ) from error
+    read_bytes(path)  # the checks of existence and size
+    try:
+        sheet = load_workbook(path, read_only=True, data_only=True).worksheets[0]
+        rows = [list(map(_cell_text, row)) for row in sheet.iter_rows(values_only=True)]
     except Exception as error:  # a damaged workbook may raise anything
         raise ValueError(f"{path}: not a readable Excel workbook ({error}); save it as CSV") from error
-    return ["\t".join(map(_cell_text, row)) for row in rows]
+    width = max(map(len, rows), default=0)
+    return ["\t".join(row + [""] * (width - len(row))) for row in rows]
 
 
 def _cell_text(value: object) -> str:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return repr(float(value)) if number else " ".join(str(value).split())
+    return repr(float(value)) if number else " ".join(str("" if value is None else value).split())
 
 
 def _split(line: str, separator: str, where: str) -> list[str]:

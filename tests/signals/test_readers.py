@@ -204,7 +204,7 @@ class TestCSV:
                 "points or decimal commas, got '0,0' in line 2 and '0.5' in line 3",
             ),
             ("time_s;acc_g\n0.0;1.0\n", {}, "times that increase over 2 rows or more, got 1 row"),
-            ("0.0;1.0\n0.1;2.0\n", {}, "2 columns and no header line; .* or give time_unit="),
+            ("0.0;1.0\n0.1;2.0\n", {}, "2 columns and no header line; .* or give column=2 and time_unit="),
             ("time_s,acc_g\n0,one\n0.5,2\n1,3\n", {}, "line 2: expected a number, got 'one'"),
             ("Time;acc_g\n5.3.2024 10h32;1.0\n5.3.2024 10:32:08;2.0\n", {}, "a clock time such as"),
             ("0,one\n0.5,2\n1,3\n", {"units": "g", "time_unit": "s"}, "line 1: expected a number, got 'one'"),

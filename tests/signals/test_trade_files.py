@@ -487,7 +487,7 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
     np.testing.assert_allclose(record.acceleration, 1e-2 * expected, atol=2e-3)
     more = smc(values, 200.0)
     path.write_text(text(*more, more[-2]))
-    with pytest.raises(ValueError, match="the header announces 61 numbers, the file has more"):
+    with pytest.raises(ValueError, match="announces 61 samples but has more after them"):
         read_record(path)
 
 
