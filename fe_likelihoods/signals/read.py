@@ -5,13 +5,12 @@ error. Everything is converted to SI units. Unit and time step come from the fil
 if neither states them or if they disagree.
 """
 
-import contextlib
 import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,18 +137,9 @@ def read_record(
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
-    reader = recognise_reader(path)
-    if reader is not None:
-        given = dict(time=time, time_unit=time_unit, skip=skip, missing=missing)
-        if unused := [name for name, value in given.items() if value is not None]:
-            raise ValueError(f"{path}: a file for {reader} states its times and samples; leave {', '.join(unused)} out")
-        return _read(reader, path, units, dt, channel, member, resample)
-    try:
-        return _read_table(path, units, dt, channel, time, time_unit, skip, missing, resample)
-    except ValueError as error:
-        if Path(path).suffix.lower() in _TABLES:
-            raise
-        raise ValueError(f"{error}. The file has no known format of ground motions and was read as a table") from error
+    return _read(
+        path, None, units, dt, channel, member, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
+    )
 
 
 def read_csv(
@@ -165,102 +155,102 @@ def read_csv(
     resample: float | None = None,
 ) -> Record:
     """Read a ground motion from a table as `read_record` does; files of other formats are refused."""
-    return _read_table(path, units, dt, column, time, time_unit, skip, missing, resample)
+    return _read(
+        path, "read_csv", units, dt, column, None, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
+    )
 
 
 def read_at2(path: str | Path, units: str | None = None) -> Record:
     """Read a ground motion from a PEER AT2 file as `read_record` does; files of other formats are refused."""
-    return _read("read_at2", path, units)
+    return _read(path, "read_at2", units)
 
 
 def read_v2(
     path: str | Path, channel: int | None = None, member: str | None = None, resample: float | None = None
 ) -> Record:
     """Read a channel of V1 or V2 files as `read_record` does; files of other formats are refused."""
-    return _read("read_v2", path, channel=channel, member=member, resample=resample)
+    return _read(path, "read_v2", channel=channel, member=member, resample=resample)
 
 
 def read_smc(path: str | Path, resample: float | None = None) -> Record:
     """Read a ground motion from a USGS SMC file as `read_record` does; files of other formats are refused."""
-    return _read("read_smc", path, resample=resample)
+    return _read(path, "read_smc", resample=resample)
 
 
 def read_geonet(path: str | Path, component: str | None = None) -> Record:
     """Read one component of a GeoNet V1A or V2A file as `read_record` does; files of other formats are refused."""
-    return _read("read_geonet", path, channel=component)
+    return _read(path, "read_geonet", channel=component)
 
 
 def read_knet(path: str | Path) -> Record:
     """Read a ground motion from a K-NET or KiK-net file as `read_record` does; files of other formats are refused."""
-    return _read("read_knet", path)
+    return _read(path, "read_knet")
 
 
 def read_esm(path: str | Path) -> Record:
     """Read a ground motion from an ESM or ITACA file as `read_record` does; files of other formats are refused."""
-    return _read("read_esm", path)
+    return _read(path, "read_esm")
 
 
 def read_obspy(path: str | Path, units: str | None = None, channel: str | None = None) -> Record:
     """Read a miniSEED, SAC or GSE2 file by obspy as `read_record` does; files of other formats are refused."""
-    return _read("read_obspy", path, units, channel=channel)
+    return _read(path, "read_obspy", units, channel=channel)
 
 
-def recognise_reader(path: str | Path) -> str | None:
+def recognise_reader(path: str | Path, expected: str | None = None) -> str | None:
     """Return the name of the function that reads a file or zip archive; None for a table (CSV, Excel).
 
-    Raises ValueError if the file cannot be read, or has a known format without a reader.
+    Raises ValueError if the file cannot be read, or has a known format without a reader, or not the `expected` one.
     """
     content = read_bytes(path)
     if zipfile.is_zipfile(io.BytesIO(content)):
         return None if Path(path).suffix.lower() in WORKBOOKS else "read_v2"
     name, reader = strong_motion.recognise(content)
-    if name and reader is None:
-        raise ValueError(f"{path}: {_looks_like(name, None)}")
+    table = expected == "read_csv" and reader == "read_at2"  # lines such as NPTS=3, DT=0.01 may stand above a table
+    if name and (reader is None or expected not in (None, reader)) and not table:
+        article = "an" if name.startswith(("ESM", "HDF5")) else "a"
+        advice = f": read it with {reader}" if reader else ", which is not read; take a file of another format"
+        raise ValueError(f"{path}: this looks like {article} {name} file{advice}")
     return reader
 
 
-@contextlib.contextmanager
-def _named_format(path: str | Path, reader: str) -> Iterator[None]:
-    """Name the format of a file that a reader refuses, if it is another known format."""
-    try:
-        yield
-    except ValueError as error:
-        try:
-            name, other = strong_motion.recognise(read_bytes(path))
-        except ValueError:
-            raise error from None
-        if name and other != reader:
-            raise ValueError(f"{path}: {_looks_like(name, other)}") from error
-        raise
-
-
-def _looks_like(name: str, reader: str | None) -> str:
-    article = "an" if name.startswith(("ESM", "HDF5")) else "a"
-    advice = ", which is not read; take a file of another format" if reader is None else f": read it with {reader}"
-    return f"this looks like {article} {name} file{advice}"
-
-
 def _read(
-    reader: str,
     path: str | Path,
+    expected: str | None,
     units: str | None = None,
     dt: float | None = None,
     channel: int | str | None = None,
     member: str | None = None,
     resample: float | None = None,
+    **table: Any,
 ) -> Record:
-    """The record in a file of a network, at the call depth below a public reader that its warnings expect."""
+    """The record in a file, at the call depth below a public reader that its warnings expect.
+
+    `table` has time, time_unit, skip and missing, the options of tables.
+    """
+    found = recognise_reader(path, expected)
+    reader = expected or found or "read_csv"
     file, name = str(path), Path(path).name if reader == "read_knet" else Path(path).stem
-    with _named_format(path, reader):
-        if reader == "read_v2":
-            found = _v2_channel(path, channel, member)
-            series, file = strong_motion.parse_v2(found), found.file
-        elif reader == "read_obspy":
-            series = strong_motion.parse_obspy(path, channel)
-        elif reader == "read_geonet":
-            series = _geonet_component(path, channel)
-        else:
-            series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
+    if reader == "read_csv":
+        try:
+            series, dt = _table_series(path, units, dt, channel, resample, **table), None
+        except ValueError as error:
+            if expected or Path(path).suffix.lower() in _TABLES:
+                raise
+            raise ValueError(
+                f"{error}. The file has no known format of ground motions and was read as a table"
+            ) from error
+    elif unused := ", ".join(name for name, option in table.items() if option is not None):
+        raise ValueError(f"{path}: a file for {reader} states its times and samples; leave {unused} out")
+    elif reader == "read_v2":
+        block = _v2_channel(path, channel, member)
+        series, file = strong_motion.parse_v2(block), block.file
+    elif reader == "read_obspy":
+        series = strong_motion.parse_obspy(path, channel)
+    elif reader == "read_geonet":
+        series = _geonet_component(path, channel)
+    else:
+        series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
     if reader in ("read_v2", "read_geonet", "read_obspy"):
         name = series.title
     record = _record(series, units, file, name, resample, dt)
@@ -294,35 +284,32 @@ def _geonet_component(path: str | Path, component: int | str | None) -> Series:
     return chosen[0]
 
 
-def _read_table(
+def _table_series(
     path: str | Path,
     units: str | None,
     dt: float | None,
     column: int | str | None,
-    time: int | str | None,
-    time_unit: str | None,
-    skip: int | None,
-    missing: Sequence[float] | None,
     resample: float | None,
-) -> Record:
-    """The record in a table, at the call depth below a public reader that its warnings expect."""
-    with _named_format(path, "read_csv"):
-        table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
-        rows = column == "rows" and "rows" not in [each.name for each in table.columns]
-        place = value_column(table, None if rows else column)
-        values = column_values(table, place, missing)
-        unit = column_unit(table, place, values, units, "acceleration", table.file)
-        warn_if_absent(table, [place], missing, stacklevel=3)
-        absent = np.flatnonzero(np.isnan(values))
-        if absent.size:
-            raise ValueError(
-                f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an "
-                f"excitation needs all samples, {absent.size} are missing: interpolate them, or cut the file"
-            )
-        step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
-        if strong_motion.recognise(read_bytes(path))[1] not in (None, "read_at2"):
-            raise ValueError(f"{path}: expected a table")  # lines such as NPTS=3, DT=0.01 may stand above a table
-    return _record(Series(table.title, step, unit, values, times), units, path, Path(path).stem, resample)
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+) -> Series:
+    """One column of a table, checked against what the file states."""
+    table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
+    rows = column == "rows" and "rows" not in [each.name for each in table.columns]
+    place = value_column(table, None if rows else column)
+    values = column_values(table, place, missing)
+    unit = column_unit(table, place, values, units, "acceleration", table.file)
+    warn_if_absent(table, [place], missing, stacklevel=4)
+    absent = np.flatnonzero(np.isnan(values))
+    if absent.size:
+        raise ValueError(
+            f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an excitation "
+            f"needs all samples, {absent.size} are missing: interpolate them, or cut the file"
+        )
+    step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
+    return Series(table.title, step, unit, values, times)
 
 
 def _record(

@@ -588,6 +588,7 @@ class TestColumns:
 
     def test_excel_without_its_package(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "openpyxl", None)
+        (tmp_path / "a.xlsx").write_bytes(b"PK")
         with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
             read_csv(tmp_path / "a.xlsx")
 

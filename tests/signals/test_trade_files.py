@@ -301,6 +301,12 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
         (text("Units: counts", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "unknown unit 'counts'"),
         (text("Peak acceleration: 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak acceleration: 2.5 g'"),
         (text("Samples: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Samples: 3' announces 3 samples, the file has 2"),
+        (text("Scans in file: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Scans in file: 3' announces 3 samples"),
+        (text("Anzahl Werte = 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Anzahl Werte = 3' announces 3 samples"),
+        (text("Peak value = 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak value = 2.5 g'"),
+        (text("Max. value (gal): 2.5", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Max. value .gal.: 2.5'"),
+        (text("Einheit: gal", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "states the unit 'gal' but units = 'g'"),
+        (text("Abtastrate: 200,5 Hz", "acc_g;x", "1,5;1", "2,5;1"), {"dt": 0.005, "column": "acc_g"}, "but 0.00498"),
         (text("fs: 50", "acc_g", "1", "2"), {"dt": 0.01}, "but 0.02 s by 'fs: 50'"),
         (
             text("PGA (g),1.0", "acc_g", "1.0", "2.0"),
@@ -333,6 +339,12 @@ def test_a_contradiction_of_what_a_header_states_is_refused(tmp_path, content, g
         ("fs = 200 Hz", 0.005),
         ("Rate, 0.2 kHz", 0.005),
         ("2 points at equal spacing of 0.005 sec", 0.005),
+        ("Abtastintervall: 5 ms", 0.005),
+        ("Abtastrate (Hz);200", 0.005),
+        ("Zeitschritt = 0.005 s", 0.005),
+        ("Fréquence d'échantillonnage : 200 Hz", 0.005),
+        ("Frecuencia de muestreo: 200 Hz", 0.005),
+        ("Pas de temps (s) : 0.005", 0.005),
     ],
 )
 def test_the_stated_step_is_used(tmp_path, line, step):
@@ -355,6 +367,10 @@ def test_the_stated_step_is_used(tmp_path, line, step):
         "Scan interval: 10 min",
         "Samples per second: 100",
         "Peak velocity: 12.5 cm/s",
+        "Peak value: 12.5",
+        "Max. value = 7.3 cm",
+        "Abtastrate: 100 Hz",
+        "Scans in file: 3",
         "PGA: 4",
         "PGA (g): 4.0",
         "Peak acc.: -39.2 m/s2 at 0.02 s",
@@ -396,6 +412,11 @@ def test_arguments_must_agree_with_a_file_that_states_them(tmp_path, form, unit)
     for key, value in (("time_unit", "s"), ("time", "t"), ("skip", 2), ("missing", (-999.0,))):
         with pytest.raises(ValueError, match=f"states its times and samples; leave {key} out"):
             read_record(tmp_path / name, **{key: value})
+
+
+def test_decimal_commas_of_a_table_are_those_of_its_header(tmp_path):
+    record = read(tmp_path, "a.txt", text("Abtastintervall: 2,5 ms", "Zeit [s];a [g]", "0,0000;1,5", "0,0025;2,5"))
+    assert record.dt == 0.0025
 
 
 def test_text_about_other_samples_is_left_out_by_skip(tmp_path):
