@@ -261,10 +261,8 @@ def parse_at2(text: str, file: str) -> Series:
     rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
     while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
         rows.pop()  # a closing remark in any words: the number of samples is stated
-    cells = number_cells([row for _, row in rows])
-    values = [
-        parse_number(cell, f"{file}, line {line}") for (line, _), row in zip(rows, cells, strict=True) for cell in row
-    ]
+    cells = [(f"{file}, line {number}", cell) for number, row in rows for cell in number_cells(row)]
+    values = [parse_number(cell, where) for where, cell in cells]
     where = f"{file}: NPTS in line {index + 1}"
     check_count(len(values), parse_count(stated[0], where), where)
     if stated[2].lower() not in _SECONDS:

@@ -146,14 +146,14 @@ def read_table(
             comments += [line.lstrip("# \t")] * comment
             lines += [(number, line)] * (not comment)
     separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
-    cells = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
-    rows, stated = logger_table(cells, file)
+    rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
+    rows, stated = logger_table(rows, file)
     along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
-    announced = None if along_rows or stated else _announced(lines, separator, file)
+    announced = None if along_rows or stated else _announced(rows, file)
     if rows and announced is None:
         _check_names(rows, separator, along_rows, file)
     if along_rows:
-        rows = _along_rows(lines, separator, file)
+        rows = _along_rows(rows, file)
     elif announced:
         rows, stated = announced
     comments += stated
@@ -161,10 +161,8 @@ def read_table(
     rows, commas = _with_points(rows, separator, file)
     columns, clock = _columns(names, below, rows, file)
     above = [line for number, line in lines if number < rows[0][0]]
-    table = Table(file, bool(names), columns, tuple(number for number, _ in rows), "", Statements(), clock)
-    table = table._replace(
-        title=comments[0] if comments else "", stated=read_statements([*comments, *above], commas), time_unit=time_unit
-    )
+    numbers, stated = tuple(number for number, _ in rows), read_statements([*comments, *above], commas)
+    table = Table(file, bool(names), columns, numbers, "".join(comments[:1]), stated, clock, None, time_unit)
     for text, count in table.stated.counts:
         if len(rows) != count:
             raise ValueError(
@@ -206,7 +204,7 @@ def _cell_text(value: object) -> str:
 
 def _split(line: str, separator: str, where: str) -> list[str]:
     if separator == " ":
-        return number_cells([line])[0] if _NUMBERS.fullmatch(line) else line.split()
+        return number_cells(line) if _NUMBERS.fullmatch(line) else line.split()
     try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
     except csv.Error as error:
@@ -234,20 +232,16 @@ def _separator(lines: Sequence[str]) -> str:
     return best
 
 
-def _along_rows(lines: list[tuple[int, str]], separator: str, file: str) -> list[_Line]:
+def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
     """One row per number, below lines of text. All lines of numbers but the last one have the same number of them."""
-    fields = [_split(line, separator, f"{file}, line {number}") for number, line in lines]
-    above = sum(1 for _ in itertools.takewhile(_is_title, fields))
-    rows = lines[above:]
-    if separator == " " and all(_NUMBERS.fullmatch(line) for _, line in rows):  # in columns, which may touch
-        fields[above:] = number_cells([line for _, line in rows])
-    for (number, _), cells in zip(rows, fields[above:], strict=True):
+    rows = [*itertools.dropwhile(lambda line: _is_title(line[1]), lines)]
+    for number, cells in rows:
+        width = len(rows[0][1])
         if wrong := [cell for cell in cells if not _known(cell)]:
             raise ValueError(f"{file}, line {number}: expected numbers below lines of text, got {wrong[0][:100]!r}")
-        width = len(fields[above])
-        if len(cells) != width and (number != lines[-1][0] or len(cells) > width):
+        if len(cells) > width or (len(cells) < width and number != rows[-1][0]):
             raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
-    return [(number, [cell]) for (number, _), cells in zip(rows, fields[above:], strict=True) for cell in cells]
+    return [(number, [cell]) for number, cells in rows for cell in cells]
 
 
 def _is_title(cells: list[str]) -> bool:
@@ -255,24 +249,23 @@ def _is_title(cells: list[str]) -> bool:
     return any(re.search("[A-Za-z]{2}", cell) for cell in cells) and 2 * sum(map(_known, cells)) <= len(cells)
 
 
-def _announced(lines: list[tuple[int, str]], separator: str, file: str) -> tuple[list[_Line], list[str]] | None:
+def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] | None:
     """One row per number below a line with their number and step, and title and step as comments; None without it.
 
     eqsig writes this line above one sample per line, RSPMatch above several ones, with at most another integer. In a
     table, the line would have as many cells as the rows.
     """
-    heads = [re.split(r"[,;\s]+", line.strip()) for _, line in lines[: _LAST_LINES + 1]]
-    place = next((k for k, head in enumerate(heads[:-1]) if all(map(is_number, head))), None)
+    heads = [" ".join(cells).split() for _, cells in lines[: _LAST_LINES + 1]]
+    place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), None)
     if place is None or not 2 <= len(head := heads[place]) <= 3 or len(heads[place + 1]) == len(head):
         return None
     if not all(map(str.isdecimal, (head[0], *head[2:]))) or not _STEP.fullmatch(head[1]):
         return None
-    try:
-        numbers = _along_rows(lines[place + 1 :], separator, file)
-    except ValueError:
+    if not all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells):
         return None
+    numbers = _along_rows(lines[place + 1 :], file)
     check_count(len(numbers), parse_count(head[0], file), f"{file}, line {lines[place][0]}")
-    return numbers, [*(line.strip() for _, line in lines[: min(place, 1)]), f"dt = {head[1]} s"]
+    return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
 
 
 # header line and decimal marks ----------------------------------------------------------------------------------------
@@ -300,14 +293,18 @@ def _is_text(cells: Sequence[str]) -> bool:
     return words and not any(map(_known, cells))
 
 
+def _first_row(lines: Sequence[_Line]) -> tuple[int, int]:
+    """Place and width of the first row that is as wide as most first rows: a number above the table is no row."""
+    places = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
+    if not places:
+        return len(lines), max((len(cells) for _, cells in lines), default=0)
+    width = Counter(len(lines[k][1]) for k in places).most_common(1)[0][0]
+    return next(k for k in places if len(lines[k][1]) == width), width
+
+
 def _header(lines: list[_Line], file: str) -> tuple[list[str], list[str], list[_Line]]:
     """Names, units below them, and rows of equal width, without columns that have neither a name nor a number."""
-    places = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
-    if places:  # the width of most first rows: a number above the table is no row
-        width = Counter(len(lines[k][1]) for k in places).most_common(1)[0][0]
-        first = next(k for k in places if len(lines[k][1]) == width)
-    else:
-        width, first = max((len(cells) for _, cells in lines), default=0), len(lines)
+    first, width = _first_row(lines)
     spare = not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
     names, below, after = _names(lines[:first], width, spare)
     if not names:
@@ -376,12 +373,11 @@ def _check_names(lines: Sequence[_Line], separator: str, along_rows: bool, file:
 
     Commas then separate cells and decimals, or the rows have names.
     """
-    first = next((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), 0)
+    first, width = _first_row(lines)
     (number, names), rows = lines[first - 1], [cells for _, cells in lines[first : first + _LAST_LINES]]
-    width = len(rows[0])
     half = separator == "," and 2 * len(names) == width and not any("." in cell for cells in rows for cell in cells)
     short = len(names) == width - 1 > 1 and any(cells[-1] for cells in rows) and not along_rows
-    if first and (half or short) and _is_text(names) and all(names):
+    if first and rows and (half or short) and _is_text(names) and all(names):
         raise ValueError(
             f"{file}, line {number}: expected a name for each of the {width} cells in a row, got {len(names)}; write "
             f"decimal points, or leave out the names of rows, in R with row.names = FALSE. {_POINTS}"

@@ -1,7 +1,6 @@
 """Shared by the readers of files: bytes and text, numbers, units, and series of samples."""
 
 import codecs
-import itertools
 import math
 import re
 from pathlib import Path
@@ -45,6 +44,7 @@ _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # What editors and transfers add after the last line: blank lines, ^Z (the end of a text in DOS), zero bytes as padding
 _PADDING = " \t\n\f\0\x1a"
 _CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
+_LAST_DECIMALS = re.compile(r"\.(\d+)([eEdD][-+]?\d+)?\s*$")
 _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
 
 
@@ -104,46 +104,19 @@ def read_text(path: str | Path) -> str:
     return decode_text(read_bytes(path)).rstrip("\0\x1a")
 
 
-def number_cells(lines: list[str]) -> list[list[str]]:
-    """Return the fields of lines of numbers, which blanks separate or which touch, as in some Fortran formats.
+def number_cells(line: str) -> list[str]:
+    """Return the fields of a line of numbers, which blanks separate or which touch, as in some Fortran formats.
 
-    Numbers that touch have a decimal point each, and begin with a sign (``-12.34567-0.12345``) or end in the same
-    columns of all lines (``12.34567100.12345``). Other text is one field, which is no number.
+    Numbers that touch have equally many decimals, and begin with a sign (``-12.34567-0.12345``) or are equally wide
+    (`` 12.34567100.12345``). Other text stays one field, which is no number.
     """
-    rows = [[part for field in line.split() for part in _apart(field)] for line in lines]
-    if any(cell.count(".") > 1 for row in rows for cell in row):
-        first = sum(cell.count(".") for cell in rows[0]) == 1  # a line that announces number and step of the others
-        fields = _aligned([line.rstrip() for line in lines[first:]])
-        return rows if fields is None else rows[:first] + fields
-    return rows
-
-
-def _apart(field: str) -> list[str]:
-    """The numbers in a field that begin with a sign; the field if a part of it is no number with a decimal point."""
-    parts = [field] if field.count(".") < 2 else re.split(r"(?<=[\d.])(?=[-+])", field)
-    return parts if all(part.count(".") == 1 for part in parts) else [field]
-
-
-def _aligned(lines: list[str]) -> list[list[str]] | None:
-    """The fields of a Fortran format with three numbers or more, whose points are at equal distances; else None."""
-    points = [[match.start() for match in re.finditer(r"\.", line)] for line in lines]
-    most = max(points, key=len, default=[])
-    if len(most) < 3 or any(found != most[: len(found)] or not found for found in points):
-        return None
-    width, after = most[1] - most[0], len(lines[0]) - points[0][-1]  # columns of a field, and from its point to its end
-    starts = [point + after - width for point in most]
-    if starts[0] < 0 or any(b - a != width for a, b in itertools.pairwise(most)):
-        return None
-    rows = []
-    for line, found in zip(lines, points, strict=True):
-        rows.append([line[start : start + width].strip() for start in starts[: len(found)]])
-        if (
-            len(line) != starts[len(found) - 1] + width
-            or line[: starts[0]].strip()
-            or not all(map(is_number, rows[-1]))
-        ):
-            return None
-    return rows
+    cells, last = line.split(), _LAST_DECIMALS.search(line)
+    if last is None or all(cell.count(".") < 2 for cell in cells):
+        return cells
+    exponent = r"[eEdD][-+]\d{2,3}" if last[2] else ""
+    fields = re.findall(rf"\s*[-+]?\d*\.\d{{{len(last[1])}}}{exponent}", line)
+    split = len({len(field) for field in fields}) == 1 or all(field[0] in " \t+-" for field in fields[1:])
+    return [field.strip() for field in fields] if split and "".join(fields) == line.rstrip() else cells
 
 
 def dimension_of(unit: str) -> str | None:

@@ -189,7 +189,7 @@ def test_a_damaged_row_never_shortens_the_samples(tmp_path, place, mark):
         assert intact.n_steps == (39 if rows is ROWS else 15)
 
 
-@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3"])
+@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3", "0.092-0.07730"])
 def test_numbers_that_may_be_split_in_two_ways_are_refused(tmp_path, row):
     for before in ("1.00000   2.00000", "1.00000   2.00000   3.00000", ""):
         with pytest.raises(ValueError, match="expected"):
