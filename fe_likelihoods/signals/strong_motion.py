@@ -37,6 +37,7 @@ miniSEED, SAC, GSE2
     Read by the package obspy.
 """
 
+import codecs
 import io
 import lzma
 import math
@@ -60,12 +61,10 @@ from .text_files import (
     Series,
     agree_on_unit,
     check_count,
-    check_peak,
     decimals_of,
     decode_text,
     is_number,
     number_cells,
-    opening_text,
     parse_count,
     parse_number,
     read_bytes,
@@ -105,7 +104,14 @@ _READERS = {
 
 def recognise(content: bytes) -> tuple[str, str | None]:
     """Return the name of a file's format (empty if unknown), and of the function that reads it (None if not read)."""
-    text = opening_text(content)
+    start, encoding = content[:8000], "latin-1"  # of binary files, one letter per byte
+    for mark, name in (
+        (codecs.BOM_UTF8, "utf-8-sig"),
+        (codecs.BOM_UTF16_LE, "utf-16"),
+        (codecs.BOM_UTF16_BE, "utf-16"),
+    ):
+        encoding = name if start.startswith(mark) else encoding
+    text = start.decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
     name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)
     return name, _READERS.get(name)
@@ -225,6 +231,15 @@ class Block(NamedTuple):
 
 _FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
 _WIDEST = 1000
+
+
+def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
+    """ValueError if the stated peak is not the peak of the samples."""
+    if not abs(found - stated) <= tolerance:
+        raise ValueError(
+            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
+            "another form than the one that is read here"
+        )
 
 
 def _whole(number: float, file: str, what: str) -> int:
@@ -478,7 +493,7 @@ def _parse_v1(block: Block) -> Series:
     if unit.lower() in ("g", "g/10"):
         unit = "g" if scale == 0.1 else unit
         rounding = 0.505 * (scale * 10.0 ** -decimals_of(printed.strip()) + 10.0 ** -decimals_of(peak))
-        check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
+        _check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
     if times is not None:
         dt, (times, values, note) = math.nan, without_repeated_times(times, values)
     return Series(f"{block.label}, uncorrected{note}", dt, unit, scale * values, times)
@@ -522,7 +537,7 @@ def parse_smc(text: str, file: str) -> Series:
         times, values = values[::2], values[1::2]
     for stated, found in ((highest, values.max()), (lowest, values.min())):
         if abs(stated) < _SMC_NULL:
-            check_peak(found, stated, 2e-4 * _largest(values), file)
+            _check_peak(found, stated, 2e-4 * _largest(values), file)
     if uneven:
         times, values, note = without_repeated_times(times, values)
     station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
@@ -568,7 +583,7 @@ def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
     # the peak is rounded to the digits that are printed; the samples are rounded or cut
     printed = block.field(start, _GEONET_DATA, int(np.argmax(np.abs(values))))
     resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
-    check_peak(_largest(values), abs(float(peak[1])), resolution, where)
+    _check_peak(_largest(values), abs(float(peak[1])), resolution, where)
     end = start + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
     if end > len(lines):
         raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
@@ -621,7 +636,7 @@ def parse_knet(text: str, file: str) -> Series:
     if stated is None:
         raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")
     peak = parse_number(stated, f"{file}, Max. Acc.")
-    check_peak(_largest(values), peak, 2e-3 * abs(peak) + 2e-3, file)
+    _check_peak(_largest(values), peak, 2e-3 * abs(peak) + 2e-3, file)
     return Series(f"{station}, channel {direction}, mean subtracted", 1.0 / rate, "gal", values)
 
 
@@ -645,7 +660,7 @@ def parse_esm(text: str, file: str) -> Series:
     if (stated := header.get("PGA_CM/S^2")) and values.size:
         peak = abs(parse_number(stated, f"{file}, PGA_CM/S^2"))
         scale = float(to_si(1.0, agree_on_unit(unit, None, "acceleration", file)) / to_si(1.0, "cm/s2"))
-        check_peak(scale * _largest(values), peak, 1e-4 * peak + 2e-6 * scale, file)
+        _check_peak(scale * _largest(values), peak, 1e-4 * peak + 2e-6 * scale, file)
     return Series(f"{header.get('NETWORK', '')}.{station} {stream}", dt, unit, values)
 
 

@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 from ..units import DIMENSIONS, find_unit
 
 __all__ = [
-    "LARGEST_FILE",
     "LINE_END",
     "NUMBER",
     "Series",
     "agree_on_unit",
     "check_count",
-    "check_peak",
     "decimals_of",
     "decode_text",
     "dimension_of",
     "is_number",
     "number_cells",
-    "opening_text",
     "parse_count",
     "parse_number",
     "read_bytes",
@@ -34,8 +31,7 @@ __all__ = [
 NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 """Regular expression for a decimal number, without alternatives for the same digits: its time is linear."""
 
-LARGEST_FILE = 256 * 2**20
-"""Largest size of a text file or an archive [bytes]; long records have some MiB."""
+_LARGEST_FILE = 256 * 2**20  # bytes of a text file or an archive; long records have some MiB
 
 LINE_END = re.compile(r"\r+\n|\r")
 """Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
@@ -62,8 +58,8 @@ def read_bytes(path: str | Path) -> bytes:
     """Return the content of a file; raise ValueError if it cannot be read or is too large."""
     try:
         size = Path(path).stat().st_size
-        if size > LARGEST_FILE:
-            raise ValueError(f"{path}: expected at most {LARGEST_FILE} bytes, got {size}; cut the file")
+        if size > _LARGEST_FILE:
+            raise ValueError(f"{path}: expected at most {_LARGEST_FILE} bytes, got {size}; cut the file")
         return Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
@@ -88,15 +84,6 @@ def decode_text(content: bytes) -> str:
         if not _CLOSING.fullmatch(text, start):
             return text
         text = text[:start]
-
-
-def opening_text(content: bytes) -> str:
-    """Return the first letters of a file in which its format is recognised; of binary files, one letter per byte."""
-    start = content[:8000]
-    for mark, encoding in ((codecs.BOM_UTF8, "utf-8-sig"), *((each, "utf-16") for each in _UTF_16)):
-        if start.startswith(mark):
-            return start.decode(encoding, errors="replace")
-    return start.decode("latin-1")
 
 
 def read_text(path: str | Path) -> str:
@@ -149,15 +136,6 @@ def check_count(found: int, stated: int, where: str) -> None:
     """Raise ValueError if a file has another number of samples than it announces."""
     if found != stated:
         raise ValueError(f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged")
-
-
-def check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
-    """Raise ValueError if the stated peak is not the peak of the samples."""
-    if not abs(found - stated) <= tolerance:
-        raise ValueError(
-            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
-            "another form than the one that is read here"
-        )
 
 
 def _as_float(field: str) -> float:
