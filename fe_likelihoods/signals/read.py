@@ -8,7 +8,6 @@ if neither states them or if they disagree.
 import io
 import zipfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -251,10 +250,27 @@ def _read(
         series = _geonet_component(path, channel)
     else:
         series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
+    unit = agree_on_unit(series.unit, units, "acceleration", file)
+    # The source has the file name without its folder, because it is written into data sets that are shared.
+    source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
     if reader in ("read_v2", "read_geonet", "read_obspy"):
         name = series.title
-    record = _record(series, units, file, name, resample, dt)
-    return replace(record, source=file.removeprefix(f"{Path(path).parent}/")) if reader == "read_v2" else record
+    if reader == "read_v2":
+        source = file.removeprefix(f"{Path(path).parent}/")
+    if series.times is not None:
+        even = uniform_times(series.times, resample, file)
+        if resample is None:
+            raise ValueError(
+                f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
+            )
+        source, step, values = f"{source}; {even.note}", resample, even.straight(values, file, stacklevel=3)
+    elif resample is not None:
+        raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
+    if dt is not None and not abs(dt - step) <= 1e-6 * step:
+        raise ValueError(
+            f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
+        )
+    return Record(name, step, to_si(values, unit, "acceleration"), source)
 
 
 def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> strong_motion.Block:
@@ -310,33 +326,6 @@ def _table_series(
         )
     step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
     return Series(table.title, step, unit, values, times)
-
-
-def _record(
-    series: Series,
-    units: str | None,
-    file: str | Path,
-    name: str,
-    resample: float | None = None,
-    dt: float | None = None,
-) -> Record:
-    unit = agree_on_unit(series.unit, units, "acceleration", file)
-    # The source has the file name without its folder, because it is written into data sets that are shared.
-    source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
-    if series.times is not None:
-        even = uniform_times(series.times, resample, str(file))
-        if resample is None:
-            raise ValueError(
-                f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
-            )
-        source, step, values = f"{source}; {even.note}", resample, even.straight(values, str(file), stacklevel=4)
-    elif resample is not None:
-        raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
-    if dt is not None and not abs(dt - step) <= 1e-6 * step:
-        raise ValueError(
-            f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
-        )
-    return Record(name, step, to_si(values, unit, "acceleration"), source)
 
 
 # measured responses ---------------------------------------------------------------------------------------------------

@@ -69,7 +69,6 @@ from .text_files import (
     parse_number,
     read_bytes,
 )
-from .uneven_times import without_repeated_times
 
 __all__ = [
     "Block",
@@ -251,6 +250,19 @@ def _whole(number: float, file: str, what: str) -> int:
 
 def _largest(values: NDArray[np.float64]) -> float:
     return float(np.abs(values).max())
+
+
+def _without_repeated_times(
+    times: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
+    """Times and samples of a digitised record with the mean of the samples of equal times, and what was done.
+
+    Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
+    """
+    first = np.concatenate([[True], np.diff(times) != 0.0])
+    number = np.cumsum(first) - 1
+    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
+    return times[first], np.bincount(number, weights=values) / np.bincount(number), note
 
 
 # PEER -----------------------------------------------------------------------------------------------------------------
@@ -495,7 +507,7 @@ def _parse_v1(block: Block) -> Series:
         rounding = 0.505 * (scale * 10.0 ** -decimals_of(printed.strip()) + 10.0 ** -decimals_of(peak))
         _check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
     if times is not None:
-        dt, (times, values, note) = math.nan, without_repeated_times(times, values)
+        dt, (times, values, note) = math.nan, _without_repeated_times(times, values)
     return Series(f"{block.label}, uncorrected{note}", dt, unit, scale * values, times)
 
 
@@ -539,7 +551,7 @@ def parse_smc(text: str, file: str) -> Series:
         if abs(stated) < _SMC_NULL:
             _check_peak(found, stated, 2e-4 * _largest(values), file)
     if uneven:
-        times, values, note = without_repeated_times(times, values)
+        times, values, note = _without_repeated_times(times, values)
     station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
     return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
 

@@ -488,11 +488,8 @@ def stated_unit(table: Table, place: int, dimension: str | None = None) -> str |
     named = unit_in_name(column.name) if table.named and not direction else None
     if named is None or below is None:
         return named or below
-    where = f"{table.file} (name and line of units)"
-    try:
-        return agree_on_unit(named, below, find_unit(below).dimension, where)
-    except ValueError as error:
-        raise ValueError(str(error) if where in str(error) else f"{where}: {error}") from None
+    dimension = dimension_of(below) or dimension_of(named)
+    return agree_on_unit(named, below, dimension, f"{table.file} (name and line of units)")
 
 
 def value_columns(table: Table) -> list[int]:

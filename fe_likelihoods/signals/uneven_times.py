@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .sampling import check_step
 
-__all__ = ["UniformTimes", "uniform_times", "without_repeated_times"]
+__all__ = ["UniformTimes", "uniform_times"]
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
@@ -86,16 +86,3 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
             f"{gaps.max():.4g} s; cut the file at its long gaps"
         )
     return UniformTimes(times, step, times[0] + step * np.arange(int(duration / step + 1e-6) + 1), usual, gaps, note)
-
-
-def without_repeated_times(
-    times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
-    """Return times and samples of a digitised record with the mean of the samples of equal times, and what was done.
-
-    Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
-    """
-    first = np.concatenate([[True], np.diff(times) != 0.0])
-    number = np.cumsum(first) - 1
-    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
-    return times[first], np.bincount(number, weights=values) / np.bincount(number), note

@@ -237,7 +237,8 @@ def test_v1_with_uneven_times(tmp_path):
     lines[27] = lines[27].replace("  0.010", "  0.013")
     with pytest.raises(ValueError, match="samples are at uneven times; give their nominal step, resample=0.01"):
         read_record(write(tmp_path / "a.V1", lines))
-    assert read_record(tmp_path / "a.V1", resample=0.01).dt == 0.01
+    record = read_record(tmp_path / "a.V1", resample=0.01)
+    assert record.dt == 0.01 and record.source.startswith("a.V1; interpolated linearly to a step of 0.01 s")
 
 
 @pytest.mark.parametrize(
