@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, find_unit
 from .error_measures import rrmse
-from .sampling import check_step, same_sampling, sample_window
+from .sampling import as_number, check_step, same_sampling, sample_window
 
 __all__ = ["Channel", "Measurements"]
 
@@ -362,10 +362,7 @@ def _single(numbers: Sequence[float]) -> float | tuple[float, ...]:
 
 
 def _check_start(start: Any) -> float:
-    try:
-        seconds = float(start)
-    except (TypeError, ValueError):
-        seconds = math.nan
+    seconds = as_number(start)
     if not math.isfinite(seconds):
         raise ValueError(f"start of the measurements must be a finite number of seconds, got {start!r}")
     return seconds
