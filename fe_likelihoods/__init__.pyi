@@ -65,8 +65,7 @@ from .signals.channels import Channel, Measurements
 from .signals.durations import growing_durations
 from .signals.error_measures import rrmse
 from .signals.events import Events
-from .signals.measurement_readers import read_columns, read_imposed_test
-from .signals.readers import read_record
+from .signals.read import read_columns, read_imposed_test, read_record
 from .signals.records import DisplacementHistory, Record
 from .simulation.dask_executor import DaskExecutor
 from .simulation.model import SimulationFailed

@@ -23,7 +23,7 @@ from fe_likelihoods.problems import (
 )
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.units import G0, to_si
 from samplers import SMCSampler

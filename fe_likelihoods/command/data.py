@@ -8,9 +8,9 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
-from ..signals.measurement_readers import read_columns
-from ..signals.readers import (
+from ..signals.read import (
     read_at2,
+    read_columns,
     read_csv,
     read_esm,
     read_geonet,

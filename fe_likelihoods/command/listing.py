@@ -8,18 +8,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..signals.at2_v2_formats import find_v2_channels, parse_v2
 from ..signals.datasets import read_dataset
-from ..signals.readers import read_record, recognise_reader
+from ..signals.read import read_record, recognise_reader
 from ..signals.records import Record
-from ..signals.smc_geonet_knet_esm_formats import parse_geonet
-from ..signals.table_columns import column_values
-from ..signals.table_times import row_times, table_step, time_column
-from ..signals.tables import Table, column_names, read_table, stated_unit
-from ..signals.text_files import read_text
+from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
+from ..signals.tables import (
+    Table,
+    column_values,
+    read_table,
+    row_times,
+    stated_unit,
+    table_step,
+    text_unit,
+    value_columns,
+)
+from ..signals.text_files import dimension_of, read_text
 from ..signals.uneven_times import uniform_times
 from ..text_tables import number, text_table
-from ..units import find_unit, from_si, to_si
+from ..units import from_si, to_si
 
 __all__ = ["describe_data"]
 
@@ -121,9 +127,9 @@ def _v2(path: Path) -> _Lines:
 def _geonet(path: Path) -> _Lines:
     components = parse_geonet(read_text(path), str(path))
     rows = [("component", *_HEAD)]
-    for each in components:
-        rows.append((each.component, *_cells(to_si(each.series.values, each.series.unit), each.series.dt)))
-    given, taken = [each.component for each in components], set[str]()
+    for component, series in components:
+        rows.append((component, *_cells(to_si(series.values, series.unit), series.dt)))
+    given, taken = [component for component, _ in components], set[str]()
     names = [(_name_of_channel(name, taken), name) for name in given if given.count(name) == 1]
     text = [f"{len(components)} components of acceleration", text_table(rows)]
     text += [f"the component {name!r} is there {given.count(name)} times" for name in given if given.count(name) > 1][
@@ -170,15 +176,13 @@ def _dataset(path: Path) -> _Lines:
 
 def _table(path: Path) -> _Lines:
     table = read_table(path)
-    place = time_column(table)
-    options, remarks = _sampling(table, place)
+    options, remarks = _sampling(table)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
     columns, unstated, marks = [], [], set()
     taken: set[str] = set()
-    for k, name in enumerate(column_names(table)):
-        if k in table.dates or k in table.clocks or k == place:
-            continue
-        values = table.values[:, k]
+    names = [column.name for column in table.columns]
+    for k in value_columns(table):
+        name, values = names[k], table.columns[k].values
         try:
             column_values(table, k)
         except ValueError as error:
@@ -186,14 +190,14 @@ def _table(path: Path) -> _Lines:
             marks |= {float(found) for found in re.findall(r"got (\S+) in \d+ rows", str(error))}
         known = values[~np.isnan(values)]
         ends = (number(known.min(), 4), number(known.max(), 4)) if known.size else ("-", "-")
-        unit = stated_unit(table, k)
+        unit = stated_unit(table, k) or text_unit(table, k, "acceleration")  # as the readers of accelerations take it
         rows.append((name, unit or "not stated", str(known.size), str(values.size - known.size), *ends))
-        if table.names.count(name) > 1:
+        if names.count(name) > 1:
             remarks.append(f"the name {name!r} is that of several columns: rename them")
             continue
-        channel = _name_of_channel(name if table.names else f"column {name}", taken)
+        channel = _name_of_channel(name if table.named else f"column {name}", taken)
         columns.append((channel, name))
-        if unit is None or not _is_unit(unit):
+        if unit is None or dimension_of(unit) is None:
             unstated.append((channel, "?"))
     text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks]
     if marks:
@@ -211,14 +215,6 @@ def _table(path: Path) -> _Lines:
     return _Lines(text, [*base, *(each for each in options if not each.startswith("missing"))], measured)
 
 
-def _is_unit(name: str) -> bool:
-    try:
-        find_unit(name)
-    except ValueError:
-        return False
-    return True
-
-
 def _clock_text(table: Table) -> str:
     """The first clock time of a table, as `zero` takes it."""
     clock = table.clock
@@ -227,12 +223,12 @@ def _clock_text(table: Table) -> str:
     return text if clock.day is None else f"{datetime.date.fromordinal(clock.day)} {text}"
 
 
-def _sampling(table: Table, place: int | None) -> tuple[list[str], list[str]]:
+def _sampling(table: Table) -> tuple[list[str], list[str]]:
     """Keys that the times need, and what is said about them."""
     try:
         step = table_step(table)
     except ValueError as error:
-        if place is None:
+        if table.time is None:
             return ['dt = "? s"    # write it: the file has no times'], ["no column of times"]
         try:
             times = row_times(table)
@@ -244,7 +240,8 @@ def _sampling(table: Table, place: int | None) -> tuple[list[str], list[str]]:
             f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
             + (f", {even.gaps.size} gap(s) of up to {even.gaps.max():.4g} s" if even.gaps.size else "")
         ]
-    start = "" if place is None else f", from {table.values[0, place]:.10g} in column {column_names(table)[place]!r}"
+    column = None if table.time is None else table.columns[table.time]
+    start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
     if table.clock is not None:
         start += f", first clock time {_clock_text(table)}"
     return [], [f"times: step {step:g} s ({1 / step:g} per second){start}"]

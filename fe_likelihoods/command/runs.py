@@ -22,7 +22,7 @@ from ..checks.rehearsal import refuse_chance
 from ..checks.result import judge_run
 from ..checks.run import read_run
 from ..prediction.prediction import Prediction
-from ..signals.hdf5_files import DAMAGE
+from ..signals.datasets import DAMAGE
 from .events import (
     Event,
     describe_events,

@@ -17,7 +17,7 @@ from ..models.executable import ExecutableModel
 from ..models.function import FunctionModel
 from ..noise.gaussian import GaussianNoise
 from ..signals.clock_times import is_clock
-from ..signals.readers import read_csv
+from ..signals.read import read_record
 from ..units import DIMENSIONS, to_si
 
 __all__ = [
@@ -164,7 +164,7 @@ def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
     return {part: documented_keys(_in_models(f"{module}.{name}")) for part, name in names.items()}
 
 
-_TABLE = documented_keys(read_csv, "time time_unit dt skip resample", time="text", skip="whole number >= 0")
+_TABLE = documented_keys(read_record, "time time_unit dt skip resample", time="text", skip="whole number >= 0")
 SECTIONS: dict[str, tuple[Key, ...]] = {
     "record": (
         Key(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..signals.tables import Table, column_names, read_table, stated_unit
+from ..signals.tables import Table, read_table, stated_unit
 from ..units import to_si
 from .modal_data import ModalData, real_shapes
 
@@ -76,7 +76,7 @@ def read_modal_data(
 
 
 def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
-    names = column_names(table)
+    names = [column.name for column in table.columns]
     words = [name.lower().replace("[", " ").replace("(", " ").replace("_", " ").split()[0] for name in names]
     found = {
         what: next((place for place, word in enumerate(words) if word in known), None)
@@ -90,10 +90,10 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
     if unknown := [name for name in sensors if name not in others]:
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
     sensors = tuple(sensors) or tuple(others)
-    values = {what: None if place is None else table.values[:, place] for what, place in found.items()}
+    values = {what: None if place is None else table.columns[place].values for what, place in found.items()}
     stated = stated_unit(table, found["frequency"], "frequency")
     frequencies = _in_hertz(values["frequency"], stated, unit, f"{table.file}, column {names[found['frequency']]!r}")
-    shapes = table.values[:, [names.index(name) for name in sensors]]
+    shapes = np.array([table.columns[names.index(name)].values for name in sensors]).reshape(len(sensors), -1).T
     sets = np.zeros(len(frequencies)) if values["set"] is None else values["set"]
     modes = values["mode"]
     if modes is None:  # the place among the lines of its identification

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..units import DIMENSIONS, find_unit
 from .error_measures import rrmse
-from .sampling import check_step, same_sampling, sample_window
+from .sampling import as_number, check_step, same_sampling, sample_window
 
 __all__ = ["Channel", "Measurements"]
 
@@ -226,23 +226,11 @@ class Measurements:
         return self._with_rows(rows, [self.values[row] for row in rows], self.starts, self.steps)
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Measurements":
-        """Return the samples between two times, both included. Time starts again from zero.
+        """Return the samples between two times [s], both included; default of `stop`: the end of the measurements.
 
-        Parameters
-        ----------
-        start, stop : float
-            Times [s] with 0 <= start < stop, as in `Record.trim`. Default of `stop`: the end of the measurements.
-
-        Returns
-        -------
-        Measurements
-            The samples. Channels that begin at zero begin at zero again, like a record that is trimmed to the same
-            times; for other channels, `start` is the new zero.
-
-        Raises
-        ------
-        ValueError
-            If the times are out of order or outside of the measurements, or a channel has no sample between them.
+        Time starts again from zero. Channels that begin at zero begin at zero again, like a record that is trimmed to
+        the same times; for other channels, `start` is the new zero. ValueError unless 0 <= start < stop <= end, or if a
+        channel has no sample between them.
         """
         if self.simultaneous and self.start == 0.0:
             window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
@@ -275,20 +263,7 @@ class Measurements:
     def decimate(self, factor: int) -> "Measurements":
         """Return every `factor`-th sample, starting with the first one, without a filter.
 
-        Parameters
-        ----------
-        factor : int
-            A whole number from 1 to the number of samples.
-
-        Returns
-        -------
-        Measurements
-            The remaining samples, with a step of `factor` times the old one.
-
-        Raises
-        ------
-        ValueError
-            If the factor is not such a number.
+        ValueError unless `factor` is a whole number from 1 to the number of samples.
 
         Notes
         -----
@@ -387,10 +362,7 @@ def _single(numbers: Sequence[float]) -> float | tuple[float, ...]:
 
 
 def _check_start(start: Any) -> float:
-    try:
-        seconds = float(start)
-    except (TypeError, ValueError):
-        seconds = math.nan
+    seconds = as_number(start)
     if not math.isfinite(seconds):
         raise ValueError(f"start of the measurements must be a finite number of seconds, got {start!r}")
     return seconds

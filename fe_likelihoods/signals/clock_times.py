@@ -9,7 +9,7 @@ import datetime
 import re
 from typing import NamedTuple
 
-__all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_midnight"]
+__all__ = ["ClockTime", "is_clock", "is_date", "parse_clock", "seconds_since_midnight", "unix_seconds"]
 
 _DATE = r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<month>\d{1,2})(?P=mark)(?P<last>\d{1,4})"
 _TIME = r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d+))?"
@@ -47,14 +47,15 @@ def parse_clock(cell: str, where: str) -> ClockTime:
             f"{where}: expected a clock time such as '03:19:53.010' or '2019-07-06T03:19:53.010', got {cell[:100]!r}"
         )
     *_, hour, minute, second, fraction, half, zone = found.groups()
-    if half and not 1 <= int(hour) <= 12:
-        raise ValueError(f"{where}: clock times with AM and PM have hours from 1 to 12; got {cell[:100]!r}")
-    if int(hour) > 24:
-        raise ValueError(f"{where}: clock times have hours from 0 to 23; got {cell[:100]!r}")
+    if not (1 <= int(hour) <= 12 if half else int(hour) <= 24):
+        hours = "with AM and PM have hours from 1 to 12" if half else "have hours from 0 to 23"
+        raise ValueError(f"{where}: clock times {hours}; got {cell[:100]!r}")
     hours = int(hour) % 12 + 12 * (half in ("P", "p")) if half else int(hour)
-    number = None if found["first"] is None else _day_number(found, where)
     whole = 3600 * hours + 60 * int(minute) + int(second)
-    return ClockTime(number, float(f"{whole}.{fraction or 0}"), len(fraction or ""), _minutes(zone), bool(half))
+    if zone is not None:  # minutes of a time zone such as +02:00; Z and UTC are zero
+        zone = 0 if zone.upper() in ("Z", "UTC") else int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
+    day = None if found["first"] is None else _day_number(found, where)
+    return ClockTime(day, float(f"{whole}.{fraction or 0}"), len(fraction or ""), zone, bool(half))
 
 
 def _day_number(found: re.Match[str], where: str) -> int:
@@ -73,11 +74,9 @@ def _day_number(found: re.Match[str], where: str) -> int:
         raise ValueError(f"{where}: expected a date, got {found[0][:100]!r} ({error})") from None
 
 
-def _minutes(zone: str | None) -> int | None:
-    """Minutes of a time zone such as ``+02:00``; ``Z`` and ``UTC`` are zero."""
-    if zone is None or zone.upper() in ("Z", "UTC"):
-        return None if zone is None else 0
-    return int(f"{zone[0]}1") * (60 * int(zone[1:3]) + int(zone[-2:]))
+def unix_seconds(time: ClockTime) -> float:
+    """Return the seconds since 1970 (UTC) of a clock time with date and time zone."""
+    return _DAY * (time.day - datetime.date(1970, 1, 1).toordinal()) + time.seconds - 60 * time.zone
 
 
 def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[float]:
@@ -88,27 +87,25 @@ def seconds_since_midnight(times: list[ClockTime | None], where: str) -> list[fl
     as on a 12-hour clock.
     """
     known = [time for time in times if time is not None]
-    dates = {time.day is None for time in known}
-    if len(dates) > 1:
-        raise ValueError(f"{where}: expected a date in all clock times or in none; write them alike")
-    if len(zones := {time.zone for time in known}) > 1:
-        raise ValueError(f"{where}: expected one time zone in all clock times, got {len(zones)}; write them alike")
-    if len(halves := {time.halves for time in known}) > 1:
-        raise ValueError(f"{where}: expected AM or PM in all clock times or in none; write them alike")
+    first, zones = known[0], {time.zone for time in known}
+    for differ, expected in (
+        (len({time.day is None for time in known}) > 1, "a date in all clock times or in none"),
+        (len(zones) > 1, f"one time zone in all clock times, got {len(zones)}"),
+        (len({time.halves for time in known}) > 1, "AM or PM in all clock times or in none"),
+    ):
+        if differ:
+            raise ValueError(f"{where}: expected {expected}; write them alike")
     day, last, found = 0, 0.0, []
     for time in times:
         if time is None:
             found.append(float("nan"))
             continue
-        if True not in halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
+        if not first.halves and 12 * _HOUR <= last < 13 * _HOUR and _HOUR <= time.seconds < 2 * _HOUR:
             raise ValueError(
                 f"{where}: the clock times go back from 12 to 1 o'clock, as on a clock of 12 hours; write hours from 0 "
                 "to 23"
             )
-        if time.day is not None:
-            day = time.day - known[0].day
-        elif time.seconds < last - _DAY / 2:
-            day += 1
+        day = time.day - first.day if time.day is not None else day + (time.seconds < last - _DAY / 2)
         last = time.seconds
         found.append(day * _DAY + time.seconds)
     return found

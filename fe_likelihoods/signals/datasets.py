@@ -9,20 +9,23 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..units import DIMENSIONS
 from .channels import Channel, Measurements
 from .events import Events
-from .hdf5_files import DAMAGE, read_values
 from .records import Record
 
-__all__ = ["Dataset", "read_dataset", "write_dataset"]
+__all__ = ["DAMAGE", "Dataset", "read_dataset", "write_dataset"]
 
-SCHEMA = "fe_likelihoods.dataset"
-SCHEMA_VERSION = 1
+DAMAGE = (OSError, KeyError, IndexError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError)
+"""Errors that reading a damaged HDF5 file raises, besides ValueError."""
+
+SCHEMA, SCHEMA_VERSION = "fe_likelihoods.dataset", 1
+# deflate compresses zeros to 1/1032 of their size (RFC 1951); data are never smaller
+_LARGEST_RATIO, _SMALL = 1100, 2**20
 
 
 class Dataset(NamedTuple):
@@ -126,7 +129,7 @@ def read_dataset(path: str | Path) -> Dataset:
                 )
             samples, values = file["record/acceleration"], file["measurements/values"]
             text, checksum = file.attrs["attributes"], file.attrs["checksum"]
-            acceleration, responses = read_values(samples, path), read_values(values, path)
+            acceleration, responses = _values(samples, path), _values(values, path)
             record = _record(acceleration, samples.attrs)
             columns = [values.attrs[key] for key in ("channel_names", "quantities", "display_units")]
             channels = tuple(Channel(*map(str, each)) for each in zip(*columns, strict=True))
@@ -191,3 +194,14 @@ def _checksum(record: Record, measurements: Measurements, attributes: str) -> st
     if isinstance(record, Events):
         parts.append(_windows_text(record))
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
+
+
+def _values(data: Any, path: str | Path) -> np.ndarray:
+    """The numbers of an h5py data set; ValueError if it declares more numbers than the file can contain."""
+    declared, stored = 8 * int(data.size), int(data.id.get_storage_size())
+    if declared > _SMALL and (declared > _LARGEST_RATIO * stored or stored > os.path.getsize(path)):
+        raise ValueError(
+            f"{path}: {data.name} declares {data.size} numbers, more than the file can contain; it is damaged, make it "
+            "or download it again"
+        )
+    return np.asarray(data[()], dtype="<f8")

@@ -22,27 +22,13 @@ __all__ = ["EventWindow", "Events", "events_of", "find_events", "join_measuremen
 
 
 class EventWindow(NamedTuple):
-    """Place of one event in the joined record.
-
-    Attributes
-    ----------
-    name : str
-        Name of the event.
-    first : int
-        Index of its first sample.
-    stop : int
-        Index after its last sample.
-    start : float
-        Time of its first sample [s].
-    end : float
-        Time of its last sample [s].
-    """
+    """Place of one event in the joined record."""
 
     name: str
-    first: int
-    stop: int
-    start: float
-    end: float
+    first: int  # index of its first sample
+    stop: int  # index after its last sample
+    start: float  # time of its first sample [s]
+    end: float  # time of its last sample [s]
 
     @property
     def samples(self) -> slice:
@@ -150,22 +136,9 @@ class Events(Record):
         return self.windows[self.names.index(name)]
 
     def split(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Split histories over the joined record into one history per event, without the pauses.
+        """Return the parts of histories (..., n_steps) over the joined record by event, without the pauses.
 
-        Parameters
-        ----------
-        values : (..., n_steps) array_like
-            Histories, such as a response (n_channels, n_steps).
-
-        Returns
-        -------
-        dict of str to ndarray, shape (..., n_steps of the event)
-            The part of each event.
-
-        Raises
-        ------
-        ValueError
-            If the histories and the joined record have different numbers of samples.
+        ValueError if the histories and the joined record have different numbers of samples.
         """
         values = np.asarray(values)
         if values.shape[-1:] != (self.n_steps,):
@@ -173,25 +146,13 @@ class Events(Record):
         return {window.name: values[..., window.samples] for window in self.windows}
 
     def join(self, measurements: Mapping[str, Measurements]) -> Measurements:
-        """Put the measurements of single events at their times in the joined record.
+        """Put the measurements of single events, by name, at their times in the joined record.
 
-        Parameters
-        ----------
-        measurements : mapping of str to Measurements
-            Measurements by the name of the event, whose time zero is the first sample of the event. All have the same
-            time step. An event may be left out: it then only changes the state of the structure. A channel may be
-            missing in some events.
-
-        Returns
-        -------
-        Measurements
-            All channels over the joined record; NaN in the pauses and wherever nothing was measured.
-
-        Raises
-        ------
-        ValueError
-            If there are no measurements, an event is unknown, the steps differ, samples are outside of their event or
-            between the steps of the joined record, or a channel has another quantity in another event.
+        Time zero of the measurements is the first sample of the event; all have the same time step. An event may be
+        left out: it then only changes the state of the structure. A channel may be missing in some events. The result
+        has all channels over the joined record, with NaN in the pauses and wherever nothing was measured. ValueError if
+        there are no measurements, an event is unknown, the steps differ, samples are outside of their event or between
+        the steps of the joined record, or a channel has another quantity in another event.
         """
         if not isinstance(measurements, Mapping) or not measurements:
             raise ValueError(f"expected Measurements for one or more of {', '.join(self.names)}; got {measurements!r}")

@@ -1,6 +1,6 @@
 """What the text above samples states about them: step, number, unit and peak.
 
-Loggers and networks print such lines in their own words (``SAMPLING INTERVAL (sec) : 0.01``, ``Sampling rate,200 Hz``,
+Loggers and networks print such lines in their own words (``SAMPLING INTERVAL (sec) : 0.01``, ``Abtastrate: 200 Hz``,
 ``NPTS=40, DT=0.01``, ``RAW PGA VALUES (gal) : (N-S) 97.4``). They are compared with the arguments of a reader and with
 the samples, and used where a reader has no argument. A number without its unit is compared only.
 """
@@ -15,42 +15,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..units import UNITS, find_unit, to_si
-from .text_files import NUMBER, decimals_of, parse_count
+from .text_files import NUMBER, decimals_of, dimension_of, parse_count
 
 __all__ = ["StatedPeak", "StatedStep", "Statements", "check_peaks", "read_statements"]
 
-_IS = r"\s*[:=,;\t]*\s*"
-_UNIT = r"(?:[\[(]\s*([^\])]{1,20}?)\s*[\])])?"
+_VALUE = rf"\s*(?:[\[(]\s*(?P<bracket>[^\])]{{1,20}}?)\s*[\])])?\s*[:=,;\t]*\s*(?P<number>{NUMBER})\s*"
 _STEP = re.compile(
-    r"\b(?:dt|delta[ _]?t|(?:sampl(?:ing|e)|time|scan)[ _-]?(?:interval|step|period|increment)|"
-    r"equal(?:ly)?\s+spac(?:ing\s+of|ed\s+at)|intervals\s+of)"
-    rf"(?:_(s|ms)\b)?\s*{_UNIT}{_IS}({NUMBER})\s*([a-z]*)",
+    r"\b(?:dt|delta[ _]?t|(?:sampl(?:ing|e)|time|scan)[ _-]?(?:interval|step|period|increment|spacing)|"
+    r"equal(?:ly)?\s+spac(?:ing\s+of|ed\s+at)|intervals\s+of|abtast(?:intervall|periode|zeit)|zeitschritt|"
+    r"pas de temps|paso de tiempo|passo temporale|interval(?:o de muestreo|lo di campionamento))"
+    rf"(?:_(?P<ending>s|ms)\b)?{_VALUE}(?P<unit>[a-z]*)",
     re.IGNORECASE,
 )
 _RATE = re.compile(
-    r"(?:\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|samples per sec(?:ond)?\b)|"
-    r"^\W*(?:fs|rate)\b(?=\s*[\[(:=,;\t]))"
-    rf"\s*{_UNIT}{_IS}({NUMBER})\s*"
-    r"(k?hz|sps|(?:samples|pts|points)\s*(?:per|/)\s*s(?:ec(?:ond)?)?)?",
+    r"(?:\b(?:(?:sampl(?:ing|e)|scan)[ _-]?(?:rate|freq(?:uency|\.)?)|(?:samples|scans) per sec(?:ond)?\b|"
+    r"abtast(?:rate|frequenz)|fr[eé]quence d.[eé]chantillonnage|frecuencia de muestreo|frequenza di campionamento)|"
+    rf"^\W*(?:fs|rate)\b(?=\s*[\[(:=,;\t])){_VALUE}"
+    r"(?P<unit>k?hz|sps|(?:samples|pts|points)\s*(?:per|/)\s*s(?:ec(?:ond)?)?)?",
     re.IGNORECASE,
 )
 _COUNT = re.compile(
     r"\b(?:npts|ndata|(?:number|no\.?|num)[ _]of[ _](?:data|samples|scans|rows|values)(?:[ _]points)?|"
-    rf"(?:number|no\.?|num)[ _]of[ _]points){_IS}(\d+)(?![\d.])|"
+    r"(?:number|no\.?|num)[ _]of[ _]points|(?:scans|samples) in (?:the )?file|"
+    r"anzahl(?: der)? (?:abtastwerte|messwerte|werte|punkte)|nombre d(?:e points|.[eé]chantillons)|"
+    r"n[uú]mero de (?:datos|muestras|puntos))\s*[:=,;\t]*\s*(\d+)(?![\d.])|"
     r"^\W*(?:samples|points|scans)\s*[:=,;\t]\s*(\d+)\W*$",
     re.IGNORECASE,
 )
-_UNIT_LINE = re.compile(r"\bunits?(?:\s+of\s+[a-z]{1,20})?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
+_UNIT_LINE = re.compile(r"\b(?:units?|einheit)(?:\s+of\s+[a-z]{1,20})?\s*[:=]\s*([^\s;,]+)", re.IGNORECASE)
 _UNITS_ARE = re.compile(r"\bunits?\s+(?:of|are|is)\s+[(\[]?\s*([^\s,;()\[\]]+)", re.IGNORECASE)
 _PEAK = re.compile(
-    rf"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?)(?:\s+values?)?\s*{_UNIT}\s*[:=,;\t]\s*(.{{0,200}})",
+    r"\b(?:pga|(?:peak|max\w*\.?)(?:\s+ground)?\s+acc\w*\.?|(?P<any>(?:peak|max\w*\.?)\s+value))(?:\s+values?)?\s*"
+    r"(?:[\[(]\s*(?P<unit>[^\])]{1,20}?)\s*[\])])?\s*[:=,;\t]\s*(?P<numbers>.{0,200})",
     re.IGNORECASE,
 )
 _NAMED = re.compile(rf"\(([^)]{{1,40}})\)\s*({NUMBER})")
 _PLAIN = re.compile(rf"({NUMBER})\s*(\S*)")
 _LONGER = ("min", "minutes", "h", "hours")  # loggers of temperature
 _LONGEST = 10_000  # letters of a line that are searched
-_HERTZ = {"khz": 1e3}
 _LARGEST_ROUNDING = 0.005  # relative, of a number with three digits; with fewer ones, such as 0.01, a step is exact
 
 
@@ -89,63 +91,49 @@ class Statements(NamedTuple):
     peaks: tuple[StatedPeak, ...] = ()
 
 
-def read_statements(lines: Sequence[str]) -> Statements:
+def read_statements(lines: Sequence[str], decimal_commas: bool = False) -> Statements:
     """Return what lines of text state."""
     steps, counts, units, peaks = [], [], [], []
-    for line in (each[:_LONGEST] for each in lines):
-        steps += [found for match in _STEP.finditer(line) if (found := _stated_step(match))]
-        steps += [found for match in _RATE.finditer(line) if (found := _stated_rate(match))]
+    for line in lines:
+        line = re.sub(r"(?<=\d),(?=\d)", ".", line[:_LONGEST]) if decimal_commas else line[:_LONGEST]
+        steps += [
+            _stated_step(match, rate) for form, rate in ((_STEP, False), (_RATE, True)) for match in form.finditer(line)
+        ]
         counts += [(match[0], parse_count(match[1] or match[2], match[0][:60])) for match in _COUNT.finditer(line)]
         units += [(match[0], match[1]) for match in _UNIT_LINE.finditer(line)]
-        units += [(match[0], match[1]) for match in _UNITS_ARE.finditer(line) if _is_acceleration(match[1])]
-        peaks += [found for match in _PEAK.finditer(line) if (found := _stated_peak(match)).printed]
-    return Statements(tuple(steps), tuple(counts), tuple(units), tuple(peaks))
+        units += [
+            (match[0], match[1]) for match in _UNITS_ARE.finditer(line) if dimension_of(match[1]) == "acceleration"
+        ]
+        peaks += [_stated_peak(match) for match in _PEAK.finditer(line)]
+    return Statements(tuple(filter(None, steps)), tuple(counts), tuple(units), tuple(filter(None, peaks)))
 
 
-def _stated_step(match: re.Match[str]) -> StatedStep | None:
-    ending, bracket, printed, unit = match.groups()
-    number, stated = float(printed), [_time_unit(each) for each in (ending, bracket, unit) if each]
-    known = [each for each in stated if each is not None]
-    if not number > 0.0 or (bracket and not known) or unit.lower() in _LONGER:  # brackets around something else
+def _stated_step(match: re.Match[str], rate: bool) -> StatedStep | None:
+    """A step, or the step of a rate; None for zero, and for a number of something else."""
+    number, unit, bracket = float(match["number"]), match["unit"] or "", match["bracket"]
+    if not number > 0.0 or unit.lower() in _LONGER:
         return None
-    factors = known[:1] or [1.0, 1e-3, 1e-6]
-    return StatedStep(match[0].strip(), tuple(number * factor for factor in factors), _rounding(printed))
+    if rate:
+        stated = (unit or bracket or "").lower()
+        factors = [1e3 if stated == "khz" else 1.0] if stated else [1.0, 1e3]
+        steps = tuple(1.0 / (number * factor) for factor in factors)
+    else:
+        stated = [each for each in (match["ending"], bracket, unit) if each and dimension_of(each) == "time"]
+        if bracket and not stated:  # brackets around something else
+            return None
+        factors = [find_unit(each).factor for each in stated[:1]] or [1.0, 1e-3, 1e-6]
+        steps = tuple(number * factor for factor in factors)
+    rounding = 0.5 * 10.0 ** -decimals_of(match["number"]) / number
+    return StatedStep(match[0].strip(), steps, min(rounding, _LARGEST_ROUNDING))
 
 
-def _stated_rate(match: re.Match[str]) -> StatedStep | None:
-    bracket, printed, unit = match.groups()
-    number, stated = float(printed), unit or bracket
-    if not number > 0.0:
-        return None
-    factors = [_HERTZ.get(stated.lower(), 1.0)] if stated else [1.0, 1e3]
-    return StatedStep(match[0].strip(), tuple(1.0 / (number * factor) for factor in factors), _rounding(printed))
-
-
-def _rounding(printed: str) -> float:
-    return min(0.5 * 10.0 ** -decimals_of(printed) / float(printed), _LARGEST_ROUNDING)
-
-
-def _time_unit(name: str) -> float | None:
-    try:
-        return find_unit(name, "time").factor
-    except ValueError:
-        return None
-
-
-def _stated_peak(match: re.Match[str]) -> StatedPeak:
-    unit, text = match.groups()
-    named = {name.strip(): printed for name, printed in _NAMED.findall(text)}
-    if not named and (plain := _PLAIN.match(text)):
-        named = {"": plain[1]}
-        unit = unit or plain[2].rstrip(",;") or None
-    return StatedPeak(match[0].strip(), unit if unit and _is_acceleration(unit) else None, named)
-
-
-def _is_acceleration(unit: str) -> bool:
-    try:
-        return find_unit(unit).dimension == "acceleration"
-    except ValueError:
-        return False
+def _stated_peak(match: re.Match[str]) -> StatedPeak | None:
+    """Peaks by name, or one without; None for other text, and a value that may be no acceleration."""
+    unit, printed = match["unit"], {name.strip(): number for name, number in _NAMED.findall(match["numbers"])}
+    if not printed and (plain := _PLAIN.match(match["numbers"])):
+        unit, printed = unit or plain[2].rstrip(",;"), {"": plain[1]}
+    unit = unit if unit and dimension_of(unit) == "acceleration" else None
+    return StatedPeak(match[0].strip(), unit, printed) if printed and (unit or not match["any"]) else None
 
 
 def check_peaks(
@@ -163,19 +151,14 @@ def check_peaks(
     The column is number `index` of `names`, with printed values (n_rows,) without missing ones; `advice` ends the
     message.
     """
-    factor = float(to_si(1.0, unit))
+    factor, digit = float(to_si(1.0, unit)), 1.01 * 10.0**-decimals
     found = [float(np.abs(each).max()) for each in (values, values - values.mean())]
     for peak in peaks:
         printed = peak.printed_of(names, index)
-        if printed is None:
-            continue
-        known = (
-            (peak.unit,) if peak.unit else (each.name for each in UNITS.values() if each.dimension == "acceleration")
-        )
+        known = [peak.unit] if peak.unit else [name for name in UNITS if UNITS[name].dimension == "acceleration"]
         ratios = [float(to_si(1.0, each)) / factor for each in known]
-        stated = abs(float(printed))
-        if not any(
-            abs(each - ratio * stated) <= 1.01 * 10.0**-decimals + 0.505 * ratio * 10.0 ** -decimals_of(printed)
+        if printed is not None and not any(
+            abs(each - ratio * abs(float(printed))) <= digit + 0.505 * ratio * 10.0 ** -decimals_of(printed)
             for each in found
             for ratio in ratios
         ):

@@ -1,4 +1,4 @@
-"""Tables in the formats of two logger programs, as header line, line of units and rows for `table_rows`.
+"""Tables in the formats of two logger programs, as header line, line of units and rows for `tables`.
 
 Campbell Scientific TOA5
     Four header lines: environment, names, units, processing (LoggerNet manual, appendix "Campbell Scientific File
@@ -27,18 +27,11 @@ def logger_table(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]
     if first == "TOA5" and len(lines) > 3:
         units = ["" if unit in ("TS", "RN") else unit for unit in lines[2][1]]
         return [lines[1], (lines[2][0], _bracketed(units)), *lines[4:]], []
-    if first.startswith("LabVIEW Measurement"):
-        return _labview(lines, file)
-    return lines, []
+    return _labview(lines, file) if first.startswith("LabVIEW Measurement") else (lines, [])
 
 
 def _bracketed(units: list[str]) -> list[str]:
     return [f"[{unit}]" if unit else "" for unit in units]
-
-
-def _without_comment(cells: list[str], width: int) -> list[str]:
-    """Cells of a row without the text in the column of comments; numbers in it show that the row is damaged."""
-    return cells[:width] if len(cells) == width + 1 and not any(map(str.isdigit, cells[width])) else cells
 
 
 def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
@@ -49,24 +42,22 @@ def _labview(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]]:
             "segment (option 'Overwrite file' or 'One header only')"
         )
     tags = {cells[0]: cells[1:] for _, cells in lines[: ends[1]]}
-    names, rows = lines[ends[1] + 1 : ends[1] + 2], lines[ends[1] + 2 :]
-    columns, axis = (
-        next(iter(tags.get(tag, ())), usual) for tag, usual in (("X_Columns", "One"), ("X_Dimension", "Time"))
-    )
-    if not names or names[0][1][0] != "X_Value" or axis != "Time":
+    (number, header), rows = lines[ends[1] + 1] if lines[ends[1] + 1 :] else (0, [""]), lines[ends[1] + 2 :]
+    columns, axis = (next(iter(tags.get(tag, ())), "") for tag in ("X_Columns", "X_Dimension"))
+    if header[0] != "X_Value" or (axis or "Time") != "Time":
         raise ValueError(
-            f"{file}: expected a LabVIEW file whose first column X_Value has times, got "
-            f"{names[0][1][:1] if names else []} and X_Dimension {axis!r}; write it with times"
+            f"{file}: expected a LabVIEW file whose first column X_Value has times, got {header[0]!r} and X_Dimension "
+            f"{axis!r}; write it with times"
         )
-    number, header = names[0]
     width = len(header) - (header[-1] == "Comment")
     labels = ["", *tags.get("Y_Unit_Label", []), *[""] * width]
-    units = ["s" if name == "X_Value" else labels[k] for k, name in enumerate(header[:width])]
-    table = [
-        (number, ["time [s]" if name == "X_Value" else name for name in header[:width]]),
-        (number, _bracketed(units)),
-        *((number, _without_comment(cells, width)) for number, cells in rows),
-    ]
+    names = ["time [s]" if name == "X_Value" else name for name in header[:width]]
+    units = ["s" if name == "X_Value" else label for name, label in zip(header[:width], labels, strict=False)]
+    # the text in the column of comments goes; numbers in it show that a row is damaged
+    cut = [k for k, (_, cells) in enumerate(rows) if len(cells) == width + 1 and not any(map(str.isdigit, cells[-1]))]
+    for k in cut:
+        rows[k] = rows[k][0], rows[k][1][:width]
+    table = [(number, names), (number, _bracketed(units)), *rows]
     if columns != "No":
         return table, []
     steps = sorted({cell for cell in tags.get("Delta_X", []) if cell})

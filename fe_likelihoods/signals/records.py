@@ -128,73 +128,28 @@ class Record:
         return Record(self.name, new_dt, samples, self._source(f"resampled to dt = {new_dt:g} s"))
 
     def trim(self, start: float = 0.0, stop: float | None = None) -> "Record":
-        """Return the part of the record between two times, both included. Time starts again from zero.
+        """Return the part of the record between two times [s], both included. Time starts again from zero.
 
-        Parameters
-        ----------
-        start, stop : float
-            Times [s] with 0 <= start < stop <= duration. Default of `stop`: the end of the record.
-
-        Returns
-        -------
-        Record
-            The part of the record.
-
-        Raises
-        ------
-        ValueError
-            If the times are out of order or outside of the record, or fewer than 2 samples remain.
+        ValueError unless 0 <= start < stop <= duration (the default of `stop`), and 2 samples or more remain.
         """
         window = sample_window(self.name, self.n_steps, self.dt, start, stop)
         note = f"trimmed to {window.start * self.dt:g} ... {(window.stop - 1) * self.dt:g} s"
         return Record(self.name, self.dt, self.acceleration[window], self._source(note))
 
     def scale(self, factor: float) -> "Record":
-        """Return the record with all samples multiplied by `factor`.
-
-        Parameters
-        ----------
-        factor : float
-            A finite number.
-
-        Returns
-        -------
-        Record
-            The scaled record.
-
-        Raises
-        ------
-        ValueError
-            If the factor is not finite.
-        """
+        """Return the record with all samples multiplied by `factor`; ValueError if it is not finite."""
         if not math.isfinite(factor):
             raise ValueError(f"scale factor of {self.name!r} must be a finite number, got {factor!r}")
         note = f"scaled by {factor:g}"
         return Record(self.name, self.dt, factor * self.acceleration, self._source(note))
 
     def followed_by(self, other: "Record", rest: float = 10.0) -> "Record":
-        """Return this record, a pause without ground motion, and another record as one record.
+        """Return this record, `rest` seconds without ground motion and another record of the same step as one record.
 
         A model simulates the result as one loading, so the state of the structure at the end of this record (cracks,
-        yielding, residual displacements) is its state at the beginning of the other record. To keep the times of the
-        events, join the records with `fe_likelihoods.signals.events.Events`.
-
-        Parameters
-        ----------
-        other : Record
-            The later record, with the same time step.
-        rest : float
-            Length of the pause [s], zero or more, rounded to whole time steps: number of zero samples times the step.
-
-        Returns
-        -------
-        Record
-            The samples of this record, zeros, and the samples of the other record.
-
-        Raises
-        ------
-        ValueError
-            If `other` is not a `Record` or has another time step, or `rest` is negative or not finite.
+        yielding, residual displacements) is its state at the beginning of the other record. The pause is rounded to
+        whole steps. To keep the times of the events, join the records with `fe_likelihoods.signals.events.Events`.
+        ValueError if `other` is not a `Record` or has another step, or `rest` is negative or not finite.
         """
         if not isinstance(other, Record):
             raise ValueError(f"{self.name!r} must be followed by a Record, got {type(other).__name__}")
@@ -267,22 +222,10 @@ class DisplacementHistory:
         return array_digest(self.displacement)
 
     def subdivide(self, max_increment: float) -> SubdividedHistory:
-        """Insert points on straight lines so that no increment exceeds a limit.
+        """Insert points on straight lines so that no increment exceeds `max_increment` [m].
 
-        Parameters
-        ----------
-        max_increment : float
-            Largest increment [m], positive.
-
-        Returns
-        -------
-        SubdividedHistory
-            The refined history. ``history.displacement[indices]`` are the original points, exactly.
-
-        Raises
-        ------
-        ValueError
-            If `max_increment` is not a positive number.
+        ``history.displacement[indices]`` of the result are the original points, exactly. ValueError if the limit is not
+        a positive number.
         """
         if not (math.isfinite(max_increment) and max_increment > 0):
             raise ValueError(f"largest increment of {self.name!r} must be a positive length [m], got {max_increment!r}")

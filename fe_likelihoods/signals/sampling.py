@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "array_digest",
+    "as_number",
     "check_samples",
     "check_step",
     "rest_samples",
@@ -49,12 +51,17 @@ def check_samples(values: ArrayLike, what: str, name: str) -> NDArray[np.float64
     return samples
 
 
+def as_number(value: Any) -> float:
+    """Return a value as a float, NaN if it is no number."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
 def check_step(dt: float, name: str) -> float:
     """Return the time step [s] as a float; raise ValueError unless it is positive and finite."""
-    try:
-        step = float(dt)
-    except (TypeError, ValueError):
-        step = math.nan
+    step = as_number(dt)
     if not (math.isfinite(step) and step > 0):
         raise ValueError(f"time step of {name!r} must be a positive number of seconds, got {dt!r}")
     return step
@@ -65,10 +72,7 @@ def rest_samples(rest: float, dt: float) -> int:
 
     Raises ValueError if the pause is negative, so that the events would overlap, or not a finite number.
     """
-    try:
-        seconds = float(rest)
-    except (TypeError, ValueError):
-        seconds = math.nan
+    seconds = as_number(rest)
     if not (math.isfinite(seconds) and seconds >= 0.0):
         overlap = ": the events would overlap" if seconds < 0.0 else ""
         raise ValueError(f"the pause between two records must be zero or more seconds, got {rest!r}{overlap}")

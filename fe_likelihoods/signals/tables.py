@@ -1,43 +1,121 @@
-"""Tables of numbers in text files and workbooks: columns with names and units.
+"""Tables of numbers in text files and workbooks, as loggers and spreadsheets write them.
 
-Times of the rows are read by `fe_likelihoods.signals.table_times`, columns of values by
-`fe_likelihoods.signals.table_columns`. Only times are converted to SI units.
+`read_table` finds separator, header line, line of units, decimal marks, clock times and the column of times.
+Semicolons, tabs, commas or blanks separate cells, whichever splits most of the last lines into numbers. Decimal commas
+are read if commas do not separate cells; separators of thousands go if a number shows them: ``1,234.5``, ``1.234,5``,
+``1'234``. Text before the header line is left out, as are lines of numbers and words that a header line follows.
+
+`table_step` and `table_start` return seconds. Values of columns stay in the units of the file; `column_values` and
+`column_unit` return them with NaN for missing samples and the unit on which file and caller agree.
 """
 
+import contextlib
+import csv
+import itertools
+import math
 import re
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import find_unit
-from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight
-from .header_statements import Statements, read_statements
-from .table_rows import read_rows
-from .text_files import agree_on_unit, decimals_of, is_number, parse_number
+from ..units import find_unit, to_si
+from .clock_times import ClockTime, is_clock, is_date, parse_clock, seconds_since_midnight, unix_seconds
+from .header_statements import Statements, check_peaks, read_statements
+from .logger_formats import logger_table
+from .text_files import (
+    agree_on_unit,
+    check_count,
+    decimals_of,
+    decode_text,
+    dimension_of,
+    is_number,
+    number_cells,
+    parse_count,
+    parse_number,
+    read_bytes,
+)
+from .uneven_times import uniform_times
 
-__all__ = ["Table", "column_names", "column_unit", "listed_columns", "named_places", "read_table", "stated_unit"]
+__all__ = [
+    "Column",
+    "Table",
+    "WORKBOOKS",
+    "column_unit",
+    "column_values",
+    "read_table",
+    "row_times",
+    "stated_unit",
+    "table_start",
+    "table_step",
+    "text_unit",
+    "unit_in_name",
+    "value_column",
+    "value_columns",
+    "warn_if_absent",
+]
 
+WORKBOOKS = (".xlsx", ".xlsm")
+"""Endings of the names of Excel workbooks."""
+
+_SEPARATORS = (";", "\t", ",", " ")
+_LAST_LINES = 50  # lines that determine the separator
+_MISSING = frozenset({"", "nan", "#n/a", "n/a", "na", "null", "-", "--"})
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?$")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")  # 1,000: a thousand, or one with three decimals
+# Separators of thousands that cannot be decimal marks: another mark or a second group follows
+_GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:(?:,\d{3})+\.\d*|(?:\.\d{3})+,\d*|(?:,\d{3}){2,}|(?:\.\d{3}){2,})$")
+_SPACED = re.compile(r"[-+]?[1-9]\d{0,2}(?:['\u2019\u00a0\u202f ]\d{3})+(?:[.,]\d*)?$")
+_SPACE = re.compile(r"\d['\u2019\u00a0\u202f ]\d{3}")
+_SPACES = str.maketrans("", "", "'\u2019\u00a0\u202f ")
+_HUNDREDS = re.compile(r"[-+]?[1-9]\d{2}$")
+_NUMBERS = re.compile(r"[\s\d.+\-eEdD]*")
+_STEP = re.compile(r"0?\.\d+|\d(?:\.\d+)?[eEdD]-\d+")  # below 1 s
+_TIME = re.compile(r"(elapsed |relative )?(t|(time|zeit|temps|tempo|tiempo)\d*)(\b|_)", re.IGNORECASE)
+_STAMP = re.compile(r"(timestamp|unix|epoch)(\b|_)", re.IGNORECASE)  # times if no other column has them
+_UNIX = re.compile(r"unix|epoch", re.IGNORECASE)
+_UNIX_SECONDS = (1e9, 4.2e9)  # seconds since 1970 of the years 2001 to 2103
 _LONGEST_UNIT = 100
+_SENTINELS = (-9999.0, -999.25, 1e30, 9.97e36)  # numbers that loggers and formats write for missing samples
+# also used for missing samples, but plausible as measured numbers: counts, or accelerations in gal
+_PLAUSIBLE_SENTINELS = (-999.0, 99999.0, -99999.0, 32767.0, -32768.0)
+_POINTS = "Numbers with decimal commas need another separator between columns, such as ';'"
+_SKIP = "If the text is about other samples, give skip= to leave it out"
+
+_Line = tuple[int, list[str]]  # its number and cells
+
+
+class Column(NamedTuple):
+    """One column of a table."""
+
+    name: str  # without a header line its number, from 1
+    values: NDArray[np.float64]  # (n_rows,) as printed, NaN for missing; clock times [s since the first midnight]
+    decimals: int  # most digits after the decimal point
+    below: str  # unit below the header line, "" without
+    kind: str  # "number", "clock", or "text", such as dates and a logger's state, which has no values
 
 
 class Table(NamedTuple):
-    """Columns of numbers in a text file."""
+    """A table in a text file or workbook."""
 
     file: str  # for messages
-    names: tuple[str, ...]  # empty without a header line
-    values: NDArray[np.float64]  # (n_rows, n_columns)
+    named: bool  # whether it has a header line
+    columns: tuple[Column, ...]
     lines: tuple[int, ...]  # line numbers of the rows
-    decimals: tuple[int, ...]  # most digits printed after the decimal point, per column
-    comments: str
-    units: tuple[str, ...]  # below the header line, "" per column without them
-    time_unit: str | None = None  # as given by the caller
-    clocks: frozenset[int] = frozenset()  # columns of clock times [s since the midnight before the first]
-    dates: frozenset[int] = frozenset()  # columns of dates or text, such as a logger's state, without values
+    title: str  # the first comment
+    stated: Statements  # what comments and the text above state
     clock: ClockTime | None = None  # the first clock time
-    time: int | None = None  # column of times, as given by the caller
-    stated: Statements = Statements()  # what comments and the text above state
+    time: int | None = None  # column of times
+    time_unit: str | None = None  # as given by the caller
+    chosen: bool = False  # whether the caller has chosen the column of times
+
+
+# rows of cells --------------------------------------------------------------------------------------------------------
 
 
 def read_table(
@@ -47,77 +125,337 @@ def read_table(
     time: int | str | None = None,
     along_rows: bool = False,
 ) -> Table:
-    """Read columns of numbers from a text file or an Excel workbook, with NaN for missing cells.
+    """Read columns of numbers from a text file, or from the first sheet of an Excel workbook (needs openpyxl).
 
-    Separators are commas, semicolons, tabs or blanks; text above the table (`skip` lines, None finds them), a header
-    line and a line of units are optional; lines with ``#`` are comments. `time` is the name or number of the column of
-    times, by default found; with `time_unit`, the first column of a file without a header line has them. Raises
-    ValueError if the file cannot be read, has no rows or rows of different length, has a cell that is no finite number,
-    or states another number of samples.
+    `skip` lines are above the table, None finds them; lines with ``#`` are comments. `time` is the name or number of
+    the column of times, by default found; with `time_unit`, the first column of a file without a header line has them.
+    With `along_rows` the numbers are one column, row after row, and the last row may be shorter. Raises ValueError if
+    the file cannot be read, has no rows or rows of different length, has a cell that is no finite number, or states
+    another number of samples.
     """
-    file, rows = str(path), read_rows(path, skip, along_rows)
-    width = len(rows.cells[0][1])
+    if skip is not None and (isinstance(skip, bool) or not isinstance(skip, int) or skip < 0):
+        raise ValueError(f"skip must be a number of lines, zero or more, got {skip!r}")
     if time_unit is not None:
         find_unit(time_unit, "time")
-    values = np.empty((len(rows.cells), width))
-    decimals, clocks, dates, clock = [], set(), set(), None
-    for column in range(width):
-        cells = [(cells[column], f"{file}, line {number}") for number, cells in rows.cells]
-        if any(is_clock(cell) for cell, _ in cells):
-            clocks.add(column)
-            times = [parse_clock(cell, where) if cell else None for cell, where in cells]
-            values[:, column] = seconds_since_midnight(times, file)
-            decimals.append(max(time.decimals for time in times if time is not None))
-            clock = next(time for time in times if time is not None) if clock is None else clock
-        elif any(cell for cell, _ in cells) and all(not cell or is_date(cell) or _is_word(cell) for cell, _ in cells):
-            dates.add(column)
-            values[:, column] = np.nan
-            decimals.append(0)
-        else:
-            values[:, column] = [parse_number(cell, where) if cell else np.nan for cell, where in cells]
-            decimals.append(max(decimals_of(cell) for cell, _ in cells))
-    lines = tuple(number for number, _ in rows.cells)
-    units = rows.units or ("",) * width
-    numbers = rows.names, values, lines, tuple(decimals), "\n".join(rows.comments), units, time_unit
-    stated = read_statements([*rows.comments, *rows.above])
-    for text, count in stated.counts:
-        if len(values) != count:
+    file, lines, comments = str(path), [], []
+    is_book = Path(path).suffix.lower() in WORKBOOKS
+    text = _workbook(path) if is_book else decode_text(read_bytes(path)).splitlines()
+    for number, line in enumerate(text, 1):
+        if number > (skip or 0) and line.strip():
+            comment = line.lstrip().startswith("#")
+            comments += [line.lstrip("# \t")] * comment
+            lines += [(number, line)] * (not comment)
+    separator = "\t" if is_book else _separator([line for _, line in lines[-_LAST_LINES:]])
+    rows = [(number, _split(line, separator, f"{file}, line {number}")) for number, line in lines]
+    rows, stated = logger_table(rows, file)
+    along_rows = along_rows and not any("rows" in row for _, row in rows[:_LAST_LINES])
+    announced = None if along_rows or stated else _announced(rows, file)
+    if rows and announced is None:
+        _check_names(rows, separator, along_rows, file)
+    if along_rows:
+        rows = _along_rows(rows, file)
+    elif announced:
+        rows, stated = announced
+    comments += stated
+    names, below, rows = _header(rows, file)
+    rows, commas = _with_points(rows, separator, file)
+    columns, clock = _columns(names, below, rows, file)
+    above = [line for number, line in lines if number < rows[0][0]]
+    numbers, stated = tuple(number for number, _ in rows), read_statements([*comments, *above], commas)
+    table = Table(file, bool(names), columns, numbers, "".join(comments[:1]), stated, clock, None, time_unit)
+    for text, count in table.stated.counts:
+        if len(rows) != count:
             raise ValueError(
-                f"{file}: {text!r} announces {count} samples, the file has {len(values)}; it is truncated or damaged. "
-                "If the text is about other samples, give skip= to leave it out"
+                f"{file}: {text!r} announces {count} samples, the file has {len(rows)}; it is truncated or damaged. "
+                f"{_SKIP}"
             )
-    table = Table(file, *numbers, frozenset(clocks), frozenset(dates), clock, None, stated)
-    return table if time is None else table._replace(time=_time_place(table, time))
-
-
-def _time_place(table: Table, time: int | str) -> int:
-    places = [place for place in named_places(table, time) if place not in table.dates]
+    if time is None:
+        return table._replace(time=_time_column(table))
+    places = [k for k, column in enumerate(columns) if column.name == str(time) and column.kind != "text"]
     if len(places) != 1:
         raise ValueError(
-            f"{table.file}: expected one column of times with time={time!r}, found {len(places)}; "
-            f"{listed_columns(table)}"
+            f"{file}: expected one column of times with time={time!r}, found {len(places)}; {_listed_columns(table)}"
         )
-    return places[0]
+    return table._replace(time=places[0], chosen=True)
 
 
-def column_names(table: Table) -> tuple[str, ...]:
-    """Names of the columns, without a header line their numbers, from 1."""
-    return table.names or tuple(str(k + 1) for k in range(table.values.shape[1]))
+def _workbook(path: str | Path) -> list[str]:
+    """Lines of the first sheet, with tabs between cells; formulas have their stored values."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError as error:
+        raise ValueError(
+            f"reading {path} needs the package openpyxl: install it with pip install openpyxl, or save the sheet as CSV"
+        ) from error
+    read_bytes(path)  # the checks of existence and size
+    try:
+        sheet = load_workbook(path, read_only=True, data_only=True).worksheets[0]
+        rows = [list(map(_cell_text, row)) for row in sheet.iter_rows(values_only=True)]
+    except Exception as error:  # a damaged workbook may raise anything
+        raise ValueError(f"{path}: not a readable Excel workbook ({error}); save it as CSV") from error
+    width = max(map(len, rows), default=0)
+    return ["\t".join(row + [""] * (width - len(row))) for row in rows]
 
 
-def named_places(table: Table, column: int | str) -> list[int]:
-    """Columns with a name, or without a header line with a number, from 1."""
-    return [place for place, name in enumerate(column_names(table)) if name == str(column)]
+def _cell_text(value: object) -> str:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return repr(float(value)) if number else " ".join(str("" if value is None else value).split())
 
 
-def listed_columns(table: Table) -> str:
-    """The names of the columns, for messages."""
-    if table.names:
-        return f"the columns are {', '.join(table.names)}"
+def _split(line: str, separator: str, where: str) -> list[str]:
+    if separator == " ":
+        return number_cells(line) if _NUMBERS.fullmatch(line) else line.split()
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=separator != "\t"))
+    except csv.Error as error:
+        raise ValueError(f"{where}: expected cells separated by {separator!r} ({error})") from None
+    cells = [cell.strip() for cell in cells]
     return (
-        f"the columns have no names: give a number from 1 to {table.values.shape[1]}. Numbers with decimal commas need "
-        "another separator between columns, such as ';'"
+        [cell.translate(_SPACES) if _SPACED.match(cell) else cell for cell in cells] if _SPACE.search(line) else cells
     )
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """The separator that splits most lines into several numbers, or into one number if no separator does."""
+    best, most = " ", (0, 0)
+    for separator in _SEPARATORS:
+        widths: Counter[int] = Counter()
+        for line in lines:
+            with contextlib.suppress(ValueError):
+                cells = _split(line, separator, "")
+                widths[len(cells)] += _is_data(cells)
+        width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
+        if (count * (width > 1), count) > most:
+            best, most = separator, (count * (width > 1), count)
+    if most == (0, 0):  # no line of numbers: the separator that is there, for the message
+        best = next((each for each in _SEPARATORS if any(each in line for line in lines)), " ")
+    return best
+
+
+def _along_rows(lines: list[_Line], file: str) -> list[_Line]:
+    """One row per number, below lines of text. All lines of numbers but the last one have the same number of them."""
+    rows = [*itertools.dropwhile(lambda line: _is_title(line[1]), lines)]
+    for number, cells in rows:
+        width = len(rows[0][1])
+        if wrong := [cell for cell in cells if not _known(cell)]:
+            raise ValueError(f"{file}, line {number}: expected numbers below lines of text, got {wrong[0][:100]!r}")
+        if len(cells) > width or (len(cells) < width and number != rows[-1][0]):
+            raise ValueError(f"{file}, line {number}: expected {width} numbers as in the first row, got {len(cells)}")
+    return [(number, [cell]) for number, cells in rows for cell in cells]
+
+
+def _is_title(cells: list[str]) -> bool:
+    """Whether a line has words, and no more numbers than other cells: a damaged row of numbers is no title."""
+    return any(re.search("[A-Za-z]{2}", cell) for cell in cells) and 2 * sum(map(_known, cells)) <= len(cells)
+
+
+def _announced(lines: list[_Line], file: str) -> tuple[list[_Line], list[str]] | None:
+    """One row per number below a line with their number and step, and title and step as comments; None without it.
+
+    eqsig writes this line above one sample per line, RSPMatch above several ones, with at most another integer. In a
+    table, the line would have as many cells as the rows.
+    """
+    heads = [" ".join(cells).split() for _, cells in lines[: _LAST_LINES + 1]]
+    place = next((k for k, head in enumerate(heads[:-1]) if head and all(map(is_number, head))), None)
+    if place is None or not 2 <= len(head := heads[place]) <= 3 or len(heads[place + 1]) == len(head):
+        return None
+    if not all(map(str.isdecimal, (head[0], *head[2:]))) or not _STEP.fullmatch(head[1]):
+        return None
+    if not all(_known(cell) for _, cells in lines[place + 1 :] for cell in cells):
+        return None
+    numbers = _along_rows(lines[place + 1 :], file)
+    check_count(len(numbers), parse_count(head[0], file), f"{file}, line {lines[place][0]}")
+    return numbers, [*(" ".join(cells) for _, cells in lines[: min(place, 1)]), f"dt = {head[1]} s"]
+
+
+# header line and decimal marks ----------------------------------------------------------------------------------------
+
+
+def _is_missing(cell: str) -> bool:
+    return cell.lower() in _MISSING
+
+
+def _known(cell: str) -> bool:
+    """Whether a cell is a number in any spelling, a clock time or a date."""
+    if _is_missing(cell):
+        return False
+    return (
+        is_number(cell) or bool(_DECIMAL_COMMA.match(cell) or _GROUPED.match(cell)) or is_clock(cell) or is_date(cell)
+    )
+
+
+def _is_data(cells: Sequence[str]) -> bool:
+    return any(map(_known, cells)) and all(_known(cell) or _is_missing(cell) for cell in cells)
+
+
+def _is_text(cells: Sequence[str]) -> bool:
+    words = any(any(map(str.isalpha, cell)) and not _is_missing(cell) for cell in cells)
+    return words and not any(map(_known, cells))
+
+
+def _first_row(lines: Sequence[_Line]) -> tuple[int, int]:
+    """Place and width of the first row that is as wide as most first rows: a number above the table is no row."""
+    places = [*itertools.islice((k for k, (_, cells) in enumerate(lines) if _is_data(cells)), _LAST_LINES)]
+    if not places:
+        return len(lines), max((len(cells) for _, cells in lines), default=0)
+    width = Counter(len(lines[k][1]) for k in places).most_common(1)[0][0]
+    return next(k for k in places if len(lines[k][1]) == width), width
+
+
+def _header(lines: list[_Line], file: str) -> tuple[list[str], list[str], list[_Line]]:
+    """Names, units below them, and rows of equal width, without columns that have neither a name nor a number."""
+    first, width = _first_row(lines)
+    spare = not any(cells[-1] for _, cells in lines[first:] if len(cells) == width)
+    names, below, after = _names(lines[:first], width, spare)
+    if not names:
+        # a damaged first row is an error and no text above the table, and a row of missing samples is a row
+        after = next((k for k in range(first) if len(lines[k][1]) == width and _is_row(lines[k][1])), first)
+    rows = lines[after:]
+    if not rows:
+        raise ValueError(f"{file}: expected rows of numbers, found none")
+    for number, cells in rows:
+        if len(cells) != width:
+            last = not names and len(cells) < width and number == rows[-1][0] and all(map(_known, cells))
+            advice = "; if the samples follow each other along the rows, give column='rows' and dt=" if last else ""
+            raise ValueError(
+                f"{file}, line {number}: expected {width} cells as in the first line, got {len(cells)}{advice}"
+            )
+    kept = [k for k in range(width) if (names and names[k]) or not all(_is_missing(cells[k]) for _, cells in rows)]
+    if not kept or len(kept) == width:  # else empty after a separator at the end of each line
+        return names, below, rows
+    names, below = ([each[k] for k in kept] if each else [] for each in (names, below))
+    return names, below, [(number, [cells[k] for k in kept]) for number, cells in rows]
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether some cells are numbers, or all are missing and not all empty."""
+    return any(map(_known, cells)) or (any(cells) and all(map(_is_missing, cells)))
+
+
+def _names(lines: Sequence[_Line], width: int, spare: bool) -> tuple[list[str], list[str], int]:
+    """Names, units and the place after them: the last line of words as wide as the rows, and a line of units below.
+
+    Separators at the ends of the rows may be missing at the end of the header line, and the other way round. Only then,
+    if the last cells of all rows are empty (`spare`), the header line may have one cell less.
+    """
+    found: list[tuple[int, list[str]]] = []
+    for place, (_, cells) in enumerate(lines):
+        words = list(cells)
+        while len(words) > width and not words[-1]:
+            words.pop()
+        if spare and len(words) == width - 1 and width > 2:
+            words.append("")
+        states = width == 1 and any(read_statements(words))  # a line such as "Time step: 10 ms" names no column
+        if len(words) == width and _is_text(words) and not states:
+            found.append((place, words))
+    if not found:
+        return [], [], len(lines)
+    place, last = found[-1]
+    if len(found) > 1 and found[-2][0] == place - 1 and _are_units(last):
+        return found[-2][1], [cell.strip("[]() ") for cell in last], place + 1
+    return last, [], place + 1
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether a line below a header line has units: all cells are units, one is a unit of time, or all are in brackets.
+
+    Cells that are no known unit are refused when their column is read. A capital S may be the direction south.
+    """
+    given = [cell for cell in cells if cell]
+    units = [cell.strip("[]() ") for cell in given]
+    dimensions = [dimension_of(unit) for unit in units]
+    time = any(unit != "S" and dimension == "time" for unit, dimension in zip(units, dimensions, strict=True))
+    return time or all(dimensions) or all(cell[0] + cell[-1] in ("()", "[]") for cell in given)
+
+
+def _check_names(lines: Sequence[_Line], separator: str, along_rows: bool, file: str) -> None:
+    """Raise ValueError if the line above the rows has half as many names as they have cells, or one name too few.
+
+    Commas then separate cells and decimals, or the rows have names.
+    """
+    first, width = _first_row(lines)
+    (number, names), rows = lines[first - 1], [cells for _, cells in lines[first : first + _LAST_LINES]]
+    half = separator == "," and 2 * len(names) == width and not any("." in cell for cells in rows for cell in cells)
+    short = len(names) == width - 1 > 1 and any(cells[-1] for cells in rows) and not along_rows
+    if first and rows and (half or short) and _is_text(names) and all(names):
+        raise ValueError(
+            f"{file}, line {number}: expected a name for each of the {width} cells in a row, got {len(names)}; write "
+            f"decimal points, or leave out the names of rows, in R with row.names = FALSE. {_POINTS}"
+        )
+
+
+def _with_points(lines: list[_Line], separator: str, file: str) -> tuple[list[_Line], bool]:
+    """Rows with decimal points and without separators of thousands, "" for missing cells; whether commas were decimal.
+
+    Separators of thousands go if a number such as ``1,234.5`` or ``1.234.567`` shows which mark it is. Cells such as
+    ``1,000`` have three decimals unless commas separate the cells and the file has no other decimal comma, or the
+    column has no other decimal comma and integers of three digits: then they are refused.
+    """
+    rows = [(number, ["" if _is_missing(cell) else cell for cell in cells]) for number, cells in lines]
+
+    def cells():
+        return ((number, cell) for number, row in rows for cell in row)
+
+    shown = next(((n, cell) for n, cell in cells() if "," in cell or cell.count(".") > 1 if _GROUPED.match(cell)), None)
+    if shown is not None:
+        mark = next(letter for letter in shown[1] if letter in ",.")
+        decimal = "." if mark == "," else ","
+        grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+(?:\{decimal}\d*)?$")
+        for number, row in rows:
+            for k, cell in enumerate(row):
+                if mark in cell and grouped.match(cell):
+                    row[k] = cell.replace(mark, "")
+                elif mark in cell and _known(cell) and not (is_clock(cell) or is_date(cell)):
+                    raise ValueError(
+                        f"{file}: {mark!r} separates thousands in {shown[1]!r}, line {shown[0]}, but not in {cell!r}, "
+                        f"line {number}; write all numbers alike, without separators of thousands"
+                    )
+    comma = next(((n, cell) for n, cell in cells() if _DECIMAL_COMMA.match(cell)), None)
+    if comma is None:
+        return rows, False
+    columns = [[(number, row[k]) for number, row in rows] for k in range(len(rows[0][1]))]
+    thousands = [next((each for each in column if _THOUSANDS.match(each[1])), None) for column in columns]
+    decimals = [any(_DECIMAL_COMMA.match(c) and not _THOUSANDS.match(c) for _, c in column) for column in columns]
+    for column, found, own in zip(columns, thousands, decimals, strict=True):
+        hundreds = not own and any(_HUNDREDS.match(cell) for _, cell in column)
+        if found and (hundreds or (separator == "," and not any(decimals))):
+            raise ValueError(
+                f"{file}, line {found[0]}: expected a number, got {found[1]!r}, which may have a separator of "
+                "thousands or a decimal comma; write it without separators of thousands and with a decimal point"
+            )
+    if point := next(((n, cell) for n, cell in cells() if "." in cell and is_number(cell)), None):
+        raise ValueError(
+            f"{file}: expected decimal points or decimal commas, got {comma[1]!r} in line {comma[0]} and {point[1]!r} "
+            f"in line {point[0]}; write all numbers alike, without separators of thousands"
+        )
+    return [(n, [cell.replace(",", ".") if _known(cell) else cell for cell in row]) for n, row in rows], True
+
+
+# columns --------------------------------------------------------------------------------------------------------------
+
+
+def _columns(
+    names: list[str], below: list[str], rows: list[_Line], file: str
+) -> tuple[tuple[Column, ...], ClockTime | None]:
+    """Columns of numbers, clock times and text, and the first clock time."""
+    columns, first = [], None
+    for k in range(len(rows[0][1])):
+        cells = [(row[k], f"{file}, line {number}") for number, row in rows]
+        filled = [cell for cell, _ in cells if cell]
+        kind, decimals = "number", 0
+        if any(map(is_clock, filled)):
+            kind, times = "clock", [parse_clock(cell, where) if cell else None for cell, where in cells]
+            values = seconds_since_midnight(times, file)
+            known = [time for time in times if time is not None]
+            first, decimals = first or known[0], max(time.decimals for time in known)
+        elif filled and all(is_date(cell) or _is_word(cell) for cell in filled):
+            kind, values = "text", [math.nan] * len(cells)
+        else:
+            values = [parse_number(cell, where) if cell else math.nan for cell, where in cells]
+            decimals = max(map(decimals_of, filled), default=0)
+        name, unit = names[k] if names else str(k + 1), below[k] if below else ""
+        columns.append(Column(name, np.array(values), decimals, unit, kind))
+    return tuple(columns), first
 
 
 def _is_word(cell: str) -> bool:
@@ -125,42 +463,319 @@ def _is_word(cell: str) -> bool:
     return cell[0] not in "+-.,0123456789" and not is_number(cell)
 
 
-def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:
-    """Return the unit of a column as the file states it, in its name or below the header line, or None.
-
-    With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north.
-    """
-    named = column_unit(table.names[place]) if table.names else None
-    if dimension is not None and _direction(table, place, dimension):
-        named = None
-    below = table.units[place] or None
-    if named is None or below is None:
-        return named or below
-    where = f"{table.file} (name and line of units)"
-    try:
-        stated = find_unit(below).dimension
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-    return agree_on_unit(named, below, stated, where)
-
-
-def _direction(table: Table, place: int, dimension: str) -> bool:
-    """Whether the name of a column ends with the direction north or south, which look like newton and second."""
-    end = table.names[place][-2:] if table.names else ""
-    return (end == "_N" and dimension != "force") or (end == "_S" and dimension != "time")
-
-
-def column_unit(name: str) -> str | None:
+def unit_in_name(name: str) -> str | None:
     """Return the unit at the end of a column name (``acc_cm_s2``, ``force [kip]``, ``acc, g``), or None."""
     name = name[-_LONGEST_UNIT:]
     bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
     parts = name.split("_")
     texts = ["_".join(parts[i:]) for i in range(1, len(parts))] + name.split(", ")[1:][-1:]
     for text in [bracket[1]] if bracket else texts:
-        try:
-            unit = find_unit(text).name
-        except ValueError:
-            continue
-        if unit != "1":  # a number at the end of a name is a counter, not the unit of a strain
+        # a number at the end of a name is a counter, not the unit of a strain
+        if dimension_of(text) and (unit := find_unit(text).name) != "1":
             return unit
     return bracket[1] if bracket else None
+
+
+def stated_unit(table: Table, place: int, dimension: str | None = None) -> str | None:
+    """Return the unit of a column as the file states it, in its name or below the header line, or None.
+
+    With a `dimension` other than force, the N at the end of a name such as ``acc_N`` is the direction north, and an S
+    is the direction south unless it is a time.
+    """
+    column = table.columns[place]
+    end, below = column.name[-2:], column.below or None
+    direction = dimension and ((end == "_N" and dimension != "force") or (end == "_S" and dimension != "time"))
+    named = unit_in_name(column.name) if table.named and not direction else None
+    if named is None or below is None:
+        return named or below
+    dimension = dimension_of(below) or dimension_of(named)
+    return agree_on_unit(named, below, dimension, f"{table.file} (name and line of units)")
+
+
+def value_columns(table: Table) -> list[int]:
+    """Return the places of the columns with values."""
+    return [k for k, column in enumerate(table.columns) if column.kind == "number" and k != table.time]
+
+
+def _listed_columns(table: Table) -> str:
+    if table.named:
+        return f"the columns are {', '.join(column.name for column in table.columns)}"
+    return f"the columns have no names: give a number from 1 to {len(table.columns)}. {_POINTS}"
+
+
+def value_column(table: Table, column: int | str | None = None) -> int:
+    """Return the place of the named column, or of the only column that is not the time."""
+    places = value_columns(table)
+    if column is not None:
+        places = [place for place in places if table.columns[place].name == str(column)]
+    elif not table.named and len(places) > 1:
+        raise ValueError(
+            f"{table.file} has {len(table.columns)} columns and no header line; write one such as 'time_s,acc_g', or "
+            "give column=2 and time_unit='s' if the first column has the times, in seconds; else column=1 and the step "
+            f"dt=; or column='rows' and dt= if the samples follow each other along the rows. {_POINTS}"
+        )
+    if len(places) != 1:
+        which = f" named {column!r}" if column else "; choose it with column="
+        raise ValueError(f"{table.file}: expected one column of values{which}, {_listed_columns(table)}")
+    return places[0]
+
+
+def column_values(table: Table, place: int, missing: Sequence[float] | None = None) -> NDArray[np.float64]:
+    """Return the numbers of a column, with NaN for numbers that are in `missing`.
+
+    ValueError is raised for a number that usually stands for missing samples and is not in `missing`, unless `missing`
+    is empty or the number may have been measured: the column has other numbers within 1 % of it, or, for -999 and the
+    limits of integers, other numbers of half its size, like the samples next to a measured peak.
+    """
+    values, listed = table.columns[place].values, _listed(missing)
+    if missing is not None:
+        values = np.where(np.isin(values, listed), np.nan, values)
+    for sentinel in (*_SENTINELS, *_PLAUSIBLE_SENTINELS) if missing is None or listed.size else ():
+        found = np.flatnonzero(values == sentinel)
+        close = sentinel in _SENTINELS
+        similar = np.abs(values - sentinel) <= 0.01 * abs(sentinel) if close else np.abs(values) >= 0.5 * abs(sentinel)
+        if found.size and np.count_nonzero(similar) == found.size:
+            numbers = ", ".join(f"{number:g}" for number in (*listed, sentinel))
+            raise ValueError(
+                f"{table.file}, line {table.lines[found[0]]}: expected a measured number, got {sentinel:g} in "
+                f"{found.size} rows, which usually stands for a missing sample; give missing=[{numbers}] to read it "
+                "as NaN, or missing=[] if it was measured"
+            )
+    return values
+
+
+def warn_if_absent(table: Table, places: Sequence[int], missing: Sequence[float] | None, stacklevel: int) -> None:
+    """Warn if a number in `missing` is in none of the columns: the file may write it in another way."""
+    listed = _listed(missing)
+    absent = listed[~np.isin(listed, [table.columns[place].values for place in places])]
+    if absent.size:
+        warnings.warn(
+            f"{table.file}: missing={', '.join(f'{number:g}' for number in absent)} is in none of the columns that "
+            "were read: check how the file writes missing samples, or leave it out",
+            UserWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+def _listed(missing: Sequence[float] | None) -> NDArray[np.float64]:
+    """Numbers that stand for missing samples; ValueError if they are not finite numbers."""
+    given = [] if missing is None else [missing] if np.ndim(missing) == 0 else list(missing)
+    if not all(isinstance(number, Real) and math.isfinite(number) for number in given):
+        raise ValueError(f"missing must be finite numbers, such as (-9999,), or () for none; got {missing!r}")
+    return np.array(given, dtype=float)
+
+
+def text_unit(table: Table, place: int, dimension: str, others: bool = False) -> str | None:
+    """Return the unit that comments or the text above a table state for a column of a dimension, or None.
+
+    With other units known (`others`), text that is no unit is ignored, except for counts.
+    """
+    places = value_columns(table)
+    for _, unit in table.stated.units:
+        known = dimension_of(unit)
+        alone = len(places) == 1 and known != "time" and (known or not others or "count" in unit.lower())
+        if alone or known == dimension:
+            return unit
+    if dimension != "acceleration" or others or place not in places:
+        return None
+    names = [table.columns[k].name for k in places]
+    peaks = (peak for peak in table.stated.peaks if peak.unit and peak.printed_of(names, places.index(place)))
+    return next((peak.unit for peak in peaks), None)
+
+
+def column_unit(
+    table: Table, place: int, values: NDArray[np.float64], given: str | None, dimension: str, where: str
+) -> str:
+    """Return the unit of a column, on which file and caller agree; a stated peak is compared with its `values`."""
+    named = stated_unit(table, place, dimension)
+    text = text_unit(table, place, dimension, others=named is not None or given is not None)
+    stated = agree_on_unit(named, text, dimension, f"{where} (column and text)") if named or text else None
+    unit = agree_on_unit(stated, given, dimension, where)
+    if dimension == "acceleration" and not np.isnan(values).any():
+        names, decimals = [table.columns[k].name for k in value_columns(table)], table.columns[place].decimals
+        index = value_columns(table).index(place)
+        check_peaks(table.stated.peaks, names, index, values, decimals, unit, table.file, f". {_SKIP}")
+    return unit
+
+
+# times ----------------------------------------------------------------------------------------------------------------
+
+
+def _time_column(table: Table) -> int | None:
+    """Place of the times: by the name of the column, else a clock, or the first column of a table without names."""
+    kinds = [column.kind for column in table.columns]
+    if not table.named and table.time_unit is not None and len(kinds) > 1:
+        return 0
+    numbers = [k for k, kind in enumerate(kinds) if kind == "number" and table.named]
+    named = (k for form in (_TIME, _STAMP) for k in numbers if form.match(table.columns[k].name))
+    return next(named, kinds.index("clock") if "clock" in kinds else None)
+
+
+def _is_unix(seconds: float) -> bool:
+    return _UNIX_SECONDS[0] <= seconds < _UNIX_SECONDS[1]
+
+
+def _time_unit(table: Table) -> str:
+    column = table.columns[table.time]
+    if column.kind == "clock":
+        return "s"
+    stated = stated_unit(table, table.time)
+    if stated is None and table.time_unit is None:
+        # the unit in which the times are Unix times of this century
+        units = (("s", 1), ("ms", 1e3), ("us", 1e6))
+        unix = next((unit for unit, n in units if _is_unix(column.values[0] / n)), None)
+        if unix is not None and _UNIX.search(column.name):
+            return unix
+        hint = "" if unix is None else f" (for Unix times {unix!r} would fit the numbers)"
+        raise ValueError(
+            f"{table.file}: the column {column.name!r} has no unit; call it time_s or time_ms, or give time_unit={hint}"
+        )
+    return agree_on_unit(stated, table.time_unit, "time", f"{table.file} (times)")
+
+
+def _times(table: Table) -> NDArray[np.float64]:
+    """Times of the rows [s]; ValueError if some are missing, or another column has different times."""
+    unit = _time_unit(table)
+    times = to_si(table.columns[table.time].values, unit, "time")
+    if np.isnan(times).any():
+        line = table.lines[int(np.argmax(np.isnan(times)))]
+        raise ValueError(f"{table.file}, line {line}: expected a time, got an empty cell or NaN; write all times")
+    own = table.columns[table.time]
+    others = [] if table.chosen or not table.named or own.kind == "clock" else table.columns
+    for place, other in enumerate(others):
+        if place == table.time or other.kind != "number" or not (_TIME.match(other.name) or _STAMP.match(other.name)):
+            continue
+        stated = stated_unit(table, place)  # T may be a temperature
+        plain = stated is None and _TIME.match(other.name) and not re.match(r"t(\b|_)", other.name, re.IGNORECASE)
+        if not plain and (stated is None or dimension_of(stated) != "time"):
+            continue
+        digits = (to_si(10.0**-column.decimals, each) for column, each in ((own, unit), (other, stated or unit)))
+        ahead = to_si(other.values, stated or unit, "time") - times
+        ahead = ahead - ahead[0] if _is_unix(abs(ahead[0])) else ahead  # a Unix time beside an elapsed one
+        if not np.all(np.abs(ahead) <= max(map(float, digits))):
+            raise ValueError(
+                f"{table.file}: expected one column of times, the columns {own.name!r} and {other.name!r} have "
+                "different times; write one file for each of them with its columns of values, or name one, time="
+            )
+    return times
+
+
+def row_times(table: Table, dt: float | None = None) -> NDArray[np.float64]:
+    """Return the times of the rows [s]; raise ValueError if the table has none, some are missing, or `dt` is given."""
+    if table.time is None or dt is not None:
+        raise ValueError(
+            f"{table.file}: resample is for uneven times in the file and dt for a file without times; give one of them"
+        )
+    return _times(table)
+
+
+def _uniform_step(table: Table) -> tuple[float, float]:
+    """Return the mean step of the times [s], and the largest error in it that rounding can cause."""
+    times, column = _times(table), table.columns[table.time]
+    if times.size < 2 or not times[-1] > times[0]:
+        raise ValueError(
+            f"{table.file}: expected times that increase over 2 rows or more, got {times.size} row(s); print the times "
+            "with more digits, or leave the column out and give dt="
+        )
+    increments = np.diff(times)
+    step, largest = float(times[-1] - times[0]) / increments.size, float(np.abs(times).max())
+    digit = 10.0**-column.decimals
+    rounding = float(to_si(digit, _time_unit(table))) * (1 + 1e-6)
+    with np.errstate(over="ignore"):  # whether each printed time is a float32, rounded to the printed digits
+        apart = np.abs(column.values.astype(np.float32).astype(np.float64) - column.values)
+    single = 2e-7 * largest if 2e-7 * largest <= 0.25 * step and np.all(apart <= 0.501 * digit) else 0.0
+    # no term may reach a step, otherwise it hides lost samples if the times are large, such as Unix times
+    tolerance = (rounding if rounding <= 0.501 * step else 0.0) + single
+    tolerance += min(1e-4 * step + 4 * float(np.spacing(largest)), 0.1 * step)
+    usual = float(np.median(increments))
+    bad = np.abs(increments - usual) > tolerance
+    off_grid = np.abs(times - times[0] - step * np.arange(times.size))[1:] > tolerance
+    if bad.any() or off_grid.any():
+        index = int(np.argmax(bad) if bad.any() else np.argmax(off_grid))
+        advice = "insert rows with empty cells where the logger has missed samples, print the times with more digits"
+        with contextlib.suppress(ValueError):
+            even = uniform_times(times, None, table.file)
+            advice += f", or give resample={even.step:.6g} to interpolate to a uniform step"
+        raise ValueError(
+            f"{table.file}, line {table.lines[index + 1]}: expected a uniform time step of about {usual:g} s, got "
+            f"{increments[index]:g} s from {times[index]:g} to {times[index + 1]:g} s; {advice}"
+        )
+    tolerance /= increments.size
+    rate = round(1 / step) if 1 / step < 1e15 else 0
+    return (1 / rate if rate and abs(1 / rate - step) < min(tolerance, 1e-4 * step) else step), tolerance
+
+
+def table_step(table: Table, dt: float | None = None) -> float:
+    """Return the time step [s] of a table: from its times, the comment ``dt = ... s`` and the argument, which must
+    agree.
+
+    Printed times are rounded, so each may differ from a uniform grid by one unit of its last digit: half a unit because
+    it is rounded, half a unit because the two ends that define the grid are rounded. If this unit is more than half a
+    step, the tolerance would hide a missing sample, and it is not applied. Times that may have been stored as float32
+    may differ by 2e-7 times the largest time, if this is less than a quarter of a step. Other times must be uniform
+    within 1e-4 of a step and round-off; ValueError otherwise. A whole number of samples per second is used where the
+    mean step corresponds to it within the rounding and a relative 1e-4.
+    """
+    step, tolerance = (None, 0.0) if table.time is None else _uniform_step(table)
+    known = [("the argument dt", dt)] if dt is not None else []
+    known += [(repr(each.text), each.steps[0]) for each in table.stated.steps if len(each.steps) == 1]
+    known += [("the time column", step)] if step is not None else []
+    if not known:
+        unclear = "".join(f", and states {each.text!r} without a unit" for each in table.stated.steps[:1])
+        raise ValueError(
+            f"{table.file} has no times (column time_s) and no comment 'dt = ... s'{unclear}: give dt= in seconds, or "
+            "the column of times, time="
+        )
+    first, chosen = known[0]
+    if step is not None and dt is None and not abs(step - chosen) <= tolerance + 1e-6 * step:
+        first, chosen = known[-1]  # the times show a step that the text rounds
+    if step is not None and not abs(step - chosen) <= tolerance + 1e-6 * step:
+        raise ValueError(
+            f"{table.file}: the step is {chosen} s by {first} but {step} s by the time column; correct one"
+        )
+    for each in table.stated.steps:
+        if not each.fits(chosen, tolerance):
+            raise ValueError(
+                f"{table.file}: the step is {chosen} s by {first} but {each.steps[0]} s by {each.text!r}; correct one, "
+                "or give skip= to leave out text that is about other samples"
+            )
+    return chosen
+
+
+def table_start(table: Table, step: float, zero: float | str = 0.0) -> float:
+    """Return the time of the first row after `zero` [s or clock time]; a file without times begins at time zero.
+
+    With ``zero=0``, a start within the rounding of its printed digits from a whole number of steps is set to this
+    number; for another `zero`, within round-off.
+    """
+    if isinstance(zero, str):
+        zero = _clock_zero(table, zero)
+    if table.time is None:
+        return 0.0 - zero
+    unit, column = _time_unit(table), table.columns[table.time]
+    first, digit = (float(to_si(each, unit)) for each in (column.values[0], 10.0**-column.decimals))
+    start = first - zero
+    rounding = 0.5 * digit * (1 + 1e-6) if zero == 0.0 else 4 * float(np.spacing(max(abs(first), abs(zero))))
+    nearest = round(start / step)
+    return nearest * step if abs(start - nearest * step) <= rounding + 1e-9 * step else start
+
+
+def _clock_zero(table: Table, text: str) -> float:
+    """Return the clock time `zero` in the times of the table [s]; what it does not state is as in the first row."""
+    zero, first = parse_clock(text, "zero"), table.clock
+    column = None if table.time is None else table.columns[table.time]
+    if column is None or column.kind != "clock":
+        if column is None or not _is_unix(to_si(column.values[0], _time_unit(table))):
+            raise ValueError(f"{table.file}: zero={text!r} needs a column of clock times; give zero in seconds")
+        if zero.day is None or zero.zone is None:
+            raise ValueError(
+                f"{table.file}: the times are Unix times: give zero={text!r} with date and time zone, as in "
+                "'2019-07-06T03:19:53Z'"
+            )
+        return unix_seconds(zero)
+    if zero.day is not None and first.day is None:
+        raise ValueError(f"{table.file}: the times have no date; give zero={text!r} without one")
+    if zero.zone is not None and first.zone is None:
+        raise ValueError(f"{table.file}: the times have no time zone; give zero={text!r} without one, as in the file")
+    days = 0 if zero.day is None else zero.day - first.day
+    return 86400 * days + zero.seconds - (0 if zero.zone is None else 60 * (zero.zone - first.zone))

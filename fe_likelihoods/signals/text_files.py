@@ -1,7 +1,6 @@
-"""Shared by the readers of text files: reading, numbers, units and series of samples."""
+"""Shared by the readers of files: bytes and text, numbers, units, and series of samples."""
 
 import codecs
-import itertools
 import math
 import re
 from pathlib import Path
@@ -13,19 +12,16 @@ from numpy.typing import NDArray
 from ..units import DIMENSIONS, find_unit
 
 __all__ = [
-    "LARGEST_FILE",
     "LINE_END",
     "NUMBER",
     "Series",
     "agree_on_unit",
     "check_count",
-    "check_peak",
     "decimals_of",
     "decode_text",
-    "fixed_width_samples",
+    "dimension_of",
     "is_number",
     "number_cells",
-    "opening_text",
     "parse_count",
     "parse_number",
     "read_bytes",
@@ -35,9 +31,7 @@ __all__ = [
 NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 """Regular expression for a decimal number, without alternatives for the same digits: its time is linear."""
 
-LARGEST_FILE = 256 * 2**20
-"""Largest size of a text file or an archive [bytes]; long records have some MiB."""
-
+_LARGEST_FILE = 256 * 2**20  # bytes of a text file or an archive; long records have some MiB
 
 LINE_END = re.compile(r"\r+\n|\r")
 """Regular expression for the end of a line with a carriage return, or two in a text that was transferred twice."""
@@ -46,6 +40,7 @@ _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # What editors and transfers add after the last line: blank lines, ^Z (the end of a text in DOS), zero bytes as padding
 _PADDING = " \t\n\f\0\x1a"
 _CLOSING = re.compile(r"[^\d,;\t]{0,80}(?<![A-Za-z])(?:end|eof)[^\d,;\t]{0,80}", re.IGNORECASE)  # *** End data ***
+_LAST_DECIMALS = re.compile(r"\.(\d+)([eEdD][-+]?\d+)?\s*$")
 _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")  # the letter of double precision
 
 
@@ -63,46 +58,32 @@ def read_bytes(path: str | Path) -> bytes:
     """Return the content of a file; raise ValueError if it cannot be read or is too large."""
     try:
         size = Path(path).stat().st_size
-        if size > LARGEST_FILE:
-            raise ValueError(f"{path}: expected at most {LARGEST_FILE} bytes, got {size}; cut the file")
+        if size > _LARGEST_FILE:
+            raise ValueError(f"{path}: expected at most {_LARGEST_FILE} bytes, got {size}; cut the file")
         return Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; check the path") from error
 
 
 def decode_text(content: bytes) -> str:
-    """Return the text of a file without padding and a closing remark after its last line.
+    """Return the text of a file without padding and closing remarks after its last line.
 
     The text is UTF-8 or UTF-16 with a byte-order mark, UTF-8 where it is valid, else Latin-1. A line such as ``*** End
     data ***`` is a closing remark: it has no number, and no separator of cells. Zero bytes directly after a number are
     kept, so that this number is refused: a table that a crash has cut and padded may have lost its last digits.
     """
-    if content.startswith(_UTF_16):
-        text = content.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = content.decode("latin-1")
-    text = _without_padding(LINE_END.sub("\n", text))
-    while _CLOSING.fullmatch(text, text.rfind("\n") + 1):
-        text = _without_padding(text[: text.rfind("\n") + 1])
-    return text
-
-
-def _without_padding(text: str) -> str:
-    """A text up to the end of its last line, or ^Z; blanks at the end of this line may be empty cells."""
-    last = len(text.rstrip(_PADDING))
-    return text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
-
-
-def opening_text(content: bytes) -> str:
-    """Return the first letters of a file in which its format is recognised; of binary files, one letter per byte."""
-    start = content[:8000]
-    for mark, encoding in ((codecs.BOM_UTF8, "utf-8-sig"), *((each, "utf-16") for each in _UTF_16)):
-        if start.startswith(mark):
-            return start.decode(encoding, errors="replace")
-    return start.decode("latin-1")
+    try:
+        text = content.decode("utf-8-sig") if not content.startswith(_UTF_16) else content.decode("utf-16", "replace")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = LINE_END.sub("\n", text)
+    while True:
+        last = len(text.rstrip(_PADDING))  # blanks at the end of this line may be empty cells
+        text = text[:last] + re.split(r"[\n\f\x1a]", text[last:], maxsplit=1)[0]
+        start = text.rfind("\n") + 1
+        if not _CLOSING.fullmatch(text, start):
+            return text
+        text = text[:start]
 
 
 def read_text(path: str | Path) -> str:
@@ -110,44 +91,27 @@ def read_text(path: str | Path) -> str:
     return decode_text(read_bytes(path)).rstrip("\0\x1a")
 
 
-def number_cells(lines: list[str]) -> list[list[str]]:
-    """Return the fields of lines of numbers, which blanks separate or which touch, as in some Fortran formats.
+def number_cells(line: str) -> list[str]:
+    """Return the fields of a line of numbers, which blanks separate or which touch, as in some Fortran formats.
 
-    Numbers that touch have a decimal point each, and begin with a sign (``-12.34567-0.12345``) or end in the same
-    columns of all lines (``12.34567100.12345``). Other text is one field, which is no number.
+    Numbers that touch have equally many decimals, and begin with a sign (``-12.34567-0.12345``) or are equally wide
+    (`` 12.34567100.12345``). Other text stays one field, which is no number.
     """
-    rows = [[part for field in line.split() for part in _apart(field)] for line in lines]
-    if any(cell.count(".") > 1 for row in rows for cell in row):
-        first = sum(cell.count(".") for cell in rows[0]) == 1  # a line that announces number and step of the others
-        fields = _aligned([line.rstrip() for line in lines[first:]])
-        return rows if fields is None else rows[:first] + fields
-    return rows
+    cells, last = line.split(), _LAST_DECIMALS.search(line)
+    if last is None or all(cell.count(".") < 2 for cell in cells):
+        return cells
+    exponent = r"[eEdD][-+]\d{2,3}" if last[2] else ""
+    fields = re.findall(rf"\s*[-+]?\d*\.\d{{{len(last[1])}}}{exponent}", line)
+    split = len({len(field) for field in fields}) == 1 or all(field[0] in " \t+-" for field in fields[1:])
+    return [field.strip() for field in fields] if split and "".join(fields) == line.rstrip() else cells
 
 
-def _apart(field: str) -> list[str]:
-    """The numbers in a field that begin with a sign; the field if a part of it is no number with a decimal point."""
-    parts = [field] if field.count(".") < 2 else re.split(r"(?<=[\d.])(?=[-+])", field)
-    return parts if all(part.count(".") == 1 for part in parts) else [field]
-
-
-def _aligned(lines: list[str]) -> list[list[str]] | None:
-    """The fields of a Fortran format with three numbers or more, whose points are at equal distances; else None."""
-    points = [[match.start() for match in re.finditer(r"\.", line)] for line in lines]
-    most = max(points, key=len, default=[])
-    if len(most) < 3 or any(found != most[: len(found)] or not found for found in points):
+def dimension_of(unit: str) -> str | None:
+    """Return the dimension of a unit, or None for other text."""
+    try:
+        return find_unit(unit).dimension
+    except ValueError:
         return None
-    width, after = most[1] - most[0], len(lines[0]) - points[0][-1]  # columns of a field, and from its point to its end
-    starts = [point + after - width for point in most]
-    fields = [
-        [line[start : start + width].strip() for start in starts[: len(found)]]
-        for line, found in zip(lines, points, strict=True)
-    ]
-    whole = (
-        len(line) == starts[len(row) - 1] + width and not line[: starts[0]].strip()
-        for line, row in zip(lines, fields, strict=True)
-    )
-    even = all(b - a == width for a, b in itertools.pairwise(most)) and starts[0] >= 0
-    return fields if even and all(whole) and all(is_number(cell) for row in fields for cell in row) else None
 
 
 def agree_on_unit(stated: str | None, given: str | None, dimension: str, file: str | Path) -> str:
@@ -174,13 +138,23 @@ def check_count(found: int, stated: int, where: str) -> None:
         raise ValueError(f"{where} announces {stated} samples, the file has {found}; it is truncated or damaged")
 
 
-def check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
-    """Raise ValueError if the stated peak is not the peak of the samples."""
-    if not abs(found - stated) <= tolerance:
-        raise ValueError(
-            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
-            "another form than the one that is read here"
-        )
+def _as_float(field: str) -> float:
+    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
+    if "_" in field:
+        raise ValueError
+    try:
+        return float(field)
+    except ValueError:
+        return float(_FORTRAN_EXPONENT.sub("e", field))
+
+
+def is_number(field: str) -> bool:
+    """Return whether a field of a file is a number."""
+    try:
+        _as_float(field)
+    except ValueError:
+        return False
+    return True
 
 
 def parse_number(field: str, where: str) -> float:
@@ -195,30 +169,11 @@ def parse_number(field: str, where: str) -> float:
     return value
 
 
-def fixed_width_samples(
-    lines: list[str], start: int, count: int, form: tuple[int, int], file: str, first: int = 1
-) -> NDArray[np.float64]:
-    """Return `count` samples in Fortran columns, which may touch, from line index `start` on; `form` is (numbers per
-    line, columns per number), `first` the file's number of the first line.
-
-    Raises ValueError if a line has too few or too many numbers.
-    """
-    per_line, width = form
-    values: list[float] = []
-    for k in range(start, start - (-count // per_line)):
-        line, where = (lines[k].rstrip() if k < len(lines) else ""), f"{file}, line {first + k}"
-        wanted = min(per_line, count - len(values))
-        if math.ceil(len(line) / width) != wanted:
-            raise ValueError(
-                f"{where}: expected {wanted} numbers of {width} columns after {len(values)} of {count} samples, got "
-                f"{math.ceil(len(line) / width)}; the file is truncated or damaged"
-            )
-        values += [parse_number(line[i * width : (i + 1) * width].strip(), where) for i in range(wanted)]
-    if len(values) < 2:
-        raise ValueError(f"{file}: expected two samples or more, the file announces {count}")
-    if len(line) % width and len(lines[start].rstrip()) % width == 0:  # the last line ends within a number
-        raise ValueError(f"{where}: expected numbers of {width} columns, the last one is cut; the file is truncated")
-    return np.array(values)
+def parse_count(digits: str, where: str) -> int:
+    """Return a number of samples, channels or columns; raise ValueError for more than 12 digits."""
+    if len(digits) > 12:
+        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
+    return int(digits)
 
 
 def decimals_of(field: str) -> int:
@@ -229,29 +184,3 @@ def decimals_of(field: str) -> int:
     mantissa, _, exponent = field.lower().replace("d", "e").partition("e")
     power = int(exponent or 0) if len(exponent) < 6 else 0  # a larger exponent belongs to zero
     return min(max(len(mantissa.partition(".")[2]) - power, -300), 300)
-
-
-def is_number(field: str) -> bool:
-    """Return whether a field of a file is a number."""
-    try:
-        _as_float(field)
-    except ValueError:
-        return False
-    return True
-
-
-def parse_count(digits: str, where: str) -> int:
-    """Return a number of samples, channels or columns; raise ValueError for more than 12 digits."""
-    if len(digits) > 12:
-        raise ValueError(f"{where}: expected a count, got a number with {len(digits)} digits")
-    return int(digits)
-
-
-def _as_float(field: str) -> float:
-    """A number, also with an exponent of Fortran (1.0D-03); ValueError for digits grouped by underscores."""
-    if "_" in field:
-        raise ValueError
-    try:
-        return float(field)
-    except ValueError:
-        return float(_FORTRAN_EXPONENT.sub("e", field))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .sampling import check_step
 
-__all__ = ["UniformTimes", "uniform_times", "without_repeated_times"]
+__all__ = ["UniformTimes", "uniform_times"]
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
@@ -26,9 +26,7 @@ class UniformTimes(NamedTuple):
     note: str  # what is done, for the description of the data
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n_steps,) at the uniform times, linear between known samples and NaN in gaps and beyond the
-        last.
-        """
+        """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
         known = np.flatnonzero(~np.isnan(values))
         if known.size == 0:
             return np.full(self.uniform.size, np.nan)
@@ -43,9 +41,7 @@ class UniformTimes(NamedTuple):
         return np.where(apart, np.where(near, values[known][nearest], np.nan), found)
 
     def straight(self, values: NDArray[np.float64], where: str, stacklevel: int) -> NDArray[np.float64]:
-        """Return values (n_steps,) at the uniform times, with straight lines over gaps and a warning about them in
-        `where`.
-        """
+        """Values (n_steps,) at the uniform times, with straight lines over gaps and a warning about them."""
         if self.gaps.size:
             warnings.warn(
                 f"{where}: {self.note}; an excitation needs all samples, so the gaps are straight lines: compare with "
@@ -80,27 +76,13 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
             f"{where}: expected the nominal step of the samples, about {usual:.4g} s, got resample={step:g}; resample "
             "the record or decimate the measurements afterwards"
         )
-    gaps = increments[increments > _GAP * usual]
-    others = increments[increments <= _GAP * usual]
+    gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
-    if times[-1] - times[0] > 2 * times.size * step:
+    duration = times[-1] - times[0]
+    if duration > 2 * times.size * step:
         raise ValueError(
-            f"{where}: expected samples at most times, got {times.size} in {times[-1] - times[0]:.4g} s with a gap of "
+            f"{where}: expected samples at most times, got {times.size} in {duration:.4g} s with a gap of "
             f"{gaps.max():.4g} s; cut the file at its long gaps"
         )
-    uniform = times[0] + step * np.arange(int((times[-1] - times[0]) / step + 1e-6) + 1)
-    return UniformTimes(times, step, uniform, usual, gaps, note)
-
-
-def without_repeated_times(
-    times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
-    """Return times and samples of a digitised record with the mean of the samples of equal times, and what was done.
-
-    Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
-    """
-    first = np.concatenate([[True], np.diff(times) != 0.0])
-    number = np.cumsum(first) - 1
-    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
-    return times[first], np.bincount(number, weights=values) / np.bincount(number), note
+    return UniformTimes(times, step, times[0] + step * np.arange(int(duration / step + 1e-6) + 1), usual, gaps, note)

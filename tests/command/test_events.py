@@ -14,7 +14,7 @@ from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
 from fe_likelihoods.prediction.prediction import Prediction
-from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.read import read_csv
 from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
 

@@ -65,6 +65,17 @@ def test_what_a_file_does_not_state_must_be_written(tmp_path):
     assert listed(path)[1]["record"]["dt"] == "? s"
 
 
+@pytest.mark.parametrize("line", ["# units: gal", "Units: gal", "RAW PGA VALUES (gal) : 4.0"])
+def test_a_unit_above_the_table_is_listed_as_it_is_read(tmp_path, line):
+    path = tmp_path / "a.csv"
+    path.write_text(f"{line}\ntime_s,base\n0.00,1\n0.01,2\n0.02,-4\n")
+    output, lines = listed(path)
+    assert "base     gal        3" in output and "units" not in lines["record"] and "units" not in lines["measurements"]
+    record, measured = read_as_listed(lines)
+    np.testing.assert_array_equal(record.acceleration, measured.values[0])
+    assert record.acceleration[2] == -0.04
+
+
 def written(path, lines):
     path.write_text("\n".join(lines))
     return path

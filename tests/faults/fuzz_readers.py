@@ -29,7 +29,7 @@ import numpy as np
 from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
 from fe_likelihoods.command.listing import describe_data
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
+from fe_likelihoods.signals.read import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from fe_likelihoods.units import G0
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, STEP
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc

@@ -8,7 +8,7 @@ import pytest
 
 from fe_likelihoods import Channel, Measurements, Record
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
+from fe_likelihoods.signals.read import read_at2, read_csv, read_v2
 from fe_likelihoods.units import G0
 from tests.faults.fuzz_readers import fuzz, wrong_in_silence, zipped
 from tests.signals.test_readers import cosmos

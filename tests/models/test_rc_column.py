@@ -37,7 +37,7 @@ from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column import PARAMETERS
 from fe_likelihoods.models.rc_column_parts import Patches
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
-from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.units import G0
 from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
 

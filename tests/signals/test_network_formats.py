@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import read_record
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
+from fe_likelihoods.signals.read import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from fe_likelihoods.units import G0
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, write_at2
@@ -237,7 +237,8 @@ def test_v1_with_uneven_times(tmp_path):
     lines[27] = lines[27].replace("  0.010", "  0.013")
     with pytest.raises(ValueError, match="samples are at uneven times; give their nominal step, resample=0.01"):
         read_record(write(tmp_path / "a.V1", lines))
-    assert read_record(tmp_path / "a.V1", resample=0.01).dt == 0.01
+    record = read_record(tmp_path / "a.V1", resample=0.01)
+    assert record.dt == 0.01 and record.source.startswith("a.V1; interpolated linearly to a step of 0.01 s")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import read_record
-from fe_likelihoods.signals.readers import read_csv, read_obspy
+from fe_likelihoods.signals.read import read_csv, read_obspy
 
 VALUES = np.sin(0.3 * np.arange(200.0)).astype(np.float32)
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.signals.measurement_readers import read_columns, read_imposed_test
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_v2
+from fe_likelihoods.signals.read import read_at2, read_columns, read_csv, read_imposed_test, read_v2
 from fe_likelihoods.units import G0, to_si
 
 # Peak ground acceleration [g], number of samples and step [s]: the table in the README of the records.
@@ -205,7 +204,7 @@ class TestCSV:
                 "points or decimal commas, got '0,0' in line 2 and '0.5' in line 3",
             ),
             ("time_s;acc_g\n0.0;1.0\n", {}, "times that increase over 2 rows or more, got 1 row"),
-            ("0.0;1.0\n0.1;2.0\n", {}, "2 columns and no header line; .* or give time_unit="),
+            ("0.0;1.0\n0.1;2.0\n", {}, "2 columns and no header line; .* or give column=2 and time_unit="),
             ("time_s,acc_g\n0,one\n0.5,2\n1,3\n", {}, "line 2: expected a number, got 'one'"),
             ("Time;acc_g\n5.3.2024 10h32;1.0\n5.3.2024 10:32:08;2.0\n", {}, "a clock time such as"),
             ("0,one\n0.5,2\n1,3\n", {"units": "g", "time_unit": "s"}, "line 1: expected a number, got 'one'"),
@@ -589,6 +588,7 @@ class TestColumns:
 
     def test_excel_without_its_package(self, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "openpyxl", None)
+        (tmp_path / "a.xlsx").write_bytes(b"PK")
         with pytest.raises(ValueError, match="install it with pip install openpyxl, or save the sheet as CSV"):
             read_csv(tmp_path / "a.xlsx")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 
 

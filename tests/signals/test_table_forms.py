@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns, read_record
-from fe_likelihoods.signals.readers import read_csv
-from fe_likelihoods.signals.tables import column_unit
+from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.tables import unit_in_name
 from fe_likelihoods.units import G0
 
 TOP = Channel("top", "acceleration", "g")
@@ -38,7 +38,7 @@ def path(tmp_path):
     ],
 )
 def test_units_in_names(name, unit):
-    assert column_unit(name) == unit
+    assert unit_in_name(name) == unit
 
 
 def test_letters_of_directions_are_no_units(path):

@@ -10,7 +10,7 @@ import pytest
 
 from fe_likelihoods import Channel, read_columns, read_record
 from fe_likelihoods.command.listing import describe_data
-from fe_likelihoods.signals.readers import read_at2, read_csv, read_geonet
+from fe_likelihoods.signals.read import read_at2, read_csv, read_geonet
 from fe_likelihoods.units import G0
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
 from tests.signals.test_readers import cosmos, csmip
@@ -189,7 +189,7 @@ def test_a_damaged_row_never_shortens_the_samples(tmp_path, place, mark):
         assert intact.n_steps == (39 if rows is ROWS else 15)
 
 
-@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3"])
+@pytest.mark.parametrize("row", ["0.5-103-0.6-103", "12.34567100.123", "1.2.3", "0.092-0.07730"])
 def test_numbers_that_may_be_split_in_two_ways_are_refused(tmp_path, row):
     for before in ("1.00000   2.00000", "1.00000   2.00000   3.00000", ""):
         with pytest.raises(ValueError, match="expected"):
@@ -201,7 +201,7 @@ def test_numbers_that_may_be_split_in_two_ways_are_refused(tmp_path, row):
 
 def advised(error):
     """The alternatives of a message, as arguments."""
-    found = re.search(r"or give (?:the number .* such as )?(.*?)\. Numbers with", str(error.value))[1]
+    found = re.search(r"or give (.*?)\. Numbers with", str(error.value))[1]
     plain = {"units": "g"}
     for choice in re.split(r"; ", found):
         given = dict(re.findall(r"(column|time_unit)='?(\w+)'?", choice))
@@ -217,12 +217,15 @@ def test_arguments_proposed_for_a_table_without_a_header_line_work(tmp_path, wid
     path.write_text(text(*(" ".join(f"{value:g}" for value in row) for row in values)))
     with pytest.raises(ValueError, match=f"{width} columns and no header line") as error:
         read_record(path, units="g")
-    choices = list(advised(error))
-    assert len(choices) == 3 if times else 2
-    records = [read_record(path, **given) for given in choices]
+    with_times, *choices = advised(error)
     if times:
-        np.testing.assert_array_equal(records[0].acceleration, values[:, 1] * G0)
-        assert records.pop(0).dt == 0.02
+        record = read_record(path, **with_times)
+        np.testing.assert_array_equal(record.acceleration, values[:, 1] * G0)
+        assert record.dt == 0.02
+    else:
+        with pytest.raises(ValueError, match="expected (a uniform time step|times that increase)"):
+            read_record(path, **with_times)
+    records = [read_record(path, **given) for given in choices]
     np.testing.assert_array_equal(records[0].acceleration, values[:, 0] * G0)
     np.testing.assert_array_equal(records[1].acceleration, values.ravel() * G0)
     measured = read_columns(path, [TOP], [width], "g", dt=0.01)
@@ -298,6 +301,12 @@ def test_the_header_of_an_afad_file_states_everything(tmp_path):
         (text("Units: counts", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "unknown unit 'counts'"),
         (text("Peak acceleration: 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak acceleration: 2.5 g'"),
         (text("Samples: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Samples: 3' announces 3 samples, the file has 2"),
+        (text("Scans in file: 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Scans in file: 3' announces 3 samples"),
+        (text("Anzahl Werte = 3", "acc_g", "1", "2"), {"dt": 0.01}, "'Anzahl Werte = 3' announces 3 samples"),
+        (text("Peak value = 2.5 g", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Peak value = 2.5 g'"),
+        (text("Max. value (gal): 2.5", "acc_g", "1.0", "2.0"), {"dt": 0.01}, "states 'Max. value .gal.: 2.5'"),
+        (text("Einheit: gal", "acc", "1", "2"), {"dt": 0.01, "units": "g"}, "states the unit 'gal' but units = 'g'"),
+        (text("Abtastrate: 200,5 Hz", "acc_g;x", "1,5;1", "2,5;1"), {"dt": 0.005, "column": "acc_g"}, "but 0.00498"),
         (text("fs: 50", "acc_g", "1", "2"), {"dt": 0.01}, "but 0.02 s by 'fs: 50'"),
         (
             text("PGA (g),1.0", "acc_g", "1.0", "2.0"),
@@ -330,6 +339,12 @@ def test_a_contradiction_of_what_a_header_states_is_refused(tmp_path, content, g
         ("fs = 200 Hz", 0.005),
         ("Rate, 0.2 kHz", 0.005),
         ("2 points at equal spacing of 0.005 sec", 0.005),
+        ("Abtastintervall: 5 ms", 0.005),
+        ("Abtastrate (Hz);200", 0.005),
+        ("Zeitschritt = 0.005 s", 0.005),
+        ("Fréquence d'échantillonnage : 200 Hz", 0.005),
+        ("Frecuencia de muestreo: 200 Hz", 0.005),
+        ("Pas de temps (s) : 0.005", 0.005),
     ],
 )
 def test_the_stated_step_is_used(tmp_path, line, step):
@@ -352,6 +367,10 @@ def test_the_stated_step_is_used(tmp_path, line, step):
         "Scan interval: 10 min",
         "Samples per second: 100",
         "Peak velocity: 12.5 cm/s",
+        "Peak value: 12.5",
+        "Max. value = 7.3 cm",
+        "Abtastrate: 100 Hz",
+        "Scans in file: 3",
         "PGA: 4",
         "PGA (g): 4.0",
         "Peak acc.: -39.2 m/s2 at 0.02 s",
@@ -393,6 +412,11 @@ def test_arguments_must_agree_with_a_file_that_states_them(tmp_path, form, unit)
     for key, value in (("time_unit", "s"), ("time", "t"), ("skip", 2), ("missing", (-999.0,))):
         with pytest.raises(ValueError, match=f"states its times and samples; leave {key} out"):
             read_record(tmp_path / name, **{key: value})
+
+
+def test_decimal_commas_of_a_table_are_those_of_its_header(tmp_path):
+    record = read(tmp_path, "a.txt", text("Abtastintervall: 2,5 ms", "Zeit [s];a [g]", "0,0000;1,5", "0,0025;2,5"))
+    assert record.dt == 0.0025
 
 
 def test_text_about_other_samples_is_left_out_by_skip(tmp_path):
@@ -484,7 +508,7 @@ def test_the_advice_for_repeated_times_of_smc_works(tmp_path):
     np.testing.assert_allclose(record.acceleration, 1e-2 * expected, atol=2e-3)
     more = smc(values, 200.0)
     path.write_text(text(*more, more[-2]))
-    with pytest.raises(ValueError, match="the header announces 61 numbers, the file has more"):
+    with pytest.raises(ValueError, match="announces 61 samples but has more after them"):
         read_record(path)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns
-from fe_likelihoods.signals.readers import read_csv
+from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.signals.uneven_times import uniform_times
 from fe_likelihoods.units import G0
 

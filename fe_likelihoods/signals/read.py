@@ -1,0 +1,517 @@
+"""Readers of ground motions and measured responses: files of strong-motion networks, CSV files, Excel workbooks.
+
+`read_record` and `read_columns` recognise the format; a reader of one format that is given another one names it in its
+error. Everything is converted to SI units. Unit and time step come from the file or the arguments; ValueError is raised
+if neither states them or if they disagree.
+"""
+
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..units import to_si
+from . import strong_motion
+from .channels import Channel, Measurements
+from .records import DisplacementHistory, Record
+from .tables import (
+    WORKBOOKS,
+    Table,
+    column_unit,
+    column_values,
+    read_table,
+    row_times,
+    table_start,
+    table_step,
+    value_column,
+    warn_if_absent,
+)
+from .text_files import Series, agree_on_unit, read_bytes, read_text
+from .uneven_times import uniform_times
+
+__all__ = [
+    "ImposedTest",
+    "read_at2",
+    "read_columns",
+    "read_csv",
+    "read_esm",
+    "read_geonet",
+    "read_imposed_test",
+    "read_knet",
+    "read_obspy",
+    "read_record",
+    "read_smc",
+    "read_v2",
+    "recognise_reader",
+]
+
+_TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
+
+
+def read_record(
+    path: str | Path,
+    channel: int | str | None = None,
+    units: str | None = None,
+    missing: Sequence[float] | None = None,
+    member: str | None = None,
+    resample: float | None = None,
+    *,
+    dt: float | None = None,
+    column: int | str | None = None,
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+) -> Record:
+    """Read a ground motion from a file in any supported format, which is recognised by the first lines.
+
+    The formats are PEER AT2, CSMIP and COSMOS V1 and V2, USGS SMC, GeoNet, K-NET and KiK-net, ESM and ITACA; miniSEED,
+    SAC and GSE2 by the package obspy; CSV files with a header line such as ``time_s,acc_g``, and Excel workbooks.
+
+    In tables, commas, semicolons, tabs or blanks separate cells. Decimal commas are read where commas do not separate.
+    The text is UTF-8, UTF-16 with a byte-order mark, or Latin-1. The unit is the suffix of the column name (``acc_g``,
+    ``acc_cm_s2``, ``acc [m/s²]``, ``acc, g``), a cell in a line of units below the header line, the comment ``# units:
+    g``, or `units`; if several are given, they must agree. Times must be uniform within the rounding of the printed
+    digits. The first sample of the record is at time zero, even if the times in the file begin later.
+
+    What comments and the text above a table state is used, and must agree with the arguments and the samples: step or
+    rate (``# dt = 0.02 s``, ``Sampling rate: 200 Hz``), number of samples (``npts = 1559``, ``NUMBER OF DATA: 1559``),
+    unit and peak acceleration (``PGA (gal): 312.8``). A step without its unit is compared only. Blocks of samples below
+    a line with their number and step, as of eqsig and RSPMatch, are read; such a file does not state the unit.
+
+    Parameters
+    ----------
+    path : str or path
+        A file, or a zip archive of CSMIP and COSMOS V2 files. Archives may contain archives; V1 files in them, which
+        are uncorrected, are read if there are no V2 files. Lines of a table that start with ``#`` are comments.
+    channel : int or str, optional
+        Number of a channel at the station, or name of a file in the archive (V2), component such as ``"S16W"``
+        (GeoNet), end of the name of a trace such as ``"HNZ"`` (miniSEED), or column of a table, where there are
+        several.
+    units : str, optional
+        Unit of the acceleration, if an AT2, CSV, miniSEED or SAC file does not state it.
+    missing : sequence of float, optional
+        Numbers in a table that stand for missing samples; they are read as NaN, which an excitation must not have. A
+        warning names the numbers that the column does not have. If not listed, -9999, -999.25, 1e30 and 9.97e36 are
+        refused unless further numbers lie within 1 % of them; -999, 99999, -99999, 32767 and -32768 unless a further
+        number has half their size. ``()`` takes all numbers as measured.
+    member : str, optional
+        End of a file name in the archive, such as ``"Free Field.zip/CHAN012.V2"``, if several have the channel.
+    resample : float, optional
+        Nominal step of uneven times [s], to which the samples are interpolated linearly. The source of the record says
+        what was done, and a warning names gaps, which are filled by straight lines.
+    dt : float, optional
+        Time step [s], needed for a file without times.
+    column : int or str, optional
+        Another name of `channel`: name of the column, or its number from 1 in a file without a header line. ``"rows"``
+        takes the numbers of a file without a header line row after row, as those of the Fortran format ``8F10.5``.
+    time : str or int, optional
+        Name or number of the column of times, if it is not found. Other columns that look like times are then ignored.
+    time_unit : str, optional
+        Unit of the times, if the column name does not end with it. Without a header line, the first column then has the
+        times, unless `time` is another one.
+    skip : int, optional
+        Number of lines above the table, if they are not found. What they state is ignored.
+
+    Returns
+    -------
+    Record
+        The ground motion, named after the file, the trace or the channel. Samples of K-NET are without their mean.
+
+    Raises
+    ------
+    ValueError
+        If the file, column or channel does not exist or several match (the message lists them), unit or step are
+        missing or contradictory, a cell is no finite number or is empty, a time step is irregular (the message names
+        the first one), the samples are not as many or do not have the peak that the file states, or the format is
+        known and not read.
+
+    Examples
+    --------
+    >>> record = read_record("logger.csv", column="base", units="g")
+    """
+    if channel is not None and column is not None:
+        raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
+    channel = column if channel is None else channel
+    return _read(
+        path, None, units, dt, channel, member, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
+    )
+
+
+def read_csv(
+    path: str | Path,
+    units: str | None = None,
+    dt: float | None = None,
+    column: int | str | None = None,
+    *,
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+    resample: float | None = None,
+) -> Record:
+    """Read a ground motion from a table as `read_record` does; files of other formats are refused."""
+    return _read(
+        path, "read_csv", units, dt, column, None, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
+    )
+
+
+def read_at2(path: str | Path, units: str | None = None) -> Record:
+    """Read a ground motion from a PEER AT2 file as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_at2", units)
+
+
+def read_v2(
+    path: str | Path, channel: int | None = None, member: str | None = None, resample: float | None = None
+) -> Record:
+    """Read a channel of V1 or V2 files as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_v2", channel=channel, member=member, resample=resample)
+
+
+def read_smc(path: str | Path, resample: float | None = None) -> Record:
+    """Read a ground motion from a USGS SMC file as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_smc", resample=resample)
+
+
+def read_geonet(path: str | Path, component: str | None = None) -> Record:
+    """Read one component of a GeoNet V1A or V2A file as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_geonet", channel=component)
+
+
+def read_knet(path: str | Path) -> Record:
+    """Read a ground motion from a K-NET or KiK-net file as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_knet")
+
+
+def read_esm(path: str | Path) -> Record:
+    """Read a ground motion from an ESM or ITACA file as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_esm")
+
+
+def read_obspy(path: str | Path, units: str | None = None, channel: str | None = None) -> Record:
+    """Read a miniSEED, SAC or GSE2 file by obspy as `read_record` does; files of other formats are refused."""
+    return _read(path, "read_obspy", units, channel=channel)
+
+
+def recognise_reader(path: str | Path, expected: str | None = None) -> str | None:
+    """Return the name of the function that reads a file or zip archive; None for a table (CSV, Excel).
+
+    Raises ValueError if the file cannot be read, or has a known format without a reader, or not the `expected` one.
+    """
+    content = read_bytes(path)
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        return None if Path(path).suffix.lower() in WORKBOOKS else "read_v2"
+    name, reader = strong_motion.recognise(content)
+    table = expected == "read_csv" and reader == "read_at2"  # lines such as NPTS=3, DT=0.01 may stand above a table
+    if name and (reader is None or expected not in (None, reader)) and not table:
+        article = "an" if name.startswith(("ESM", "HDF5")) else "a"
+        advice = f": read it with {reader}" if reader else ", which is not read; take a file of another format"
+        raise ValueError(f"{path}: this looks like {article} {name} file{advice}")
+    return reader
+
+
+def _read(
+    path: str | Path,
+    expected: str | None,
+    units: str | None = None,
+    dt: float | None = None,
+    channel: int | str | None = None,
+    member: str | None = None,
+    resample: float | None = None,
+    **table: Any,
+) -> Record:
+    """The record in a file, at the call depth below a public reader that its warnings expect.
+
+    `table` has time, time_unit, skip and missing, the options of tables.
+    """
+    found = recognise_reader(path, expected)
+    reader = expected or found or "read_csv"
+    file, name = str(path), Path(path).name if reader == "read_knet" else Path(path).stem
+    if reader == "read_csv":
+        try:
+            series, dt = _table_series(path, units, dt, channel, resample, **table), None
+        except ValueError as error:
+            if expected or Path(path).suffix.lower() in _TABLES:
+                raise
+            raise ValueError(
+                f"{error}. The file has no known format of ground motions and was read as a table"
+            ) from error
+    elif unused := ", ".join(name for name, option in table.items() if option is not None):
+        raise ValueError(f"{path}: a file for {reader} states its times and samples; leave {unused} out")
+    elif reader == "read_v2":
+        block = _v2_channel(path, channel, member)
+        series, file = strong_motion.parse_v2(block), block.file
+    elif reader == "read_obspy":
+        series = strong_motion.parse_obspy(path, channel)
+    elif reader == "read_geonet":
+        series = _geonet_component(path, channel)
+    else:
+        series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
+    unit = agree_on_unit(series.unit, units, "acceleration", file)
+    # The source has the file name without its folder, because it is written into data sets that are shared.
+    source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
+    if reader in ("read_v2", "read_geonet", "read_obspy"):
+        name = series.title
+    if reader == "read_v2":
+        source = file.removeprefix(f"{Path(path).parent}/")
+    if series.times is not None:
+        even = uniform_times(series.times, resample, file)
+        if resample is None:
+            raise ValueError(
+                f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
+            )
+        source, step, values = f"{source}; {even.note}", resample, even.straight(values, file, stacklevel=3)
+    elif resample is not None:
+        raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
+    if dt is not None and not abs(dt - step) <= 1e-6 * step:
+        raise ValueError(
+            f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
+        )
+    return Record(name, step, to_si(values, unit, "acceleration"), source)
+
+
+def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> strong_motion.Block:
+    """The channel with a number; a text is a number too, or the name of a file in the archive."""
+    if isinstance(channel, str):
+        channel, member = (int(channel), member) if channel.isdecimal() else (None, channel)
+    candidates = strong_motion.find_v2_channels(path, member)
+    chosen = [each for each in candidates if channel is None or each.channel == channel]
+    if len(chosen) != 1:
+        listing = "\n  ".join(f"channel {each.channel}: {each.label} [{each.file}]" for each in chosen or candidates)
+        raise ValueError(
+            f"{path}: expected one channel with channel = {channel}, member = {member!r}, found {len(chosen)}; "
+            "choose with channel= and member=, or in a TOML file with the end of a file name as column, among\n  "
+            f"{listing}"
+        )
+    return chosen[0]
+
+
+def _geonet_component(path: str | Path, component: int | str | None) -> Series:
+    found = strong_motion.parse_geonet(read_text(path), str(path))
+    chosen = [series for name, series in found if component is None or name.lower() == str(component).lower()]
+    if len(chosen) != 1:
+        raise ValueError(
+            f"{path}: expected one component with component = {component!r}, found {len(chosen)}; the components are "
+            f"{', '.join(name for name, _ in found)}"
+        )
+    return chosen[0]
+
+
+def _table_series(
+    path: str | Path,
+    units: str | None,
+    dt: float | None,
+    column: int | str | None,
+    resample: float | None,
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+) -> Series:
+    """One column of a table, checked against what the file states."""
+    table = read_table(path, skip, time_unit, time, along_rows=column == "rows")
+    rows = column == "rows" and "rows" not in [each.name for each in table.columns]
+    place = value_column(table, None if rows else column)
+    values = column_values(table, place, missing)
+    unit = column_unit(table, place, values, units, "acceleration", table.file)
+    warn_if_absent(table, [place], missing, stacklevel=4)
+    absent = np.flatnonzero(np.isnan(values))
+    if absent.size:
+        raise ValueError(
+            f"{table.file}, line {table.lines[absent[0]]}: expected a number, got an empty cell or NaN; an excitation "
+            f"needs all samples, {absent.size} are missing: interpolate them, or cut the file"
+        )
+    step, times = (table_step(table, dt), None) if resample is None else (np.nan, row_times(table, dt))
+    return Series(table.title, step, unit, values, times)
+
+
+# measured responses ---------------------------------------------------------------------------------------------------
+
+
+class ImposedTest(NamedTuple):
+    """A laboratory test with an imposed displacement.
+
+    Attributes
+    ----------
+    history : DisplacementHistory
+        The imposed displacement.
+    measurements : Measurements
+        The channels measured at its steps. ``measurements.dt`` is 1, one step.
+    """
+
+    history: DisplacementHistory
+    measurements: Measurements
+
+
+def read_columns(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str | int],
+    units: str | Sequence[str] | None = None,
+    dt: float | None = None,
+    description: str = "",
+    *,
+    time: int | str | None = None,
+    time_unit: str | None = None,
+    skip: int | None = None,
+    zero: float | str = 0.0,
+    missing: Sequence[float] | None = None,
+    resample: float | None = None,
+) -> Measurements:
+    """Read measured responses from the columns of a table, a CSV file or workbook as `read_record` reads it.
+
+    Accelerations are also read from the files of strong-motion networks, with the numbers or names of their channels as
+    `columns`, such as those of a structure in a zip archive of V2 files. An empty cell, ``NaN``, ``NA``, ``N/A``,
+    ``#N/A``, ``NULL``, ``-`` or ``--`` is a missing sample.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    channels : sequence of Channel
+        The measured channels.
+    columns : sequence of str or int
+        Names of the columns in the header line, or without one their numbers, from 1; one per channel.
+    units : str or sequence of str, optional
+        Unit of the numbers, one for all columns or one per column. Not needed if the names of the columns end with the
+        unit (``disp_in``). If both are given, they must agree.
+    description : str, optional
+        Description of the measurements.
+    zero : float or str, optional
+        Time in the file at which the excitation begins [s]. For clock times, which count from midnight, it may be a
+        clock time, such as ``"03:19:53.37"`` or ``"2019-07-06T03:19:53.37"``, in the time zone of the file unless it
+        states another one (``"03:19:53Z"``, ``"05:19:53+02:00"``).
+    dt, time, time_unit, skip, missing, resample : optional
+        As in `read_record`. Missing samples, and those in gaps of uneven times, are NaN.
+
+    Returns
+    -------
+    Measurements
+        The channels. They start at the first time of the file minus `zero`, so a file that begins at 0.37 s keeps this
+        time; give ``zero=0.37`` if the excitation begins with it.
+
+    Raises
+    ------
+    ValueError
+        As `read_record`, or if a unit has another dimension than its channel.
+
+    Examples
+    --------
+    >>> top = Channel("top", "acceleration", "g")
+    >>> measured = read_columns("logger.csv", [top], ["a_top"], units="g", time_unit="s")
+    """
+    if (reader := recognise_reader(path)) is not None:
+        if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
+            raise ValueError(
+                f"{path}: a file for {reader} states units and times; leave units, dt, time, time_unit, skip and "
+                "missing out"
+            )
+        return _recorded(path, channels, columns, description, zero, resample)
+    table = read_table(path, skip, time_unit, time)
+    values = _channel_values(table, channels, columns, units, missing)
+    warn_if_absent(table, [value_column(table, column) for column in columns], missing, stacklevel=2)
+    if resample is None:
+        step = table_step(table, dt)
+    else:
+        even, step = uniform_times(row_times(table, dt), resample, table.file), resample
+        values = np.array([even.interpolate(row) for row in values])
+        description = ", ".join(filter(None, (description, even.note)))
+    return Measurements(tuple(channels), step, values, description, table_start(table, step, zero))
+
+
+def _recorded(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Sequence[str | int],
+    description: str,
+    zero: float | str,
+    resample: float | None,
+) -> Measurements:
+    """Measured accelerations in a file of a strong-motion network or a zip archive of such files."""
+    if isinstance(columns, str) or len(channels) != len(columns):
+        raise ValueError(f"expected one channel of {path} for each of {len(channels)} channels, got {columns!r}")
+    if isinstance(zero, str):
+        raise ValueError(f"{path} has no clock times; give zero in seconds after its first sample, got {zero!r}")
+    if other := next((channel for channel in channels if channel.dimension != "acceleration"), None):
+        raise ValueError(
+            f"{path}: accelerations are read from files of this format, and the channel {other.name!r} is a "
+            f"{other.dimension}; leave it out, or write its samples to a CSV file"
+        )
+    records = [read_record(path, column, resample=resample) for column in columns]
+    labels = [f"{channel.name} is {record.name}" for channel, record in zip(channels, records, strict=True)]
+    text = ", ".join(filter(None, (description, *labels)))
+    steps, rows = [record.dt for record in records], [record.acceleration for record in records]
+    return Measurements(tuple(channels), steps, rows, text, 0.0 - zero)
+
+
+def read_imposed_test(
+    path: str | Path,
+    displacement: str,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None = None,
+    displacement_unit: str | None = None,
+    description: str = "",
+    *,
+    skip: int | None = None,
+    missing: Sequence[float] | None = None,
+) -> ImposedTest:
+    """Read a quasi-static laboratory test from a CSV file: the imposed displacement, and channels at its steps.
+
+    Parameters
+    ----------
+    displacement : str
+        Name of the column with the imposed displacement.
+    displacement_unit : str, optional
+        Unit of the displacement, if the column name does not end with it.
+    path, channels, columns, units, description, skip, missing
+        As in `read_columns`.
+
+    Returns
+    -------
+    ImposedTest
+        The history, named after the file, and the measurements.
+
+    Raises
+    ------
+    ValueError
+        As `read_columns`, except for times, which the test does not have.
+
+    Examples
+    --------
+    >>> force = Channel("base", "force", "kN")
+    >>> test = read_imposed_test("cyclic.csv", "disp_mm", [force], ["force_kN"])
+    """
+    table = read_table(path, skip)
+    imposed = Channel(displacement, "displacement", displacement_unit or "m")
+    (history,) = _channel_values(table, (imposed,), (displacement,), displacement_unit, missing)
+    values = _channel_values(table, channels, columns, units, missing)
+    places = [value_column(table, column) for column in (displacement, *columns)]
+    warn_if_absent(table, places, missing, stacklevel=2)
+    measurements = Measurements(tuple(channels), 1.0, values, description)
+    return ImposedTest(DisplacementHistory(Path(path).stem, history, Path(path).name), measurements)
+
+
+def _channel_values(
+    table: Table,
+    channels: Sequence[Channel],
+    columns: Sequence[str],
+    units: str | Sequence[str] | None,
+    missing: Sequence[float] | None,
+) -> NDArray[np.float64]:
+    """Columns of a table in SI units (n_channels, n_rows)."""
+    given = [units] * len(columns) if units is None or isinstance(units, str) else list(units)
+    if isinstance(columns, str) or not len(channels) == len(columns) == len(given):
+        raise ValueError(
+            f"expected one column and one unit for each of {len(channels)} channels, got columns {columns!r}, "
+            f"units {units!r}; the unit of the times is given by time_unit="
+        )
+    rows = []
+    for channel, column, unit in zip(channels, columns, given, strict=True):
+        place = value_column(table, column)
+        values, where = column_values(table, place, missing), f"{table.file}, column {column!r}"
+        rows.append(to_si(values, column_unit(table, place, values, unit, channel.dimension, where)))
+    return np.array(rows)

@@ -1,0 +1,726 @@
+"""Files of strong-motion networks: which format a file has, and its samples as they are.
+
+Each parser returns plain numbers with the unit, the step and the title that the file states, and converts nothing. The
+stated number of samples and the stated peak are compared with the samples, so that a file with another layout is
+refused instead of misread. Fortran columns have no separators: they are split by width, never at blanks.
+
+PEER AT2
+    Header lines with NPTS and DT, then free-format samples.
+CSMIP V2
+    Per channel 25 lines of text, an integer header, a real header (100 numbers in columns of 10), and blocks of
+    acceleration, velocity and displacement. Each block starts with a line such as
+    ``3000 POINTS OF ACCEL DATA EQUALLY SPACED AT  .020 SEC.  (UNITS: CM/SEC/SEC)``, each channel ends with ``/&``.
+CSMIP V1
+    Per channel 13 lines of text, an integer header (100 numbers in columns of 5), and a real header (50 numbers in
+    columns of 10; the third is the length [s], the seventh the peak [g]). Then follow ``13200 Accelerogram points at
+    200 pts/sec in units of g.  Format: (8f9.6)`` and samples, or pairs of a time [s] and a sample in columns of 7, with
+    the unit in the text.
+COSMOS V1 and V2 (format 1.20)
+    Headers that state their length and Fortran format, then
+    ``42000 acceleration pts, approx  210 secs, units=cm/sec2(04),Format=(1E15.6)``.
+USGS SMC
+    11 lines of text, 48 integers in columns of 10, 50 reals in columns of 15, comment lines with ``|``, samples in
+    columns of 10 [cm/s²]; times [s] alternate with samples where the number of samples per second is missing.
+    Format description: U.S. Geological Survey, National Strong-Motion Program, "SMC-format data files",
+    ``smcfmt.html``.
+GeoNet V1A, V2A
+    Per component 16 lines of text, 40 integers and 60 reals in columns of 8, then accelerations [mm/s²], and in V2A
+    velocities and displacements, in columns of 8. Format description: W. J. Cousins (2008), "GNS accelerogram data
+    files, standard format"; GeoNet, "Strong motion file formats".
+K-NET, KiK-net
+    17 lines of names and values, then counts, which are multiplied by the stated scale factor. The mean is subtracted,
+    as in the stated peak. Format description: National Research Institute for Earth Science and Disaster Resilience,
+    "About K-NET ASCII format".
+ESM, ITACA (DYNA 1.x)
+    Lines ``NAME: value``, then one sample per line. Format description: ITACA development team, "DYNA 1.0".
+miniSEED, SAC, GSE2
+    Read by the package obspy.
+"""
+
+import codecs
+import io
+import lzma
+import math
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..units import to_si
+from .clock_times import is_clock
+from .header_statements import check_peaks, read_statements
+from .text_files import (
+    LINE_END,
+    NUMBER,
+    Series,
+    agree_on_unit,
+    check_count,
+    decimals_of,
+    decode_text,
+    is_number,
+    number_cells,
+    parse_count,
+    parse_number,
+    read_bytes,
+)
+
+__all__ = [
+    "Block",
+    "find_v2_channels",
+    "parse_at2",
+    "parse_esm",
+    "parse_geonet",
+    "parse_knet",
+    "parse_obspy",
+    "parse_smc",
+    "parse_v2",
+    "recognise",
+]
+
+_LOOK = 40  # lines in which a format is recognised
+_READERS = {
+    "PEER AT2": "read_at2",
+    "CSMIP or COSMOS V1": "read_v2",
+    "CSMIP or COSMOS V2": "read_v2",
+    "USGS SMC": "read_smc",
+    "GeoNet": "read_geonet",
+    "K-NET or KiK-net": "read_knet",
+    "ESM or ITACA": "read_esm",
+    "miniSEED": "read_obspy",
+    "GSE2": "read_obspy",
+    "SAC": "read_obspy",
+}
+
+
+# which format ---------------------------------------------------------------------------------------------------------
+
+
+def recognise(content: bytes) -> tuple[str, str | None]:
+    """Return the name of a file's format (empty if unknown), and of the function that reads it (None if not read)."""
+    start, encoding = content[:8000], "latin-1"  # of binary files, one letter per byte
+    for mark, name in (
+        (codecs.BOM_UTF8, "utf-8-sig"),
+        (codecs.BOM_UTF16_LE, "utf-16"),
+        (codecs.BOM_UTF16_BE, "utf-16"),
+    ):
+        encoding = name if start.startswith(mark) else encoding
+    text = start.decode(encoding, errors="replace")
+    lines = LINE_END.sub("\n", text).splitlines()
+    name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)
+    return name, _READERS.get(name)
+
+
+def _is_table(lines: list[str]) -> bool:
+    """Whether two successive lines have numbers between commas, semicolons or tabs, which no format here has."""
+    before = False
+    for line in lines:
+        separator = next((each for each in (";", "\t", ",") if each in line), None)
+        cells = [] if separator is None else [cell.strip() for cell in line.split(separator)]
+        numbers = len(cells) > 1 and all(is_number(cell.replace(",", ".")) or is_clock(cell) for cell in cells)
+        if numbers and before:
+            return True
+        before = numbers
+    return False
+
+
+def _name_of(lines: list[str], text: str) -> str:
+    first, head = next((line.strip() for line in lines), ""), "\n".join(lines)
+    version = text[304:308].encode("latin-1", "replace")  # in the header of SAC, 632 bytes
+
+    def begins(pattern: str) -> bool:
+        return bool(re.match(pattern, first, re.IGNORECASE))
+
+    rules = (
+        ("HDF5", text.startswith("\x89HDF")),
+        ("K-NET or KiK-net", first.startswith("Origin Time") and "Scale Factor" in head),
+        ("ESM or ITACA", first.startswith("EVENT_NAME:") and "SAMPLING_INTERVAL_S:" in head),
+        ("USGS SMC", bool(re.match(r"[0-9] +(UN)?CORRECTED ACCELEROGRAM", first))),
+        ("USGS SMC without acceleration", bool(re.match(r"[0-9] +(VELOCITY|DISPLACEMENT|RESPONSE|UNKNOWN)", first))),
+        ("GeoNet", begins(r"(un)?corrected accelerogram") and any(line.startswith("Site ") for line in lines[1:2])),
+        ("COSMOS V0 (raw acceleration)", begins("raw acc") and "Format v0" in first),
+        ("CSMIP or COSMOS V1", begins(r"uncorrected acceler(ation\b|ogram)")),
+        ("CSMIP or COSMOS V2", begins("corrected acc")),
+        ("CSMIP V3 (spectra)", begins("response and fourier")),
+        ("BHRC V1", first.startswith("* VOL1DS FILE")),
+        ("LabVIEW TDMS", text.startswith("TDSm")),
+        ("MATLAB", text.startswith("MATLAB 5.0 MAT-file")),
+        ("gzip", text.startswith("\x1f\x8b")),
+        ("PDF", text.startswith("%PDF")),
+        ("web page (HTML)", begins(r"<(!doctype )?html\b")),
+        ("miniSEED", bool(re.match(r"\d{6}[DRQM][ \0]|MS\x03", text))),
+        ("GSE2", text.startswith("WID2 ")),
+        ("SAC", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[:1] + version[-1:]),
+        ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
+        ("Taiwan CWB or SMART", first.startswith("#StationCode")),
+        ("binary", "\0" in text.rstrip("\0\x1a\r\n ") and not text.startswith("PK")),  # no workbook
+    )
+    return next((name for name, fits in rules if fits), "")
+
+
+# numbers in Fortran columns -------------------------------------------------------------------------------------------
+
+
+class Block(NamedTuple):
+    """Lines of a file, or of one channel in it. The form of a block of columns is (numbers per line, width)."""
+
+    file: str  # with the archive that contains it
+    lines: list[str]
+    first: int = 1  # number of the first line in the file
+    channel: int | str | None = None  # number at the station, or direction of a component
+    label: str = ""
+
+    def where(self, place: int) -> str:
+        """File and line for a message."""
+        return f"{self.file}, line {self.first + place}"
+
+    def field(self, start: int, form: tuple[int, int], place: int) -> str:
+        """Text of the number at a position, from 0, of a header in columns from the line with index `start`."""
+        row, column = divmod(place, form[0])
+        line = self.lines[start + row] if 0 <= start + row < len(self.lines) else ""
+        field = line[column * form[1] : (column + 1) * form[1]].strip()
+        parse_number(field, self.where(start + row))
+        return field
+
+    def header(self, start: int, count: int, form: tuple[int, int]) -> tuple[list[float], int]:
+        """Numbers of a header, and the index of the line after them."""
+        return [float(self.field(start, form, place)) for place in range(count)], start - (-count // form[0])
+
+    def samples(self, start: int, count: int, form: tuple[int, int], last: bool = True) -> NDArray[np.float64]:
+        """Samples in columns, which may touch. `last`: no further numbers may follow."""
+        (per_line, width), values, line = form, [], ""
+        end = start - (-count // per_line)
+        for k in range(start, end):
+            line = self.lines[k].rstrip() if k < len(self.lines) else ""
+            wanted, found = min(per_line, count - len(values)), math.ceil(len(line) / width)
+            if found != wanted:
+                raise ValueError(
+                    f"{self.where(k)}: expected {wanted} numbers of {width} columns after {len(values)} of {count} "
+                    f"samples, got {found}; the file is truncated or damaged"
+                )
+            values += [parse_number(line[i * width :][:width].strip(), self.where(k)) for i in range(wanted)]
+        if len(values) < 2:
+            raise ValueError(f"{self.file}: expected two samples or more, the file announces {count}")
+        if len(line) % width and len(self.lines[start].rstrip()) % width == 0:  # the last line ends within a number
+            raise ValueError(
+                f"{self.where(end - 1)}: expected numbers of {width} columns, the last one is cut; it is truncated"
+            )
+        following = next((line for line in self.lines[end:] if line.strip()), "")
+        if last and is_number(following[:width].strip()):
+            raise ValueError(f"{self.where(start)}: the file announces {count} samples but has more after them")
+        return np.array(values)
+
+    def form_at_the_end_of(self, place: int) -> tuple[int, int] | None:
+        """The Fortran format at the end of a line; None without one."""
+        stated = _FORMAT.search(self.lines[place].rstrip()[-100:])
+        if stated is None:
+            return None
+        form = parse_count(stated[1] or "1", self.where(place)), parse_count(stated[2], self.where(place))
+        if not all(0 < each <= _WIDEST for each in form):
+            raise ValueError(
+                f"{self.where(place)}: expected a format of 1 to {_WIDEST} numbers and columns, got {stated[0]!r}"
+            )
+        return form
+
+
+_FORMAT = re.compile(r"\(\s*(\d*)\s*[a-z](\d+)\.\d+[^)]*\)$", re.IGNORECASE)
+_WIDEST = 1000
+
+
+def _check_peak(found: float, stated: float, tolerance: float, where: str) -> None:
+    """ValueError if the stated peak is not the peak of the samples."""
+    if not abs(found - stated) <= tolerance:
+        raise ValueError(
+            f"{where}: the header states a peak of {stated:g}, the samples have {found:g}; the file is damaged, or of "
+            "another form than the one that is read here"
+        )
+
+
+def _whole(number: float, file: str, what: str) -> int:
+    """A number of lines or samples."""
+    if not 0.0 <= number < 1e9 or abs(number - round(number)) > 1e-6:
+        raise ValueError(f"{file}: expected a number of {what}, got {number:g}")
+    return round(number)
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(np.abs(values).max())
+
+
+def _without_repeated_times(
+    times: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
+    """Times and samples of a digitised record with the mean of the samples of equal times, and what was done.
+
+    Such samples are closer to each other than the printed digits of their times show. Times that decrease stay.
+    """
+    first = np.concatenate([[True], np.diff(times) != 0.0])
+    number = np.cumsum(first) - 1
+    note = "" if first.all() else f", mean of samples of equal times ({int((~first).sum())})"
+    return times[first], np.bincount(number, weights=values) / np.bincount(number), note
+
+
+# PEER -----------------------------------------------------------------------------------------------------------------
+
+# Expressions are searched from one place in a line, and their parts never match the same text: their time is linear.
+_AT2_COUNT = re.compile(r"NPTS\s*=\s*(\d+)\b", re.IGNORECASE)
+_AT2_STEP = re.compile(rf"\bDT\s*=\s*({NUMBER})\s*([a-z]*)", re.IGNORECASE)
+_AT2_OLD = re.compile(rf"\s*(\d+)\s+({NUMBER})\s*(?:,\s*)?NPTS\s*,\s*DT", re.IGNORECASE)
+_SECONDS = frozenset({"", "s", "sec", "secs", "second", "seconds"})
+_UNITS_OF = re.compile(r"UNITS?\s*(?:OF|ARE|IS|:|=)\s*[(\[]?\s*([^\s,;()\[\]]+?)[)\]]?[.]?(?=[\s,;]|$)", re.IGNORECASE)
+
+
+def parse_at2(text: str, file: str) -> Series:
+    """Return the samples of a PEER AT2 file, in the new or old form of its header."""
+    lines = text.splitlines()
+    index, stated = next(((i, found) for i, line in enumerate(lines) if (found := _at2_header(line))), (None, None))
+    if index is None:
+        raise ValueError(
+            f"{file}: expected a header line 'NPTS=  4096, DT=  .0100 SEC' or '4096  .0100  NPTS, DT', found none in "
+            f"{len(lines)} lines; read plain columns of numbers with read_csv"
+        )
+    units = _UNITS_OF.search("\n".join(lines[:index]))
+    rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]
+    while rows and re.search("[A-Za-z]{3}", rows[-1][1]) and not any(map(is_number, rows[-1][1].split())):
+        rows.pop()  # a closing remark in any words: the number of samples is stated
+    cells = [(f"{file}, line {number}", cell) for number, row in rows for cell in number_cells(row)]
+    values = [parse_number(cell, where) for where, cell in cells]
+    where = f"{file}: NPTS in line {index + 1}"
+    check_count(len(values), parse_count(stated[0], where), where)
+    if stated[2].lower() not in _SECONDS:
+        raise ValueError(
+            f"{file}, line {index + 1}: expected DT in seconds, such as 'DT= .0100 SEC', got {stated[1]} {stated[2]}; "
+            "write it in seconds"
+        )
+    title = lines[index - 2].strip() if index >= 2 else ""
+    return Series(title, float(stated[1]), units[1] if units else None, np.array(values))
+
+
+def _at2_header(line: str) -> tuple[str, str, str] | None:
+    """Number of samples, step and unit of the step, as stated in a line of an AT2 header; None for other lines."""
+    if (count := _AT2_COUNT.search(line)) and (step := _AT2_STEP.search(line)):
+        return count[1], step[1], step[2]
+    old = _AT2_OLD.match(line)
+    return (old[1], old[2], "") if old else None
+
+
+# CSMIP and COSMOS -----------------------------------------------------------------------------------------------------
+
+_CSMIP_DATA = re.compile(rf"^\s*(\d+)\s+points\s+of\s+accel\s+data\s+equally\s+spaced\s+at\s*({NUMBER})", re.IGNORECASE)
+_CSMIP_UNITS = re.compile(r"units:\s*([^\s)]+)|\bin\s+([^\s.,]+)", re.IGNORECASE)
+_COSMOS_DATA = re.compile(r"^\s*(\d+)\s+acceleration\s+pts\b.*?units\s*=\s*([^\s,(]+)", re.IGNORECASE)
+_COSMOS_REALS = re.compile(r"^\s*(\d+)\s+real-header\s+values\s+follow\s+on\s+(\d+)\s+lines", re.IGNORECASE)
+_END = re.compile(r"^\s*(/&|end-of-data)", re.IGNORECASE)
+_V1_FIRST = re.compile(r"\s*uncorrected accelerogram", re.IGNORECASE)
+_V1_DATA = re.compile(
+    rf"^\s*(\d+)\s+accelerogram\s+points\s+at\s*({NUMBER})\s*pts/sec\s+in\s+units\s+of\s+(\S+?)\s*\.", re.IGNORECASE
+)
+_V1_UNITS = re.compile(r"units\s+of\s+uncor\s+\w+\s+are\s+sec\s+and\s+(g/10|g)\b", re.IGNORECASE)
+_V1_TEXT, _V1_INTEGERS, _V1_REALS, _V1_PAIRS = 13, (16, 5), (8, 10), (10, 7)  # lines; forms of blocks
+_V1_REAL_START = _V1_TEXT + math.ceil(100 / 16)  # lines before the 50 reals
+_V1_HEADER = _V1_REAL_START + math.ceil(50 / 8)
+_V2_TEXT, _CSMIP_FORM, _CSMIP_REALS = 25, (8, 10), 100
+# positions in headers, from 0: step of V2 files; number, length and peak of V1 files
+_CSMIP_DT, _COSMOS_DT, _V1_COUNT, _V1_LENGTH, _V1_PEAK = 60, 33, 27, 2, 6
+# Limits of a zip archive and its contents: bytes, files, nested archives. Stations have a few MiB.
+_LARGEST_CONTENT, _MOST_FILES, _DEEPEST, _MOST_LINES = 64 * 2**20, 2000, 3, 4_000_000
+_ZIP_DAMAGE = (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError, KeyError, IndexError) + (
+    OverflowError,
+    MemoryError,
+    struct.error,
+    zlib.error,
+    lzma.LZMAError,
+    UnicodeError,
+)
+
+
+def find_v2_channels(path: str | Path, member: str | None = None) -> list[Block]:
+    """Return the channels with acceleration in a V1 or V2 file, or in the V2, else V1 files of an archive."""
+    content = read_bytes(path)
+    files = [(str(path), content)]
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        files = list(dict.fromkeys(_unzip(content, str(path), str(path), [_MOST_FILES, _LARGEST_CONTENT])))
+    if member is not None:
+        exact = [(name, data) for name, data in files if name == f"{path}/{member}"]
+        files = exact or [(name, data) for name, data in files if name.lower().endswith(member.lower())]
+    elif len(files) > 1:  # corrected acceleration, if there is any
+        corrected, raw = (
+            [(name, data) for name, data in files if name.lower().endswith(ends)]
+            for ends in ((".v2", ".v2c"), (".v1", ".v1c"))
+        )
+        files = corrected or raw
+    channels = [channel for name, data in files for channel in _split_v2(decode_text(data), name)]
+    if not channels:
+        raise ValueError(
+            f"{path}: expected a CSMIP or COSMOS V1 or V2 file with a line 'N POINTS OF ACCEL DATA EQUALLY SPACED AT "
+            f"...', 'N acceleration pts ...' or 'Uncorrected accelerogram', found none in {len(files)} file(s)"
+            + (f" named {member!r}" if member else "")
+        )
+    return sorted(channels, key=lambda each: (each.channel is None, each.channel or 0))
+
+
+def _unzip(content: bytes, name: str, archive: str, left: list[int], depth: int = 1) -> Iterator[tuple[str, bytes]]:
+    """Yield the names and contents of the files in a zip archive, and in the archives that it contains.
+
+    `left` is how many files and bytes may still be read, for all nested archives together.
+    """
+    if depth > _DEEPEST:
+        raise ValueError(
+            f"{name}: expected at most {_DEEPEST} archives within each other; unpack it and read the files"
+        )
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as opened:
+            infos = opened.infolist()
+            left[:] = left[0] - len(infos), left[1] - sum(info.file_size for info in infos)
+            if min(left) < 0:
+                raise ValueError(
+                    f"{archive}: expected at most {_MOST_FILES} files with {_LARGEST_CONTENT} bytes in all, got more; "
+                    "unpack the archive and read the files"
+                )
+            for info in infos:
+                inner = f"{name}/{info.filename}"
+                if info.filename.lower().endswith(".zip"):
+                    yield from _unzip(opened.read(info), inner, archive, left, depth + 1)
+                elif not info.is_dir():
+                    yield inner, opened.read(info)
+    except _ZIP_DAMAGE as error:
+        raise ValueError(f"{name}: the zip archive cannot be read ({error}); download it again") from error
+
+
+def _split_v2(text: str, file: str) -> list[Block]:
+    """The channels of a V2 file, without channels of velocity and displacement (in COSMOS files)."""
+    if text.count("\n") > _MOST_LINES:
+        raise ValueError(f"{file}: expected at most {_MOST_LINES} lines, got {text.count(chr(10))}")
+    channels, lines, first = [], text.splitlines(), 0
+    for index, line in enumerate(lines):
+        end = _END.match(line)
+        if not end and index < len(lines) - 1:
+            continue
+        block = lines[first : index + (not end)]
+        if _is_v1(block) or any(_CSMIP_DATA.match(each) or _COSMOS_DATA.match(each) for each in block):
+            head = "\n".join(block[:25])
+            number = re.search(r"STA CHN:\s*(\d+)", head, re.IGNORECASE)
+            label = re.search(r"^\s*(?:STA )?CHAN\s*(\d+|\?)\s*:[^\n]*", head, re.IGNORECASE | re.MULTILINE)
+            if number is None and label is not None and label[1] != "?":
+                number = label
+            title = re.sub(r"\s+", " ", label[0]).strip() if label else Path(file).name
+            channels.append(Block(file, block, first + 1, parse_count(number[1], file) if number else None, title))
+        first = index + 1
+    return channels
+
+
+def _is_v1(lines: list[str]) -> bool:
+    """Whether the lines of a channel are in the CSMIP format V1."""
+    first = bool(lines and _V1_FIRST.match(lines[0])) and len(lines) > _V1_HEADER
+    return first and not any(map(_CSMIP_DATA.match, lines))
+
+
+def parse_v2(block: Block) -> Series:
+    """Return the acceleration of one channel."""
+    where, lines = block.file, block.lines
+    if _is_v1(lines):
+        return _parse_v1(block)
+    index = next(i for i, line in enumerate(lines) if _CSMIP_DATA.match(line) or _COSMOS_DATA.match(line))
+    line = lines[index]
+    if re.match(r"\s*raw", lines[0], re.IGNORECASE):
+        raise ValueError(
+            f"{where}: expected acceleration, got {lines[0].strip()!r}, counts of a recorder; take V1 or V2"
+        )
+    if _V1_FIRST.match(lines[0]):
+        raise ValueError(f"{where}: expected corrected acceleration in this form, got {lines[0].strip()!r}")
+    form = block.form_at_the_end_of(index)
+    if csmip := _CSMIP_DATA.match(line):
+        units = _CSMIP_UNITS.search(line, csmip.end())
+        unit, form = units and (units[1] or units[2]), form or _CSMIP_FORM
+        dt = _header_step(block, index - math.ceil(_CSMIP_REALS / _CSMIP_FORM[0]), _CSMIP_FORM, _CSMIP_DT)
+        # The data line has the step with three decimals only, the real header may have more.
+        if abs(dt - float(csmip[2])) > 0.51e-3:
+            raise ValueError(
+                f"{block.where(index)}: the step is {csmip[2]} s here but {dt} s in the real header; correct one"
+            )
+        if unit is None:
+            raise ValueError(f"{block.where(index)}: expected the unit of acceleration in {line.strip()!r}")
+    else:
+        unit = _COSMOS_DATA.match(line)[2]
+        header = next((i for i in range(index) if _COSMOS_REALS.match(lines[i])), None)
+        header_form = block.form_at_the_end_of(header) if header is not None else None
+        if header_form is None:
+            raise ValueError(f"{where}: expected a line 'N Real-header values follow on N lines, Format= (5F15.6)'")
+        if form is None:
+            raise ValueError(f"{block.where(index)}: expected a Format such as (8F10.5) in {line!r}")
+        dt = _header_step(block, header + 1, header_form, _COSMOS_DT)
+    count = parse_count((csmip or _COSMOS_DATA.match(line))[1], block.where(index))
+    values = block.samples(index + 1, count, form)
+    if csmip:
+        decimals = decimals_of(lines[index + 1][: form[1]].strip())
+        check_peaks(read_statements(lines[:_V2_TEXT]).peaks, ("",), 0, values, decimals, unit, where)
+    uncorrected = ", uncorrected" if re.match(r"\s*uncorrected", lines[0], re.IGNORECASE) else ""
+    return Series(block.label + uncorrected, dt, unit, values)
+
+
+def _header_step(block: Block, start: int, form: tuple[int, int], place: int) -> float:
+    """The time step at a position, from 0, of a real header."""
+    value = float(block.field(start, form, place))
+    if not value > 0:
+        raise ValueError(
+            f"{block.where(start)}: number {place + 1} of the real header must be the time step [s], got {value}"
+        )
+    return value
+
+
+def _parse_v1(block: Block) -> Series:
+    """The uncorrected acceleration of one channel: at a constant rate, or with times."""
+    where, line = block.file, block.lines[_V1_HEADER]
+    length, peak = (block.field(_V1_REAL_START, _V1_REALS, place) for place in (_V1_LENGTH, _V1_PEAK))
+    times, note = None, ""
+    if match := _V1_DATA.match(line):
+        dt, unit, form = 1.0 / float(match[2]), match[3], block.form_at_the_end_of(_V1_HEADER)
+        if form is None or not 0.0 < dt < math.inf:
+            raise ValueError(f"{block.where(_V1_HEADER)}: expected a rate and a Format in {line!r}")
+        count = parse_count(match[1], where)
+        values = block.samples(_V1_HEADER + 1, count, form)
+        if abs(count * dt - float(length)) > 2.0 * dt:
+            raise ValueError(
+                f"{where}: {count} samples at {1 / dt:g} per second are not {length} s; the file is damaged"
+            )
+        printed = block.lines[_V1_HEADER + 1][: form[1]]
+    else:
+        found = _V1_UNITS.search("\n".join(block.lines[:_V1_TEXT]))
+        if found is None:
+            raise ValueError(f"{where}: expected 'Units of uncor data are sec and g' or 'g/10' in {_V1_TEXT} lines")
+        unit, width = found[1], _V1_PAIRS[1]
+        count = parse_count(block.field(_V1_TEXT, _V1_INTEGERS, _V1_COUNT), where)
+        pairs = block.samples(_V1_HEADER, 2 * count, _V1_PAIRS)
+        times, values, printed = pairs[::2], pairs[1::2], line[width : 2 * width]
+        dt, digit = float(times[-1] - times[0]) / max(count - 1, 1), 10.0 ** -decimals_of(line[:width].strip())
+        if dt > 0.0 and np.all(np.abs(times - times[0] - dt * np.arange(count)) <= digit):
+            rate, times = round(1.0 / dt), None
+            dt = 1.0 / rate if rate and abs(1.0 / rate - dt) <= digit / (count - 1) else dt
+    scale = 0.1 if unit.lower() == "g/10" else 1.0
+    if unit.lower() in ("g", "g/10"):
+        unit = "g" if scale == 0.1 else unit
+        rounding = 0.505 * (scale * 10.0 ** -decimals_of(printed.strip()) + 10.0 ** -decimals_of(peak))
+        _check_peak(scale * _largest(values), abs(float(peak)), rounding, where)
+    if times is not None:
+        dt, (times, values, note) = math.nan, _without_repeated_times(times, values)
+    return Series(f"{block.label}, uncorrected{note}", dt, unit, scale * values, times)
+
+
+# USGS and GeoNet ------------------------------------------------------------------------------------------------------
+
+_SMC_NULL = 1.6e38  # larger reals stand for missing values
+_SMC_TYPES = {"1": "UNCORRECTED ACCELEROGRAM", "2": "CORRECTED ACCELEROGRAM"}
+_SMC_TEXT, _SMC_INTEGERS, _SMC_REALS, _SMC_DATA = 11, (8, 10), (5, 15), (8, 10)
+_GEONET_TEXT, _GEONET_HEADERS, _GEONET_DATA, _MOST_COMPONENTS = 16, (10, 8), (10, 8), 100
+_GEONET_PEAK = re.compile(rf"Acceleration:\s*peak\s*({NUMBER})\s*mm/s/s", re.IGNORECASE)
+_GEONET_STEP = re.compile(rf"\bat\s+(?:intervals\s+of\s+)?({NUMBER})\s*s", re.IGNORECASE)
+_GEONET_UNIT = re.compile(rf"in\s+units\s+of\s+({NUMBER})\s*mm/s/s", re.IGNORECASE)
+
+
+def parse_smc(text: str, file: str) -> Series:
+    """Return the samples of a USGS SMC file, uncorrected or corrected."""
+    block = Block(file, text.splitlines())
+    title = block.lines[0].strip() if block.lines else ""
+    number, _, kind = title.partition(" ")
+    if _SMC_TYPES.get(number) != kind.strip():
+        raise ValueError(
+            f"{file}: expected the first line '1 UNCORRECTED ACCELEROGRAM' or '2 CORRECTED ACCELEROGRAM' of an SMC "
+            f"file, got {title[:80]!r}"
+        )
+    integers, start = block.header(_SMC_TEXT, 48, _SMC_INTEGERS)
+    reals, start = block.header(start, 50, _SMC_REALS)
+    comments, count = (_whole(integers[place], file, what) for place, what in ((15, "comment lines"), (16, "samples")))
+    rate, highest, lowest = reals[1], reals[29], reals[31]
+    uneven = rate >= _SMC_NULL  # pairs of time and acceleration
+    if not rate > 0.0 or (uneven and count % 2):
+        raise ValueError(
+            f"{file}: expected a positive number of samples per second as the second real, or none for an even number "
+            f"of times and accelerations, got {rate:g} and {count} numbers"
+        )
+    if not all(line.startswith("|") for line in block.lines[start : start + comments]):
+        raise ValueError(f"{file}: expected {comments} comment lines that start with '|'; the file is damaged")
+    values, times, note = block.samples(start + comments, count, _SMC_DATA), None, ""
+    if uneven:
+        times, values = values[::2], values[1::2]
+    for stated, found in ((highest, values.max()), (lowest, values.min())):
+        if abs(stated) < _SMC_NULL:
+            _check_peak(found, stated, 2e-4 * _largest(values), file)
+    if uneven:
+        times, values, note = _without_repeated_times(times, values)
+    station = next((line.strip() for line in block.lines[2:_SMC_TEXT] if line.startswith("station")), title)
+    return Series(re.sub(r"\s+", " ", station) + note, math.nan if uneven else 1.0 / rate, "cm/s2", values, times)
+
+
+def parse_geonet(text: str, file: str) -> list[tuple[str, Series]]:
+    """Return the directions, such as ``"S16W"`` or ``"Up"``, and samples of a GeoNet V1A or V2A file."""
+    block, place, found = Block(file, text.splitlines()), 0, []
+    while any(line.strip() for line in block.lines[place : place + 3]):
+        if len(found) >= _MOST_COMPONENTS:
+            raise ValueError(f"{file}: expected at most {_MOST_COMPONENTS} components")
+        component, series, place = _geonet_component(block, place)
+        found.append((component, series))
+    if not found:
+        raise ValueError(f"{file}: expected a GeoNet V1A or V2A file, got an empty one")
+    return found
+
+
+def _geonet_component(block: Block, place: int) -> tuple[str, Series, int]:
+    """Direction and samples of one component, and the line after it."""
+    lines, where = block.lines, block.where(place)
+    head = "\n".join(lines[place : place + _GEONET_TEXT])
+    if not re.match(r"\s*(un)?corrected accelerogram", head, re.IGNORECASE):
+        raise ValueError(
+            f"{where}: expected 'Corrected accelerogram' or 'Uncorrected accelerogram', the first line of a component "
+            f"of a GeoNet file, got {lines[place][:80]!r}"
+        )
+    peak, component = _GEONET_PEAK.search(head), re.search(r"^Component\s+(\S+)", head, re.MULTILINE)
+    step = next((match for line in head.splitlines()[10:12] if (match := _GEONET_STEP.search(line))), None)
+    if peak is None or component is None or step is None:
+        raise ValueError(f"{where}: expected the component, the step and the peak acceleration in {_GEONET_TEXT} lines")
+    integers, start = block.header(place + _GEONET_TEXT, 40, _GEONET_HEADERS)
+    reals, start = block.header(start, 60, _GEONET_HEADERS)
+    counts, dt = [_whole(number, block.file, "samples") for number in integers[33:36]], reals[25]
+    if not dt > 0.0 or abs(dt - float(step[1])) > 0.51e-3:
+        raise ValueError(
+            f"{where}: the step is {step[1]} s in the text but {dt:g} s in the header; the file is damaged"
+        )
+    unit = _GEONET_UNIT.search(head)
+    scale = float(unit[1]) if unit else 1.0
+    values = scale * block.samples(start, counts[0], _GEONET_DATA, last=False)
+    # the peak is rounded to the digits that are printed; the samples are rounded or cut
+    printed = block.field(start, _GEONET_DATA, int(np.argmax(np.abs(values))))
+    resolution = 1.01 * scale * 10.0 ** -decimals_of(printed) + 0.505 * 10.0 ** -decimals_of(peak[1])
+    _check_peak(_largest(values), abs(float(peak[1])), resolution, where)
+    end = start + sum(math.ceil(count / _GEONET_DATA[0]) for count in counts)
+    if end > len(lines):
+        raise ValueError(f"{where}: expected {sum(counts)} numbers up to line {end}; the file is truncated")
+    site = re.search(r"^Site\s+(\S+)", head, re.MULTILINE)
+    title = f"{site[1] if site else 'GeoNet'}, component {component[1]}"
+    return component[1], Series(title, dt, "mm/s2", values), end
+
+
+# K-NET and ESM --------------------------------------------------------------------------------------------------------
+
+_KNET_TEXT, _KNET_NAME = 17, 18
+_KNET_SCALE = re.compile(rf"({NUMBER})?\s*\(gal\)\s*/\s*({NUMBER})$", re.IGNORECASE)
+_ESM_TEXT, _ESM_NAME = 200, re.compile(r"[A-Z][A-Z0-9_/^]*:")  # most lines of the header; 55 to 64 in known versions
+
+
+def _stated(header: dict[str, str], names: tuple[str, ...], file: str, form: str) -> list[str]:
+    """The values of names in a header; ValueError if one is missing."""
+    if missing := [name for name in names if name not in header]:
+        raise ValueError(f"{file}: expected the header of {form} file, {', '.join(missing)} are missing")
+    return [header[name] for name in names]
+
+
+def _samples_below(lines: list[str], start: int, file: str) -> NDArray[np.float64]:
+    """Numbers that blanks separate, from the line with index `start`."""
+    fields = ((k, field) for k, line in enumerate(lines[start:], start + 1) for field in line.split())
+    return np.array([parse_number(field, f"{file}, line {k}") for k, field in fields])
+
+
+def parse_knet(text: str, file: str) -> Series:
+    """Return the samples of a K-NET or KiK-net file, without their mean."""
+    lines = text.splitlines()
+    header = {line[:_KNET_NAME].strip().rstrip("."): line[_KNET_NAME:].strip() for line in lines[:_KNET_TEXT]}
+    names = ("Station Code", "Sampling Freq(Hz)", "Duration Time(s)", "Dir", "Scale Factor")
+    station, frequency, duration, direction, factor = _stated(header, names, file, "a K-NET")
+    rate = parse_number(re.sub(r"\s*hz$", "", frequency, flags=re.IGNORECASE), f"{file}, Sampling Freq")
+    scale = _KNET_SCALE.match(factor)
+    if scale is None or not float(scale[2]) > 0.0 or not rate > 0.0:
+        raise ValueError(
+            f"{file}: expected a positive sampling frequency and a scale factor such as '3920(gal)/6182761', got "
+            f"{rate:g} and {factor!r}"
+        )
+    counts = _samples_below(lines, _KNET_TEXT, file)
+    expected = _whole(rate * parse_number(duration, f"{file}, Duration Time"), file, "samples")
+    check_count(counts.size, expected, f"{file}: frequency times duration")
+    # "(gal)/1048.2" means 1 gal; the stated peak is compared below
+    values = (counts - counts.mean()) * (float(scale[1] or 1.0) / float(scale[2]))
+    stated = next(
+        (header[name] for name in ("Max. Acc. (gal)", "Max Acc. (gal)", "Max. Acc (gal)") if name in header), None
+    )
+    if stated is None:
+        raise ValueError(f"{file}: expected a header line 'Max. Acc. (gal)'")
+    peak = parse_number(stated, f"{file}, Max. Acc.")
+    _check_peak(_largest(values), peak, 2e-3 * abs(peak) + 2e-3, file)
+    return Series(f"{station}, channel {direction}, mean subtracted", 1.0 / rate, "gal", values)
+
+
+def parse_esm(text: str, file: str) -> Series:
+    """Return the samples of an ESM or ITACA file."""
+    lines, header = text.splitlines(), {}
+    for line in lines[:_ESM_TEXT]:
+        if not _ESM_NAME.match(line):
+            break
+        name, _, value = line.partition(":")
+        header[name] = value.strip()
+    names = ("SAMPLING_INTERVAL_S", "NDATA", "UNITS", "DATA_TYPE", "STATION_CODE", "STREAM")
+    interval, count, unit, kind, station, stream = _stated(header, names, file, "an ESM or ITACA")
+    if kind.upper() != "ACCELERATION":
+        raise ValueError(f"{file}: expected acceleration, got DATA_TYPE {kind!r}; take the ACC file")
+    dt = parse_number(interval, f"{file}, SAMPLING_INTERVAL_S")
+    if not dt > 0.0:
+        raise ValueError(f"{file}: expected a positive SAMPLING_INTERVAL_S, got {dt:g}")
+    values, where = _samples_below(lines, len(header), file), f"{file}: NDATA"
+    check_count(values.size, _whole(parse_number(count, where), file, "samples"), where)
+    if (stated := header.get("PGA_CM/S^2")) and values.size:
+        peak = abs(parse_number(stated, f"{file}, PGA_CM/S^2"))
+        scale = float(to_si(1.0, agree_on_unit(unit, None, "acceleration", file)) / to_si(1.0, "cm/s2"))
+        _check_peak(scale * _largest(values), peak, 1e-4 * peak + 2e-6 * scale, file)
+    return Series(f"{header.get('NETWORK', '')}.{station} {stream}", dt, unit, values)
+
+
+# seismology -----------------------------------------------------------------------------------------------------------
+
+_OBSPY = {"miniSEED": "MSEED", "SAC": "SAC", "GSE2": "GSE2"}  # names in `recognise` and in obspy
+_NO_ACCELERATION = {6: "displacement", 7: "velocity"}  # IDEP in a SAC header
+
+
+def parse_obspy(path: str | Path, channel: str | None) -> Series:
+    """Return the samples of one trace in a miniSEED, SAC or GSE2 file."""
+    try:
+        import obspy
+    except ImportError as error:
+        raise ValueError(
+            f"reading {path} needs the package obspy: install it with pip install obspy, or write the record as CSV"
+        ) from error
+    content = read_bytes(path)
+    form = _OBSPY.get(recognise(content)[0])
+    if form is None:
+        raise ValueError(f"{path}: expected a file in {', '.join(_OBSPY)}")
+    try:
+        # by name: obspy would also find formats such as pickle, which runs code of the file
+        stream = obspy.read(io.BytesIO(content), format=form).merge()
+        traces = [trace for trace in stream if channel is None or trace.id.endswith(channel)]
+    except Exception as error:  # a damaged file may raise anything
+        raise ValueError(f"{path}: obspy cannot read the file ({error}); download it again") from error
+    if len(traces) != 1:
+        raise ValueError(
+            f"{path}: expected one trace with channel = {channel!r}, found {len(traces)}; the traces are "
+            f"{', '.join(trace.id for trace in stream)}"
+        )
+    (trace,) = traces
+    if np.ma.is_masked(trace.data):
+        raise ValueError(
+            f"{path}: {trace.id} lacks {np.ma.count_masked(trace.data)} samples; an excitation needs all samples: cut "
+            "the record, or fill the gaps in obspy"
+        )
+    if not np.issubdtype(trace.data.dtype, np.floating):
+        raise ValueError(
+            f"{path}: the samples of {trace.id} are whole numbers, counts of a recorder; remove the response of the "
+            "instrument in obspy, stream.remove_response(inventory, output='ACC'), and write the file again"
+        )
+    quantity = _NO_ACCELERATION.get(trace.stats.get("sac", {}).get("idep"))
+    if quantity is not None:
+        raise ValueError(
+            f"{path}: expected acceleration, the SAC header of {trace.id} says {quantity}; differentiate it"
+        )
+    rate = round(1.0 / trace.stats.delta)  # SAC has the step in single precision
+    dt = 1.0 / rate if rate and abs(rate * trace.stats.delta - 1.0) < 1e-6 else trace.stats.delta
+    return Series(f"{trace.id}", float(dt), None, np.asarray(trace.data, dtype=np.float64))
