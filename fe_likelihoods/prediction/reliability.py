@@ -77,8 +77,7 @@ class Exceedance(NamedTuple):
     upper_by_events : ndarray or None
         With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
         averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
-        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios,
-        and with the form "linear": ratios at other levels are no trials at the predicted level.
+        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     """
@@ -262,7 +261,7 @@ def _of_values(
             for k in range(len(rows))
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        by_events = None if spread.ratios.form == "linear" else np.array([each.upper_by_events for each in columns])
+        by_events = np.array([each.upper_by_events for each in columns])
         return Exceedance(limits, *numbers, effective, upper_by_events=by_events)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
@@ -288,9 +287,7 @@ def exceedance_probability(
     draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
     share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
     lower, upper = interval_of_draws(draws, share, effective, spread, level)
-    by_events = None
-    if spread.ratios is not None and spread.ratios.form == "constant":
-        by_events = _upper_by_events(values, limits, spread.ratios, level, below)
+    by_events = None if spread.ratios is None else _upper_by_events(values, limits, spread.ratios, level, below)
     return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread), by_events)
 
 
@@ -298,7 +295,9 @@ def _upper_by_events(
     values: np.ndarray, limits: np.ndarray, ratios: EventRatios, level: float, below: bool
 ) -> np.ndarray:
     """Upper end of the binomial interval for the share of events that exceed; each event is one trial."""
-    exceeded = [(values * each < limits if below else values * each > limits).mean(axis=0) for each in ratios.values]
+    logs = np.log(np.where(values > 0.0, values, 1.0))
+    moved = [values * ratios.of_event(k, logs) for k in range(len(ratios.values))]
+    exceeded = [(each < limits if below else each > limits).mean(axis=0) for each in moved]
     return binomial_interval(np.mean(exceeded, axis=0), len(ratios.values), level)[1]
 
 
