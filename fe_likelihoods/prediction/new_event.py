@@ -6,7 +6,7 @@ give too low a response come with a measured value above the fitted one. A numbe
 from *one* distribution for both. With the median parameters of the population (`Hierarchy`), the ratios of measured
 values to the values at these parameters contain the deviation of each event from the median, its fitting error, and
 their correlation. How much they are expected to scatter follows from the model, for each event and number
-(`fe_likelihoods.prediction.scatter`). How much more or less this structure scatters follows from the events
+(`fe_likelihoods.events.scatter`). How much more or less this structure scatters follows from the events
 (`EventRatios`). One event has the same formula.
 
 Histories are predicted with the parameters of the population, and with its noise.
@@ -24,6 +24,7 @@ from ..checks.finding import warn
 from ..checks.stored_posteriors import check_impossible_draws
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
 from ..events.spread import EventSpread
 from ..likelihood.likelihood import FELikelihood
 from ..noise.protocol import noise_time_shifts
@@ -34,7 +35,6 @@ from .inputs import read_source
 from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
-from .scatter import REMAINDER, log_variance, remainder_variance, spread_rows
 
 __all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
 
