@@ -15,7 +15,7 @@ import numpy as np
 
 __all__ = ["REMAINDER", "log_variance", "remainder_variance", "spread_rows"]
 
-REMAINDER = 0.04
+REMAINDER = 0.05
 """Scatter of an amplitude beyond both: 0.02 to 0.06 is best for three structures, each of them left out in turn."""
 _PHASES = 16
 
