@@ -225,13 +225,13 @@ print(f"\npropagate warned about {len(warned)} of {NEW} new events, such as:\n{n
 # `Hierarchy` is the population of the parameters: medians and standard deviations between events. `predict_new_event`
 # has one ratio for each event, of the measured peak to the peak at the median parameters of the population. This ratio
 # contains the error of the model, the spread of the parameters and their correlation. Eight events do not know how much
-# events scatter, so the scatter has a prior, and the prediction says how much of its width is due to it. Each event is
-# simulated once for this.
+# events scatter, so a scatter is expected from the model, and the prediction says how much of its width is due to it.
+# Each event is simulated five times for this.
 
-POPULATION = {  # priors of medians and of standard deviations of logarithms and logits: assumed, wide
+POPULATION = {  # priors of medians and of standard deviations of logarithms: assumed, wide
     "frequency": Varying(LogNormal(5.0, 0.5), HalfNormal(0.3)),
     "damping": Varying(LogNormal(0.1, 1.0), HalfNormal(0.7)),
-    "share": Varying(Uniform(0.0, 1.0), HalfNormal(1.0), "logit"),  # from 0 to 1, for every new event
+    "share": Varying(LogNormal(0.8, 0.3), HalfNormal(0.3)),
 }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..likelihood.posterior import Posterior
 from ..noise.residuals import ResidualChecks
+from ..priors.between_events import spread_of
 from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
 from ..text_tables import listed
@@ -19,6 +20,7 @@ from .table import Moments, ParameterRow, rows_of
 __all__ = [
     "SAME_AS_PRIOR",
     "check_fit",
+    "check_other_events",
     "check_parameters",
     "check_residuals",
     "check_responses",
@@ -254,6 +256,23 @@ def _check_truth(rows: Sequence[ParameterRow]) -> list[Finding]:
     )
     action = "Expect the same of real data: intervals do not contain the error of the model. Try a finer model or step."
     return [Finding("True values are missed", CARE, text, action)]
+
+
+def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
+    """By which factors the standard deviations from one event are too small for the parameters of another event."""
+    spread = spread_of([row.name for row in rows])
+    known = [(row, spread[row.name]) for row in rows if row.name in spread and row.cv > 0.0]
+    factors = {row.label: float(np.sqrt(1.0 + 2.0 * (sd / row.cv) ** 2)) for row, sd in known}
+    if not factors:
+        return []
+    differing = [f"{row.label} by about {percent(sd)}" for row, sd in known]
+    text = (
+        f"The standard deviations hold for this event. Between events of one structure {listed(differing)} differ, so "
+        "that for another event they are too small by factors of "
+        f"{listed([f'{factor:.2g} ({label})' for label, factor in factors.items()])}."
+    )
+    action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
+    return [Finding("Another event differs", NOTE, text, action, factors)]
 
 
 def check_residuals(fits: Fits) -> list[Finding]:

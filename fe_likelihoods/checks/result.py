@@ -8,11 +8,12 @@ import numpy as np
 from samplers.judgement.failures import check_failed_region
 
 from ..cache.simulation_cache import SimulationCache
+from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, fit_data_sets
 from .failed_simulations import Failures, failures
 from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
-from .fit import check_parameters, check_residuals, check_responses
+from .fit import check_other_events, check_parameters, check_residuals, check_responses
 from .run import FinishedRun, read_run
 from .screening import check_data, check_gaps
 from .steps import (
@@ -101,8 +102,17 @@ def check_run(
         found += check_gaps(likelihood.noise) + _check_range(likelihood)
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
         found += check_residuals(fits)
+        found += check_other_events([row for row in rows if row.name in _of_one_event(run)])
     unique = dict.fromkeys(found)  # data sets may share a description or a motion
     return judge(unique, (*_tests(run, fits, failed), *model.tests.items()))
+
+
+def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
+    """The structural parameters of a run with the data of one event; none for several, or without data."""
+    parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
+    events = [find_events(likelihood.model) for likelihood in parts]
+    is_one = len(parts) == 1 and (events[0] is None or len(events[0].names) == 1)
+    return tuple(parts[0].model.parameter_names) if is_one else ()
 
 
 def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, str]]:

@@ -71,8 +71,8 @@ def check_new_test(outside: Mapping[str, float], share: float) -> list[Finding]:
     named = ", ".join(f"{name} {each:.1%}" for name, each in outside.items() if each > 0.0)
     text = f"{share:.0%} of the draws of a new test are outside the bounds of the priors of the tests ({named})."
     action = (
-        "Use Varying(..., scale='logit') for a parameter between two physical bounds such as a share, scale='log' for "
-        "a positive one, or a narrower prior of the spread."
+        "Use scale='log' of Varying for a positive parameter, a narrower prior of the spread, or wider bounds where "
+        "they are not physical."
     )
     return [Finding("Draws beyond the bounds of the tests", CARE, text, action, outside)]
 
@@ -98,7 +98,7 @@ def check_impossible_draws(possible: np.ndarray) -> list[Finding]:
         "are left out."
     )
     action = (
-        "Use level='response', whose shares have no upper bound, let shares vary with Varying(..., scale=\"logit\"), "
-        "or state a narrower prior of their spread between events."
+        "Use level='response', whose shares have no upper bound, or state a narrower prior of their spread between "
+        "events."
     )
     return [Finding("Impossible draws", CARE, text, action, {"share": share})]

@@ -20,8 +20,6 @@ __all__ = [
     "check_same_response",
     "check_scores",
     "check_unit_of_threshold",
-    "check_widening",
-    "is_narrow",
     "note_assumed_noise",
 ]
 
@@ -64,14 +62,9 @@ def check_peaks(
     return [Finding("Beyond the calibrated amplitude", CARE, text, action, numbers)]
 
 
-def is_narrow(bandwidth: float | None, calibrated: float | None) -> bool:
-    """Whether a motion has a much narrower band [Hz] than the motion of the calibration; not if one is not known."""
-    return bandwidth is not None and calibrated is not None and bandwidth < NARROW * calibrated
-
-
 def check_bandwidth(bandwidth: float | None, calibrated: float | None) -> list[Finding]:
     """Whether the power of a motion is in a much narrower band [Hz] than in the calibration."""
-    if not is_narrow(bandwidth, calibrated):
+    if bandwidth is None or calibrated is None or not bandwidth < NARROW * calibrated:
         return []
     text = (
         f"This motion has its power in a band of {bandwidth:.2g} Hz, as a harmonic has; {calibrated:.2g} Hz in the "
@@ -145,18 +138,6 @@ def check_coverage(shares: Mapping[str, float], level: float) -> list[Finding]:
         "the response; and look for what the model lacks."
     )
     return [Finding("The measurements are outside of the band", CARE, text, action, missed)]
-
-
-def check_widening(widening: Mapping[str, float]) -> list[Finding]:
-    """The scatter between events that was widened for a motion of another kind, by quantity; 1 where it was not."""
-    if not max(widening.values(), default=1.0) > 1.0:
-        return []
-    text = (
-        "The calibration hardly speaks for this motion, which is nearly a harmonic. The scatter between events is "
-        "widened by what the response depends on the parameters more than in all calibrated events: "
-        f"{', '.join(f'{name} {times:.1f} times' for name, times in widening.items())}."
-    )
-    return [Finding("A narrow-band motion", CARE, text, "Calibrate with a motion of this kind.", widening)]
 
 
 def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: int) -> list[Finding]:

@@ -35,7 +35,6 @@ from ..prediction.propagation import check_effective_sample_size
 from ..prediction.reliability import (
     Exceedance,
     check_level,
-    exceedance,
     exceedance_probability,
     warn_of_missing_error,
     with_collapses,
@@ -434,7 +433,4 @@ def _exceeded(
 ) -> Exceedance:
     """Probability that a measure (n, ...) exceeds its limit (n,) or (1,), or is below it."""
     limits = np.broadcast_to(limit.reshape(-1, *(1,) * (values.ndim - 1)), values.shape)
-    if spread.ratios is None and spread.weights is None:
-        ratio = limits / values if below else values / limits
-        return exceedance(ratio, 1.0, effective_sample_size=effective, level=level)
     return exceedance_probability(values, limits, spread, effective, level, seed, below)

@@ -1,7 +1,7 @@
 r"""Hierarchical model of several tests, from the stored posteriors of the single tests, without simulations.
 
-Some parameters vary between the tests (specimens, events) as draws of a normal population. Its means, standard
-deviations and correlations are the hyper-parameters. Other parameters are common to all tests, and the rest belongs to
+Some parameters vary between the tests (specimens, events) as independent draws of normal populations. Their means and
+standard deviations are the hyper-parameters. Other parameters are common to all tests, and the rest belongs to
 each test alone. The likelihood of the hyper-parameters is the product over the tests of
 
 .. math::
@@ -16,9 +16,6 @@ References
 ----------
 D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 2166-2175, doi:10.1088/0004-637X/725/2/2166, eq. (9).
-
-D. Lewandowski, D. Kurowicka, H. Joe (2009), Generating random correlation matrices based on vines and extended onion
-method, Journal of Multivariate Analysis 100, 1989-2001, doi:10.1016/j.jmva.2009.04.008, section 2.
 """
 
 import copy
@@ -39,7 +36,7 @@ from .stored_posterior import StoredPosterior, describe
 
 __all__ = ["HierarchicalPosterior", "Varying"]
 
-_HYPER_NAMES = {"log": ("median", "sd_log"), "logit": ("median", "sd_logit"), "linear": ("mean", "sd")}
+_HYPER_NAMES = {"log": ("median", "sd_log"), "linear": ("mean", "sd")}
 _LARGEST = 1e100  # of a mean or a standard deviation, so that squares do not overflow
 _SMALLEST_SD = 1e-12  # of the posterior's, below which the population is a point
 
@@ -51,35 +48,26 @@ class Varying:
     Parameters
     ----------
     location : Distribution
-        Prior of the population median (scales "log" and "logit") or mean (scale "linear"), in the parameter's unit.
+        Prior of the population median (scale "log") or mean (scale "linear"), in the parameter's unit.
     sd : Distribution
-        Prior of the population's standard deviation, for the parameter's natural logarithm (scale "log"), for
-        ``ln((x-a)/(b-x))`` (scale "logit"), or for the parameter, in its unit (scale "linear").
-    scale : {"log", "linear", "logit"}
-        Whether the logarithm of the parameter, the parameter itself, or its logit has a normal distribution. The scale
-        "logit" is for parameters between two bounds a and b that are physical, such as shares, which no test can
-        exceed. Near a, a change of the logit is a relative change of x - a; in the middle it is 4 / (b - a) times the
-        change of x.
-    bounds : (float, float), optional
-        Bounds (a, b) of the scale "logit". Default: the parameter's prior bounds, which must then be the same in all
-        tests.
+        Prior of the population's standard deviation, for the parameter's natural logarithm (scale "log") or for the
+        parameter, in its unit (scale "linear").
+    scale : {"log", "linear"}
+        Whether the logarithm of the parameter or the parameter itself has a normal distribution.
 
     Raises
     ------
     ValueError
-        If a standard deviation or a median could be negative, the scale is unknown, or a median could be beyond the
-        bounds.
+        If a standard deviation or a median could be negative, or the scale is unknown.
 
     Examples
     --------
     >>> Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))
-    >>> Varying(Uniform(0.0, 1.0), HalfNormal(1.0), "logit")  # a share
     """
 
     location: Distribution
     sd: Distribution
     scale: str = "log"
-    bounds: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.scale not in SCALES:
@@ -95,10 +83,6 @@ class Varying:
                 "Varying: with scale='log' the location is a median, which needs a prior of positive values such as "
                 f"LogNormal(1.0, 0.5); got {self.location}"
             )
-        if self.bounds is not None:
-            if self.scale != "logit":
-                raise ValueError(f"Varying: bounds are those of scale='logit'; the scale is {self.scale!r}")
-            object.__setattr__(self, "bounds", _checked_bounds(self, self.bounds))
 
 
 class HierarchicalPosterior:
@@ -116,10 +100,6 @@ class HierarchicalPosterior:
     common : mapping of str to Distribution, optional
         Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
         belong to each test alone, with the prior of its stored posterior.
-    correlation : float, optional
-        Shape eta >= 1 of the LKJ prior for correlations between the varying parameters: 1 is uniform over correlation
-        matrices, larger values favour small correlations. Below 1 the density is infinite at correlations of 1 and -1.
-        Default: the varying parameters are independent.
     max_samples : int
         Largest number of samples per test. More are thinned; the time of an evaluation is proportional to it.
 
@@ -142,19 +122,15 @@ class HierarchicalPosterior:
 
     Notes
     -----
-    The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), ``median_NAME`` and ``sd_logit_NAME``
-    (scale "logit"), or ``mean_NAME`` and ``sd_NAME`` (scale "linear"), then ``correlation_A_B``, then the names of the
-    common parameters. With three varying parameters or more, correlations without the first parameter are partial:
-    ``partial_correlation_B_C`` correlates B and C given the parameters before B.
+    The hyper-parameters are ``median_NAME`` and ``sd_log_NAME`` (scale "log"), or ``mean_NAME`` and ``sd_NAME`` (scale
+    "linear"), then the names of the common parameters.
 
     The likelihood is taken as zero outside the prior bounds of a test.
 
     The result is exact up to the finite number of samples if no parameter is common. The exact value of a common
     parameter is not among the samples, so the density of common and varying parameters is described by a mixture that
     is fitted to each test's samples: correlations between them are kept, and shapes that the mixture cannot describe
-    are lost. `Hierarchy` states the errors. Where a common parameter is within 4 standard deviations of a prior bound,
-    its density is fitted on the scale of its normal score, so that a test that says nothing about it adds a constant
-    (docs/theory/hierarchy.rst).
+    are lost, such as the end at a bound of the prior. `Hierarchy` states the errors.
 
     Examples
     --------
@@ -169,35 +145,28 @@ class HierarchicalPosterior:
         varying: Mapping[str, Varying],
         *,
         common: Mapping[str, Distribution] | None = None,
-        correlation: float | None = None,
         max_samples: int = 1000,
     ) -> None:
         common = {} if common is None else common
-        _check(tests, varying, common, correlation, max_samples)
+        _check(tests, varying, common, max_samples)
         self.tests, self.varying, self.common = dict(tests), dict(varying), tuple(common)
-        self._correlated = correlation is not None and len(varying) > 1
         distributions: dict[str, Any] = {}
         for name, each in varying.items():
             location, sd = _HYPER_NAMES[each.scale]
             distributions |= {f"{location}_{name}": each.location, f"{sd}_{name}": each.sd}
-        if self._correlated:
-            distributions |= _lkj_prior(list(varying), float(correlation))
         self.prior = Prior(distributions | dict(common))
-        kinds = [each.scale for each in varying.values()] + ["linear"] * len(common)
-        bounds = [_bounds_of(name, each, tests) for name, each in varying.items()] + [None] * len(common)
-        self.scales, self.described = scales_of(kinds, bounds), {}
+        self.scales = scales_of([each.scale for each in varying.values()] + ["linear"] * len(common))
+        self.described = {}
         for name, test in self.tests.items():
             try:
-                self.described[name] = describe(
-                    test, [*varying, *common], self.scales, max_samples, n_common=len(common)
-                )
+                self.described[name] = describe(test, [*varying, *common], self.scales, max_samples)
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
         self._set_smallest_sd()
 
     def _set_smallest_sd(self) -> None:
         deviations = [
-            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self.scales.low), -1).diagonal())
+            np.sqrt(np.cov(each.points.T, ddof=0).reshape(len(self.scales.is_log), -1).diagonal())
             for each in self.described.values()
         ]
         self._smallest_sd = _SMALLEST_SD * np.min(deviations, axis=0)[: len(self.varying)]
@@ -249,8 +218,6 @@ class HierarchicalPosterior:
             state.update(f"{name} {self.tests[name].log_evidence} {each.effective_sample_size}".encode())
             for array in (each.points, each.log_weights, each.log_prior, each.means, each.covariances):
                 state.update(np.ascontiguousarray(array).tobytes())
-            if each.common is not None:
-                state.update(complete_repr(each.common).encode())
         return state.hexdigest()
 
     def __call__(self, x: Any) -> np.ndarray | float:
@@ -321,52 +288,15 @@ class HierarchicalPosterior:
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
         center = self.scales.to_scale(center)
-        factor = _correlation_factor(points[:, 2 * n : end], n)
         deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
-        return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * factor
+        return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * np.eye(n)
 
     def from_scale(self, values: np.ndarray) -> np.ndarray:
         """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""
         return self.scales.from_scale(values)
 
 
-def _checked_bounds(varying: Varying, bounds: Any) -> tuple[float, float]:
-    """Bounds of the scale "logit"; ValueError if they are not finite and ordered, or a median could be beyond them."""
-    low, high = (float(each) for each in bounds)
-    if not -np.inf < low < high < np.inf:
-        raise ValueError(f"Varying: scale='logit' needs two finite bounds (a, b), a < b; got {bounds!r}")
-    first, last = varying.location.bounds
-    if first < low or last > high:
-        raise ValueError(
-            f"Varying: with scale='logit' the location is a median between the bounds {low:g} and {high:g}, which "
-            f"needs a prior between them, such as Uniform({low:g}, {high:g}); got {varying.location}"
-        )
-    return low, high
-
-
-def _bounds_of(name: str, varying: Varying, tests: Mapping[str, StoredPosterior]) -> tuple[float, float] | None:
-    """Bounds of a varying parameter with the scale "logit": as stated, or its prior bounds, equal in all tests."""
-    if varying.scale != "logit" or varying.bounds is not None:
-        return varying.bounds
-    found = {
-        tuple(test.prior.bounds[test.prior.names.index(name)].tolist())
-        for test in tests.values()
-        if name in test.prior.names
-    }
-    if not found:
-        raise ValueError(f"HierarchicalPosterior: no test has a parameter {name}")
-    if len(found) > 1:
-        raise ValueError(
-            f"HierarchicalPosterior: the bounds of the prior of {name} differ between the tests ({sorted(found)}); "
-            "state bounds for scale='logit', Varying(..., bounds=(a, b))"
-        )
-    try:
-        return _checked_bounds(varying, next(iter(found)))
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
-
-
-def _check(tests: Any, varying: Any, common: Any, correlation: Any, max_samples: Any) -> None:
+def _check(tests: Any, varying: Any, common: Any, max_samples: Any) -> None:
     """Raise ValueError for arguments of `HierarchicalPosterior` that cannot be used."""
     for what, values, kind in (("tests", tests, StoredPosterior), ("varying", varying, Varying)):
         if (
@@ -381,38 +311,5 @@ def _check(tests: Any, varying: Any, common: Any, correlation: Any, max_samples:
         raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
     if both := sorted(set(varying) & set(common)):
         raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")
-    if correlation is not None and not 1.0 <= correlation < np.inf:
-        raise ValueError(
-            f"HierarchicalPosterior: correlation is the shape of the LKJ prior, 1 or more, or None for "
-            f"independent parameters; got {correlation!r}"
-        )
     if not isinstance(max_samples, int | np.integer) or max_samples < 100:
         raise ValueError(f"HierarchicalPosterior: max_samples must be a whole number, 100 or more; got {max_samples!r}")
-
-
-def _lkj_prior(names: list[str], shape: float) -> dict[str, Any]:
-    """Independent priors of the partial correlations, by which the correlation matrix has the LKJ distribution."""
-    from scipy.stats import beta  # slow to import, and not needed for independent parameters
-
-    prior = {}
-    for level, first in enumerate(names[:-1]):
-        b = shape + 0.5 * (len(names) - 2 - level)
-        kind = "partial_correlation" if level else "correlation"
-        prior |= {f"{kind}_{first}_{other}": beta(b, b, loc=-1.0, scale=2.0) for other in names[level + 1 :]}
-    return prior
-
-
-def _correlation_factor(partial: np.ndarray, n: int) -> np.ndarray:
-    """Cholesky factors (m, n, n) of correlation matrices from partial correlations (m, n (n - 1) / 2), or identity."""
-    factor = np.tile(np.eye(n), (len(partial), 1, 1))
-    if not partial.shape[1]:
-        return factor
-    left = np.ones((len(partial), n))  # 1 minus the sum of squares in a row so far
-    column = 0
-    for j in range(n - 1):
-        for i in range(j + 1, n):
-            factor[:, i, j] = partial[:, column] * np.sqrt(left[:, i])
-            left[:, i] -= np.square(factor[:, i, j])
-            column += 1
-        factor[:, j + 1, j + 1] = np.sqrt(np.maximum(left[:, j + 1], 1e-12))
-    return factor

@@ -111,7 +111,7 @@ class Hierarchy:
                 weights, values = np.exp(each.log_weights), each.points[:, k]
                 errors.append(np.sqrt(weights @ np.square(values - weights @ values) / weights.sum()))
             error = np.median(errors)
-            unit = {"log": " %", "logit": " of the logit", "linear": ""}[varying.scale]
+            unit = {"log": " %", "linear": ""}[varying.scale]
             factor = 100.0 if varying.scale == "log" else 1.0
             ends = f"{number(factor * low, 2)} to {number(factor * high, 2)}{unit}"
             prior = np.std(varying.sd.rvs(2000, random_state=0))
@@ -186,7 +186,7 @@ class Hierarchy:
         -------
         dict of str to float
             Population centers, averaged over the hyper-samples on the scales of the populations: the geometric mean of
-            medians for the scale "log", the mean logit for the scale "logit".
+            medians for the scale "log".
         """
         center, _ = self.posterior.population(self.samples)
         names = [*self.posterior.varying, *self.posterior.common]

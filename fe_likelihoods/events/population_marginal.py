@@ -148,28 +148,11 @@ def product_with_population(described: DescribedPosterior, center: np.ndarray, f
     scaled = np.linalg.solve(lower, offset[..., None])[..., 0]
     log_masses = described.log_shares - 0.5 * np.square(scaled).sum(axis=-1) - 0.5 * dim * _LOG_TWO_PI
     log_masses = log_masses - np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
-    if described.common is not None:
-        log_masses = log_masses + _log_correction(described, center[:, varying:])[:, None]
     gain = np.linalg.solve(total, np.tile(described.covariances[..., :varying], (len(center), 1, 1, 1)))
     means = described.means[:, :varying] + np.einsum("ncdv,ncd->ncv", gain, offset)
     # the covariance C - C (C + S)^-1 C, written as S (C + S)^-1 C because the difference loses all digits for small S
     covariances = spread[:, None] @ gain[..., :varying, :]
     return Product(log_masses, means, _roots(covariances, np.einsum("cvv->cv", described.covariances)[:, :varying]))
-
-
-def _log_correction(described: DescribedPosterior, values: np.ndarray) -> np.ndarray:
-    """Log ratio (n,) of the density of common values (n, n_common) to the mixture's density.
-
-    The mixture then gives the density of the varying parameters for these common values only. Zero beyond the bounds of
-    the prior, where `inverse_prior` is zero.
-    """
-    dim = values.shape[1]
-    lower = np.linalg.cholesky(described.covariances[:, -dim:, -dim:])
-    scaled = np.linalg.solve(lower, (values[:, None] - described.means[:, -dim:])[..., None])[..., 0]
-    terms = described.log_shares - 0.5 * np.square(scaled).sum(axis=-1) - 0.5 * dim * _LOG_TWO_PI
-    terms = terms - np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
-    log_common = described.common.logpdf(values)
-    return np.where(np.isfinite(log_common), log_common - np.logaddexp.reduce(terms, axis=1), 0.0)
 
 
 def _roots(covariances: np.ndarray, largest: np.ndarray) -> np.ndarray:

@@ -36,8 +36,6 @@ __all__ = [
     "resampled_description",
 ]
 
-_NEAR = 4.0  # distance of a bound from the mean, in standard deviations, within which a normal density does not fit
-
 
 @dataclass(frozen=True, eq=False)
 class StoredPosterior:
@@ -204,11 +202,7 @@ class StoredPosterior:
 
 
 class DescribedPosterior(NamedTuple):
-    """Posterior samples of some parameters on the scale of a population, and a mixture fitted to them.
-
-    `common` is the density of the common parameters alone, fitted on the scale of their normal scores under the priors,
-    if a sample of one common parameter is near a prior bound.
-    """
+    """Posterior samples of some parameters on the scale of a population, and a mixture fitted to them."""
 
     points: np.ndarray  # (n, dim)
     log_weights: np.ndarray  # (n,), of weights with sum 1
@@ -220,7 +214,6 @@ class DescribedPosterior(NamedTuple):
     covariances: np.ndarray  # (n_components, dim, dim)
     mixture: MixtureDistribution  # in standardised coordinates
     effective_sample_size: float  # number of independent samples
-    common: MixtureDistribution | None = None
 
     def log_prior_at(self, points: np.ndarray) -> np.ndarray:
         """Logarithm of the prior density (...) of points (..., dim) on the scale of the population."""
@@ -235,16 +228,13 @@ def on_scale(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> t
         )
     prior = stored.prior.subset(names)
     values = stored.samples[:, [stored.prior.names.index(name) for name in names]]
-    outside = ((values <= scales.low) | (values >= scales.high)).any(axis=0)
-    for name, low, high in (
-        each for each, is_out in zip(zip(names, *scales, strict=True), outside, strict=True) if is_out
-    ):
-        if high == np.inf:
-            raise ValueError(f"a logarithmic scale needs positive samples of {name}; use scale='linear'")
-        raise ValueError(
-            f"a logit scale needs samples of {name} between its bounds {low:g} and {high:g}, and not at them; state "
-            "wider ones, bounds=(low, high)"
-        )
+    if not (values > 0.0)[:, scales.is_log].all():
+        wrong = [
+            name
+            for name, is_log, each in zip(names, scales.is_log, values.T, strict=True)
+            if is_log and min(each) <= 0.0
+        ]
+        raise ValueError(f"a logarithmic scale needs positive samples of {', '.join(wrong)}; use scale='linear'")
     return prior, scales.to_scale(values)
 
 
@@ -261,9 +251,8 @@ def describe(
     scales: Scales,
     max_samples: int,
     seed: int = 0,
-    n_common: int = 0,
 ) -> DescribedPosterior:
-    """Describe the stored samples of some parameters, of which the last `n_common` have one value in all tests.
+    """Describe the stored samples of some parameters.
 
     More than `max_samples` are thinned: evenly, or by systematic resampling if they have weights. ValueError if a
     parameter is unknown, has a joint prior with parameters that are not described, or has samples that its scale does
@@ -274,7 +263,6 @@ def describe(
     equal = np.ptp(stored.log_weights) == 0.0
     rows = systematic(weights, rng, min(len(points), max_samples))  # evenly spaced rows for equal weights
     mixture = _fit(points[rows], names, stored.effective_sample_size, seed)
-    common = _fit_common(points[rows], prior, n_common, stored.effective_sample_size, seed)
     if len(points) > max_samples:
         points, log_weights = points[rows], np.full(len(rows), -np.log(len(rows)))
     else:
@@ -283,7 +271,7 @@ def describe(
     if len(stored.samples) > max_samples and not equal:  # resampling adds the error of as many samples
         size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / max_samples)
     incomplete = DescribedPosterior(
-        points, log_weights, np.zeros(len(points)), prior, scales, *_components(mixture), mixture, size, common
+        points, log_weights, np.zeros(len(points)), prior, scales, *_components(mixture), mixture, size
     )
     return incomplete._replace(log_prior=incomplete.log_prior_at(points))
 
@@ -292,16 +280,13 @@ def resampled_description(described: DescribedPosterior, rng: np.random.Generato
     """A description of samples drawn with replacement from the described ones, to estimate statistical errors.
 
     The number of draws is the effective sample size. The points stay the same; their weights are the counts of the
-    draws, and the mixtures are fitted to the draws, starting from the given ones.
+    draws, and the mixture is fitted to the draws, starting from the given one.
     """
     size = max(round(described.effective_sample_size), 1)
     counts = rng.multinomial(size, np.exp(described.log_weights) / np.exp(described.log_weights).sum())
     with np.errstate(divide="ignore"):
         log_weights = np.log(counts / size)
-    drawn, common = np.repeat(described.points, counts, axis=0), described.common
-    mixture = described.mixture.refitted(drawn)
-    if common is not None:
-        common = common.refitted(drawn[:, -common.dim :])
+    mixture = described.mixture.refitted(np.repeat(described.points, counts, axis=0))
     shares, means, covariances = _components(mixture)
     return described._replace(
         log_weights=log_weights,
@@ -309,7 +294,6 @@ def resampled_description(described: DescribedPosterior, rng: np.random.Generato
         means=means,
         covariances=covariances,
         mixture=mixture,
-        common=common,
     )
 
 
@@ -325,32 +309,6 @@ def _fit(points: np.ndarray, names: Sequence[str], effective: float, seed: int) 
         }
     )
     return fit_mixture(points, coordinates, effective_sample_size=effective, seed=seed)
-
-
-def _fit_common(
-    points: np.ndarray, prior: Prior, n_common: int, effective: float, seed: int
-) -> MixtureDistribution | None:
-    """Density of the common parameters, the last columns of points (n, dim), if one of them is near a bound.
-
-    A mixture of normal distributions cannot describe a parameter density that ends at a bound. A mixture for its normal
-    score under the prior can: where a test says nothing, the score is standard normal.
-    """
-    names = prior.names[len(prior.names) - n_common :]
-    if not n_common or any(name not in prior.distributions for name in names):  # a joint prior
-        return None
-    values, bounds = points[:, -n_common:], prior.bounds[-n_common:]
-    distances = np.abs(bounds - values.mean(axis=0)[:, None]) / values.std(axis=0)[:, None]
-    if (distances > _NEAR).all():
-        return None
-    # without near bounds, the coordinate of the joint mixture is used, which is accurate far from the prior too
-    far = (distances > _NEAR).all(axis=1)
-    scores = Prior(
-        {
-            name: TruncatedNormal(mean, sd, -np.inf, np.inf) if inside else prior.distributions[name]
-            for name, mean, sd, inside in zip(names, values.mean(axis=0), values.std(axis=0), far, strict=True)
-        }
-    )
-    return fit_mixture(values, scores, effective_sample_size=effective, seed=seed)
 
 
 def _components(mixture: MixtureDistribution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from scipy import stats
 
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import EventRatios
-from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
+from ..events.spread import EventSpread
 from ..noise.protocol import follows_response
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -30,10 +30,9 @@ from .new_event import at_parameters, draw_new_event
 from .propagation import AllFailed, check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import (
-    binomial_interval,
     check_level,
     contents,
-    interval_of_draws,
+    estimate,
     threshold_in_si,
     unit_of_threshold,
     warn_of_missing_error,
@@ -312,11 +311,11 @@ def fragility(
         collapsed[prediction.collapsed, k] = True
     spread = EventSpread(values, weights, ratios)
     exceeding = np.isnan(values) if failures_exceed else collapsed
-    found = _probabilities(spread, float(limit), exceeding, effective, level, seed)
+    found = estimate(values, limit, spread, effective, level, seed, exceeding=exceeding)
     intensity_unit = DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else ""
     try:
         rng = np.random.default_rng(seed)
-        curve = curve_with_errors(intensities, found.single, found.counted, effective, found.draws, rng)
+        curve = curve_with_errors(intensities, found.single.T, found.counted.T, effective, found.draws, rng)
         curve = curve._replace(unit=intensity_unit)
     except ValueError as reason:
         logger.warning("no fragility curve: %s", reason)
@@ -394,37 +393,3 @@ def _with_noise(posterior: Any, samples: Any, part: str | None, source: Predicti
     names = [*source.model.parameter_names, *source.noise.parameter_names]
     complete = set(names) <= set(rows) if isinstance(rows, Mapping) else np.shape(rows)[-1:] == (len(names),)
     return rows if complete else None
-
-
-class _Found(NamedTuple):
-    single: np.ndarray
-    counted: np.ndarray
-    probability: np.ndarray
-    standard_error: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    draws: np.ndarray | None
-
-
-def _probabilities(
-    spread: EventSpread, limit: float, exceeding: np.ndarray, effective: float, level: float, seed: int | None
-) -> _Found:
-    """Probabilities of samples (n_records, n) and of records, from values (n, n_records) with NaN for failures.
-
-    Failures count as exceedances where `exceeding` (n, n_records) is true; the others are left out.
-    """
-    values = spread.values
-    failed = np.isnan(values)
-    known, limits = np.where(failed, 1.0, values), np.full(values.shape, limit)
-    single = np.where(failed, exceeding, exceedance_of_samples(known, limits, spread.ratios)).T
-    counted = 1.0 - (failed & ~exceeding).T
-    trials = effective * counted.mean(axis=1)
-    share = single.sum(axis=1) / counted.sum(axis=1)
-    if spread.ratios is None and spread.weights is None:
-        lower, upper = binomial_interval(share, trials, level)
-        return _Found(single, counted, share, np.sqrt(share * (1.0 - share) / trials), lower, upper, None)
-    rng = np.random.default_rng(seed)
-    draws = exceedance_draws(values, limits, spread, rng, failed=failed, exceeding=exceeding)
-    lower, upper = interval_of_draws(draws, share, trials, spread, level)
-    deviation = np.sqrt((np.square(single - share[:, None]) * counted).sum(axis=1) / counted.sum(axis=1))
-    return _Found(single, counted, share, deviation / np.sqrt(trials), lower, upper, draws)

@@ -1,16 +1,13 @@
-r"""Prediction of an event that the structure has not seen yet, from several events that it has.
+r"""Prediction of an event that the structure has not seen yet, from one event or several that it has.
 
 Structural parameters differ from event to event: frequency and damping change with the amplitude, the season and the
 years. What a model cannot fit differs as well, and both are correlated: where the fit is a compromise, parameters that
 give too low a response come with a measured value above the fitted one. A number such as a peak is therefore predicted
-from *one* distribution for both. With the median parameters :math:`\bar\theta` of the population (`Hierarchy`),
-
-.. math:: \ln y_k = \ln g_k(\bar\theta) + e_k, \qquad
-   e_\mathrm{new} \sim t_\nu\!\left(m,\ s \sqrt{1 + 1 / K}\right),
-
-the ratios :math:`e^{e_k}` of measured values to the values at these parameters contain the deviation of each event from
-the median, its fitting error, and their correlation. Eleven events do not know how much events scatter, one knows
-nothing of it: the scatter has a prior (`EventRatios`), and one event has the same formula.
+from *one* distribution for both. With the median parameters of the population (`Hierarchy`), the ratios of measured
+values to the values at these parameters contain the deviation of each event from the median, its fitting error, and
+their correlation. How much they are expected to scatter follows from the model, for each event and number
+(`fe_likelihoods.events.scatter`). How much more or less this structure scatters follows from the events
+(`EventRatios`). One event has the same formula.
 
 Histories are predicted with the parameters of the population, and with its noise.
 Equations are on the page ``docs/theory/prediction.rst``.
@@ -22,26 +19,24 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..checks.finding import warn
 from ..checks.stored_posteriors import check_impossible_draws
-from ..checks.transfer import check_widening, is_narrow
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
+from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
 from ..events.spread import EventSpread
+from ..likelihood.likelihood import FELikelihood
+from ..noise.protocol import noise_time_shifts
+from ..priors.between_events import BETWEEN_EVENTS
 from ..signals.records import Record
-from .calibrated_range import bandwidth
-from .excitation import under_record
+from ..simulation.model import SimulationFailed
 from .inputs import read_source
 from .prediction import Prediction
 from .propagation import propagate
-from .quantities import ChannelQuantity, Quantity, measured_quantity
-from .streaming import quantiles_with_errors
+from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
 
 __all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
-
-_SENSITIVITY = 20  # draws of the population, under a motion of another kind
 
 
 def event_ratios(
@@ -49,8 +44,7 @@ def event_ratios(
     posteriors: Mapping[str, Any],
     quantity: ChannelQuantity | Sequence[ChannelQuantity],
     *,
-    form: str = "constant",
-    prior_sd: ArrayLike = PRIOR_SD,
+    spread: Mapping[str, float] | None = None,
     prior_events: float = PRIOR_EVENTS,
 ) -> EventRatios:
     """Ratios of the measured values of several events to the values at the median parameters of their population.
@@ -63,47 +57,30 @@ def event_ratios(
         The likelihood with the measurements of each event. Of a `Hierarchy`, its events are used, and must be there.
     quantity : ChannelQuantity or sequence of ChannelQuantity
         Positive numbers, such as ``peak("deck")``.
-    form, prior_sd, prior_events
+    spread : mapping of str to float, optional
+        Standard deviations of the logarithms of structural parameters between events. A key is the beginning of the
+        names of parameters that change together, such as ``{"frequency": 0.02, "damping": 0.2}``. Default:
+        `fe_likelihoods.priors.between_events.BETWEEN_EVENTS`, with the parameters whose names begin with "frequency",
+        "stiffness" and "damping". The scatter that is expected of each number follows from it. If no parameter of the
+        model is among them, amplitudes are expected to scatter by 0.12.
+    prior_events : float
         As for `EventRatios`.
 
     Returns
     -------
     EventRatios
-        With the parameters in ``at``. One simulation per event.
+        With the parameters in ``at``, and the expected scatter of each number in each event. One simulation per event,
+        and two for each group of parameters that changes.
 
     Raises
     ------
     ValueError
         If a posterior or a parameter is missing, the quantity is no number of channels, measurements or samples of them
-        are missing, a value is not positive, and as `EventRatios`.
+        are missing, a value or a spread is not positive, and as `EventRatios`.
     SimulationFailed
         If the simulation of an event at these parameters fails.
     """
-    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
-    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
-        raise ValueError(f"ratios of events need numbers such as quantity=peak(channel); got {quantity!r}")
-    of_population = isinstance(hierarchy, Hierarchy)
-    names = list(hierarchy.posterior.tests if of_population else posteriors)
-    if missing := [name for name in names if name not in posteriors]:
-        raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
-    at, values, levels = hierarchy.median_test() if of_population else dict(hierarchy), [], []
-    for name in names:
-        source = read_source(posteriors[name])
-        if source.likelihood is None:
-            raise ValueError(
-                f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
-            )
-        measured = measured_quantity(quantity, source.likelihood.measurements)
-        rows = at_parameters(at, source.model.parameter_names, 1)
-        options = {"quantiles": (), "check": False, "progress": False}
-        predicted = propagate(source.likelihood, rows, quantity=quantity, **options).mean
-        if not ((measured > 0.0) & (predicted > 0.0)).all():
-            raise ValueError(
-                f"ratios of events need positive values; event {name!r}: measured {measured}, predicted {predicted}"
-            )
-        values.append(measured / predicted)
-        levels.append(predicted)
-    return EventRatios(values, prior_sd, prior_events, levels, form, at)
+    return _ratios(hierarchy, posteriors, quantity, _checked_spread(spread), prior_events)[0]
 
 
 def predict_new_event(
@@ -113,8 +90,7 @@ def predict_new_event(
     *,
     model: Any = None,
     quantity: Quantity | Mapping[str, Quantity] = None,
-    form: str = "constant",
-    prior_sd: ArrayLike = PRIOR_SD,
+    spread: Mapping[str, float] | None = None,
     prior_events: float = PRIOR_EVENTS,
     noise: bool | str = False,
     n: int = 500,
@@ -138,18 +114,19 @@ def predict_new_event(
         Numbers such as ``peak("deck")``, one or a list of them: the *measured* values of the new event are predicted.
         Histories, as for `propagate`: the response, or the measurements with ``noise=True``. Several of these by name.
         Default: the histories of all channels.
-    form, prior_sd, prior_events
-        Of the ratio of measured values to the values at the median parameters, see `EventRatios`. The printed
-        prediction says how much of the width is due to the prior.
+    spread, prior_events
+        Of the ratio of measured values to the values at the median parameters, see `event_ratios`. The printed
+        prediction says how much of the width is due to the scatter that is expected before the events.
     noise : bool or str
         Whether histories are predicted with noise, as for `propagate`. The noise parameters must be varying, common, or
         have the same prior in all events. Shares of the response (`GaussianNoise`)
         transfer between events, levels in SI units do not. Numbers contain all errors without it.
     n : int
-        Number of draws. Histories need a simulation for each, numbers one for each event and one for the new one. Draws
-        with an impossible noise, such as a share of 1 or more of ``level="measured"``, are left out.
+        Number of draws. Histories need a simulation for each. Numbers need three to five for each event and for the new
+        one; their quantiles are exact, and their draws have equal probabilities. Draws with an impossible noise, such
+        as a share of 1 or more of ``level="measured"``, are left out.
     seed : int, optional
-        Seed for drawing parameters, ratios and noise.
+        Seed for drawing parameters and noise, and for the order of the draws of numbers.
     **options
         Further options of `propagate`, such as ``quantiles=`` and ``from_state=``.
 
@@ -170,18 +147,14 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `propagate` for peaks outside the range of all events, and for harmonics, with which the scatter is widened
-        (see Notes). For histories also as `Hierarchy.new_test`, and if more than 1 % of the draws have an
-        impossible noise. Residuals of the single calibrations are not checked.
+        As `propagate` for peaks outside the range of all events, and for harmonics. For histories also as
+        `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. Residuals of the single
+        calibrations are not checked.
 
     Notes
     -----
-    The intervals of numbers are those of normal log ratios whose scatter is the same in all events: the same change of
-    the parameters changes the logarithm of the value by the same amount. Under a harmonic near a resonance it changes
-    far more. If the power of the motion is in a band of less than a fifth of the width in every event, 20 draws of the
-    population are simulated in each event and the new one. What the variance of the logarithm over them has more than
-    the largest one of the events is added to the variance of the new event.
-    See ``docs/theory/prediction.rst``.
+    The new event has its own expected scatter, from the model under its motion: near a resonance with a harmonic, a
+    number changes far more with frequency and damping than under an earthquake.
 
     Examples
     --------
@@ -192,7 +165,7 @@ def predict_new_event(
             f"predict_new_event: expected the posteriors of the events by name, {{name: posterior}}; got {posteriors!r}"
         )
     if isinstance(quantity, Mapping):
-        given = {"model": model, "form": form, "prior_sd": prior_sd, "prior_events": prior_events, "n": n, "seed": seed}
+        given = {"model": model, "spread": spread, "prior_events": prior_events, "n": n, "seed": seed}
         return {
             name: predict_new_event(
                 hierarchy, posteriors, record, quantity=each, noise=noise and not _is_number(each), **given, **options
@@ -209,28 +182,21 @@ def predict_new_event(
     if _is_number(quantity):
         if noise:
             raise ValueError("predict_new_event: numbers contain the errors of measurements already; noise=False")
-        given = {"form": form, "prior_sd": prior_sd, "prior_events": prior_events}
-        ratios = event_ratios(hierarchy, posteriors, quantity, **given)
-        rows = at_parameters(
-            ratios.at, read_source(predictor).model.parameter_names, n
-        )  # equal rows are simulated once
-        prediction = propagate(predictor, rows, record=record, quantity=quantity, **settings)
-        moved = read_source(predictor).model
-        moved = moved if record is None else under_record(moved, record)
-        tests = list(hierarchy.posterior.tests)
-        width = bandwidth(moved)
-        if all(is_narrow(width, bandwidth(read_source(posteriors[name]).model)) for name in tests):
+        spread = _checked_spread(spread)
+        ratios, remainder = _ratios(hierarchy, posteriors, quantity, spread, prior_events)
+        names = read_source(predictor).model.parameter_names
+        at = at_parameters(ratios.at, names, n)  # equal rows are simulated once
+        prediction = propagate(predictor, at, record=record, quantity=quantity, **settings)
+        rows = spread_rows([ratios.at[name] for name in names], names, spread)[1:]
+        changed = np.full((len(rows), *prediction.mean.shape), np.nan)
+        if len(rows):
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of draws beyond bounds, and what the prediction has said
-                seeds = np.random.SeedSequence(seed).spawn(1)[0]
-                draws, _ = draw_new_event(hierarchy, list(rows), _SENSITIVITY, None, seeds)
-                own = _log_sd(predictor, draws, quantity, record, settings)
-                events = [_log_sd(posteriors[name], draws, quantity, None, {}) for name in tests]
-            ratios = _widened(ratios, own, np.max(events, axis=0))
-            several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
-            found = check_widening(dict(zip(map(str, several), np.atleast_1d(ratios.widening).tolist(), strict=True)))
-            warn(found)
-            prediction = replace(prediction, findings=(*prediction.findings, *found))
+                warnings.simplefilter("ignore")  # the prediction has said it
+                own = settings | {"quantiles": (), "calibrated": (), "check": False}
+                moved = propagate(predictor, rows, record=record, quantity=quantity, **own)
+            changed[np.setdiff1d(np.arange(len(rows)), moved.failed)] = moved.values
+        sd = np.sqrt(log_variance(np.concatenate([prediction.values[:1], changed])) + remainder)
+        ratios = replace(ratios, new_sd=sd)
         prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
         return _corrected(prediction, ratios, np.random.default_rng(seed))
     source = read_source(predictor)
@@ -245,18 +211,72 @@ def predict_new_event(
     return propagate(predictor, draws, record=record, quantity=quantity, noise=noise, seed=own_seed, **settings)
 
 
-def _log_sd(predictor: Any, draws: Mapping[str, np.ndarray], quantity: Any, record: Any, settings: Any) -> np.ndarray:
-    """Standard deviation of the logarithm of a quantity over draws of the parameters, shaped like the quantity."""
-    options = settings | {"quantiles": (), "calibrated": (), "check": False, "progress": False}
-    source = read_source(predictor)
-    values = propagate(source.likelihood or source.model, draws, record=record, quantity=quantity, **options).values
-    return np.log(np.maximum(values, np.finfo(float).tiny)).std(axis=0)
+def _checked_spread(spread: Mapping[str, float] | None) -> Mapping[str, float]:
+    """The spread of the parameters, by default `BETWEEN_EVENTS`; ValueError if it is not positive."""
+    spread = BETWEEN_EVENTS if spread is None else spread
+    if not isinstance(spread, Mapping) or not all(0.0 < each < np.inf for each in spread.values()):
+        raise ValueError(
+            "spread: expected positive standard deviations of logarithms by the beginning of a parameter's name, such "
+            f'as {{"frequency": 0.02}}; got {spread!r}'
+        )
+    return spread
 
 
-def _widened(ratios: EventRatios, own: np.ndarray, of_events: np.ndarray) -> EventRatios:
-    """Ratios for a new event that depends more on the parameters than the events do."""
-    excess = np.maximum(np.square(own) - np.square(of_events), 0.0)
-    return replace(ratios, widening=np.sqrt(1.0 + excess / np.square(ratios.sd)))
+def _ratios(
+    hierarchy: Hierarchy | Mapping[str, float],
+    posteriors: Mapping[str, Any],
+    quantity: Any,
+    spread: Mapping[str, float],
+    prior_events: float,
+) -> tuple[EventRatios, np.ndarray]:
+    """As `event_ratios`, with the mean variance over the events that the spread of the parameters does not explain."""
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
+        raise ValueError(f"ratios of events need numbers such as quantity=peak(channel); got {quantity!r}")
+    of_population = isinstance(hierarchy, Hierarchy)
+    names = list(hierarchy.posterior.tests if of_population else posteriors)
+    if missing := [name for name in names if name not in posteriors]:
+        raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
+    at, found = hierarchy.median_test() if of_population else dict(hierarchy), []
+    for name in names:
+        source = read_source(posteriors[name])
+        if source.likelihood is None:
+            raise ValueError(
+                f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
+            )
+        try:
+            found.append(_event(source.likelihood, at, quantity, spread))
+        except ValueError as error:
+            raise ValueError(f"event {name!r}: {error}") from None
+    values, levels, of_parameters, of_remainder = (np.array(each) for each in zip(*found, strict=True))
+    remainder = of_remainder.mean(axis=0)
+    return EventRatios(values, np.sqrt(of_parameters + remainder), prior_events, levels, at=at), remainder
+
+
+def _event(likelihood: FELikelihood, at: Mapping[str, float], quantity: Any, spread: Mapping[str, float]) -> tuple:
+    """Ratio of measured to predicted value of one event, the predicted one, and the variances of the log ratio."""
+    model, measured = likelihood.model, measured_quantity(quantity, likelihood.measurements)
+    at_parameters(at, model.parameter_names, 1)
+    rows = spread_rows([at[name] for name in model.parameter_names], model.parameter_names, spread)
+    responses, reasons = likelihood.simulate(rows)
+    if reasons[0]:
+        raise SimulationFailed(reasons[0])
+    evaluate = evaluator(quantity, model.channels, model.dt, model.n_steps).function
+    values = np.array(
+        [
+            np.full(measured.shape, np.nan) if why else evaluate(each)
+            for each, why in zip(responses, reasons, strict=True)
+        ]
+    )
+    if not ((measured > 0.0) & (values[0] > 0.0)).all():
+        raise ValueError(f"ratios of events need positive values; measured {measured}, predicted {values[0]}")
+    residuals = None
+    if not noise_time_shifts(likelihood.noise):
+        residuals = likelihood.residuals_of(responses[0], rows[0])
+        residuals = residuals if residuals.shape == responses[0].shape else None
+    floor = PRIOR_SD if len(rows) == 1 or residuals is None else REMAINDER
+    remainder = remainder_variance(evaluate, responses, residuals, floor)
+    return measured / values[0], values[0], log_variance(values), remainder
 
 
 def _is_number(quantity: Any) -> bool:
@@ -302,12 +322,11 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
 
 
 def _corrected(prediction: Prediction, ratios: EventRatios, rng: np.random.Generator) -> Prediction:
-    """The prediction times draws of a new event's ratio."""
-    values = prediction.values * ratios.draw(prediction.values, rng)
-    effective = prediction.effective_sample_size
-    quantiles, errors = quantiles_with_errors(
-        values.reshape(len(values), -1), np.ones(len(values), dtype=int), prediction.probabilities, effective
-    )
+    """The prediction at fixed parameters times the ratio of a new event: exact quantiles, and draws that have them."""
+    predicted, n = prediction.values[0], len(prediction.values)
+    order = rng.permuted(np.tile(np.arange(n).reshape(-1, *[1] * predicted.ndim), (1, *predicted.shape)), axis=0)
+    values = predicted * ratios.quantile((order + 0.5) / n, predicted)
+    quantiles = [predicted * ratios.quantile(each, predicted) for each in prediction.probabilities]
     shape = (len(prediction.probabilities), *prediction.mean.shape)
     unknown = np.full(prediction.mean.shape, np.nan)  # exp(t) of Student's t has no mean
     return replace(
@@ -315,8 +334,8 @@ def _corrected(prediction: Prediction, ratios: EventRatios, rng: np.random.Gener
         mean=unknown,
         variance=unknown,
         standard_error=unknown,
-        quantiles=quantiles.reshape(shape),
-        quantile_error=errors.reshape(shape),
+        quantiles=np.reshape(quantiles, shape),
+        quantile_error=np.zeros(shape),
         values=values,
         noise=True,
     )

@@ -260,12 +260,12 @@ class Prediction:
         UserWarning
             If less than one sample is expected on each side of the intervals, which then have another level: with
             fewer than 20 samples for 0.9. If the predicted standard deviation of measured samples of histories is zero;
-            they are left out of the log score and of the PIT.
+            they are left out of the PIT.
 
         Notes
         -----
         Measurements contain the model error and sensor noise: score a prediction with ``noise=True``, unless the
-        quantity is known to be free of them. For histories, CRPS, log score and PIT are computed for normal
+        quantity is known to be free of them. For histories, CRPS and PIT are computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
         """
         if not 0.0 < level < 1.0:

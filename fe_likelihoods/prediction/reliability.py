@@ -40,9 +40,9 @@ __all__ = [
     "binomial_interval",
     "check_level",
     "contents",
+    "estimate",
     "exceedance",
     "exceedance_probability",
-    "interval_of_draws",
     "threshold_in_si",
     "unit_of_threshold",
     "with_collapses",
@@ -77,8 +77,7 @@ class Exceedance(NamedTuple):
     upper_by_events : ndarray or None
         With `EventRatios`, the upper end of the Clopper-Pearson interval for the share of events whose ratio exceeds,
         averaged over the samples: what the events tell without assuming normal log ratios. Where it is far above
-        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios,
-        and with the form "linear": ratios at other levels are no trials at the predicted level.
+        `upper`, no event was near the threshold, and the probability depends on the assumed tail. None without ratios.
     unit : str
         SI unit of the threshold; "SI" where its dimension is not known.
     """
@@ -237,32 +236,24 @@ def _of_values(
     values: np.ndarray, limits: np.ndarray, spread: EventSpread, effective: float, level: float, seed: int
 ) -> Exceedance:
     """Probability that values (n, ...) exceed limits."""
-    if spread.ratios is None and spread.weights is None:
-        if values.ndim == 1:
-            share = 1.0 - np.searchsorted(np.sort(values), limits, side="right") / len(values)
-        else:
-            share = (values > limits).mean(axis=0)
-        lower, upper = binomial_interval(share, effective, level)
-        error = np.sqrt(share * (1.0 - share) / effective)
-        return Exceedance(limits, share, error, lower, upper, effective)
-    if spread.ratios is not None:
+    ratios = spread.ratios
+    if ratios is not None:
         if not (limits > 0.0).all():
             raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
-        if spread.ratios.shape not in ((), values.shape[1:]):
+        if ratios.shape not in ((), values.shape[1:]):
             raise ValueError(
-                f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got "
-                f"{spread.ratios.values.shape}"
+                f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got {ratios.values.shape}"
             )
-    if spread.ratios is not None and spread.ratios.shape:  # each quantity has ratios of its own
+    if ratios is not None and ratios.shape:  # each quantity has ratios of its own
         rows = np.broadcast_to(limits, values.shape[1:])
         columns = [
             exceedance_probability(
-                values[:, k], rows[k], spread._replace(ratios=spread.ratios.of_quantity(k)), effective, level, seed
+                values[:, k], rows[k], spread._replace(ratios=ratios.of_quantity(k)), effective, level, seed
             )
             for k in range(len(rows))
         ]
         numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        by_events = None if spread.ratios.form == "linear" else np.array([each.upper_by_events for each in columns])
+        by_events = np.array([each.upper_by_events for each in columns])
         return Exceedance(limits, *numbers, effective, upper_by_events=by_events)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
@@ -278,31 +269,68 @@ def exceedance_probability(
     seed: int,
     below: bool = False,
 ) -> Exceedance:
-    """Probability of an exceedance with ratios, or in an event population, from the quantiles of its draws.
+    """Probability of an exceedance, see `estimate`."""
+    found = estimate(values, limits, spread, effective, level, seed, below)
+    values, limits = np.broadcast_arrays(values, limits)
+    by_events = None if spread.ratios is None else _upper_by_events(values, limits, spread.ratios, level, below)
+    return Exceedance(limits[0], *found[:4], effective, contents(False, spread), by_events)
 
-    The values (n, ...) are not yet multiplied by ratios, limits are broadcast to them, and other arguments are those of
-    `exceedance`. With `below`, values below a limit exceed it.
+
+class Estimate(NamedTuple):
+    """Probability (...) of an exceedance with its Monte Carlo error and interval, and what curves are fitted to."""
+
+    probability: np.ndarray
+    standard_error: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    single: np.ndarray  # (n, ...), of each sample
+    counted: np.ndarray  # (n, ...), 0 for failures that are left out, else 1
+    draws: np.ndarray | None  # (n_draws, ...), one per population of events
+
+
+def estimate(
+    values: np.ndarray,
+    limits: np.ndarray,
+    spread: EventSpread,
+    effective: float,
+    level: float,
+    seed: int | None,
+    below: bool = False,
+    exceeding: np.ndarray | None = None,
+) -> Estimate:
+    """Probability that values (n, ...) in a new event exceed limits, which are broadcast to them.
+
+    The values are not yet multiplied by ratios. NaN are failures, which are left out, or count as exceedances where
+    `exceeding`. With `below`, values below a limit exceed it. The interval is from quantiles of draws of the event
+    population, or the Clopper-Pearson interval without ratios and population.
     """
     values, limits = np.broadcast_arrays(values, limits)
-    single = exceedance_of_samples(values, limits, spread.ratios, below)
-    draws = exceedance_draws(values, limits, spread, np.random.default_rng(seed), below)
-    share, error = single.mean(axis=0), single.std(axis=0) / np.sqrt(effective)
-    lower, upper = interval_of_draws(draws, share, effective, spread, level)
-    by_events = None
-    if spread.ratios is not None and spread.ratios.form == "constant":
-        by_events = _upper_by_events(values, limits, spread.ratios, level, below)
-    return Exceedance(limits[0], share, error, lower, upper, effective, contents(False, spread), by_events)
+    failed = np.isnan(values)
+    exceeding = np.zeros(values.shape, dtype=bool) if exceeding is None else exceeding
+    known = np.where(failed, 1.0, values)
+    single = np.where(failed, exceeding, exceedance_of_samples(known, limits, spread.ratios, below))
+    counted = 1.0 - (failed & ~exceeding)
+    number_of = counted.sum(axis=0)
+    share, trials = (single * counted).sum(axis=0) / number_of, effective * number_of / len(values)
+    error = np.sqrt((np.square(single - share) * counted).sum(axis=0) / number_of / trials)
+    if spread.ratios is None and spread.weights is None:
+        return Estimate(share, error, *binomial_interval(share, trials, level), single, counted, None)
+    rng = np.random.default_rng(seed)
+    draws = exceedance_draws(values, limits, spread, rng, below, failed, exceeding)
+    return Estimate(share, error, *_interval_of_draws(draws, share, trials, spread, level), single, counted, draws)
 
 
 def _upper_by_events(
     values: np.ndarray, limits: np.ndarray, ratios: EventRatios, level: float, below: bool
 ) -> np.ndarray:
     """Upper end of the binomial interval for the share of events that exceed; each event is one trial."""
-    exceeded = [(values * each < limits if below else values * each > limits).mean(axis=0) for each in ratios.values]
+    logs = np.log(np.where(values > 0.0, values, 1.0))
+    moved = [values * ratios.of_event(k, logs) for k in range(len(ratios.values))]
+    exceeded = [(each < limits if below else each > limits).mean(axis=0) for each in moved]
     return binomial_interval(np.mean(exceeded, axis=0), len(ratios.values), level)[1]
 
 
-def interval_of_draws(
+def _interval_of_draws(
     draws: np.ndarray, share: np.ndarray, effective: ArrayLike, spread: EventSpread, level: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Interval of the probability `share` (...) from draws of it (n_draws, ...), NaN left out, extended to contain it.

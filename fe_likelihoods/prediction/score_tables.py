@@ -13,7 +13,7 @@ from ..signals.channels import Channel
 from ..signals.error_measures import rrmse
 from ..text_tables import text_table
 from ..units import from_si
-from .scores import crps_normal, crps_samples, interval_score, log_score_normal, pit_normal, pit_samples
+from .scores import crps_normal, crps_samples, interval_score, pit_normal, pit_samples
 
 __all__ = [
     "LEVELS",
@@ -51,8 +51,6 @@ class HistoryScores(NamedTuple):
         Relative root mean square error of the mean [-].
     crps : ndarray, shape (n_channels,)
         CRPS of the normal distributions with the predicted means and standard deviations.
-    log_score : ndarray, shape (n_channels,)
-        Minus the logarithm of their density.
     interval_score : ndarray, shape (n_channels,)
         Interval score of the band between the quantiles.
     width : ndarray, shape (n_channels,)
@@ -68,8 +66,8 @@ class HistoryScores(NamedTuple):
         Shares of the measured samples whose PIT (for the normal distributions) is in each tenth of 0 to 1: about 0.1
         each for a calibrated prediction; high at both ends if the prediction is too narrow, in the middle if too wide.
     without_spread : ndarray of int, shape (n_channels,)
-        Number of measured samples with a predicted standard deviation of zero. They are left out of `log_score` and
-        `pit`, which are NaN if no other samples are left.
+        Number of measured samples with a predicted standard deviation of zero. They are left out of `pit`, which is NaN
+        if no other samples are left.
     effective_samples : ndarray, shape (n_channels,)
         Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
         errors (`fe_likelihoods.effective_samples`): for the standard error of a coverage.
@@ -84,7 +82,6 @@ class HistoryScores(NamedTuple):
     rms: np.ndarray
     rrmse: np.ndarray
     crps: np.ndarray
-    log_score: np.ndarray
     interval_score: np.ndarray
     width: np.ndarray
     coverage: np.ndarray
@@ -96,20 +93,19 @@ class HistoryScores(NamedTuple):
     coverage_error: np.ndarray
 
     def __str__(self) -> str:
-        head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width", "log score"]
+        head = ["channel", "unit", "RMS", "RRMSE", "CRPS", "interval score", "width"]
         head += [f"in {self.level:.0%} band", "strong part", "weak", "moderate", "strong"]
         rows = [head]
         for k, channel in enumerate(self.channels):
             scaled = [from_si(a[k], channel.unit) for a in (self.rms, self.crps, self.interval_score, self.width)]
             rms, crps, score, width = (f"{each:.3g}" for each in scaled)
             row = [channel.name, channel.unit, rms, f"{self.rrmse[k]:.1%}", crps, score, width]
-            row.append(f"{self.log_score[k] + np.log(from_si(1.0, channel.unit)):.2f}")
             shares = [self.coverage[k], self.coverage_strong[k], *self.coverage_by_level[k]]
             rows.append(row + ["-" if np.isnan(share) else f"{share:.1%}" for share in shares])
         if not self.without_spread.any():
             return text_table(rows)
         left_out = ", ".join(f"{n} of {c.name}" for c, n in zip(self.channels, self.without_spread, strict=True) if n)
-        return f"{text_table(rows)}\nlog score without samples whose predicted standard deviation is zero: {left_out}"
+        return f"{text_table(rows)}\nPIT without samples whose predicted standard deviation is zero: {left_out}"
 
 
 class QuantityScores(NamedTuple):
@@ -136,9 +132,6 @@ class QuantityScores(NamedTuple):
         largest. An interval between such ranks has its level on average, also if it is estimated from few samples.
     crps : ndarray, shape (n_quantities,)
         CRPS of the samples, for their effective sample size.
-    log_score : ndarray, shape (n_quantities,)
-        Minus the logarithm of the normal density with the mean and the standard deviation of the samples; inf if these
-        are all equal.
     interval_score : ndarray, shape (n_quantities,)
         Interval score.
     pit : ndarray, shape (n_quantities,)
@@ -155,7 +148,6 @@ class QuantityScores(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     crps: np.ndarray
-    log_score: np.ndarray
     interval_score: np.ndarray
     pit: np.ndarray
     lower_quartile: np.ndarray
@@ -217,7 +209,6 @@ def score_histories(
         rms=np.sqrt(np.nanmean(np.square(measured), axis=1)),
         rrmse=error,
         crps=np.nanmean(crps_normal(*moments, measured), axis=1),
-        log_score=_mean(log_score_normal(*moments, measured), spread),
         interval_score=np.nanmean(interval_score(*band, measured, level), axis=1),
         width=_mean(band[1] - band[0], there),
         coverage=_mean(inside, there),
@@ -250,7 +241,6 @@ def score_values(
         lower=lower,
         upper=upper,
         crps=crps_samples(values, measured, effective_sample_size),
-        log_score=log_score_normal(values.mean(axis=0), values.std(axis=0, ddof=1), measured),
         interval_score=interval_score(lower, upper, measured, level),
         pit=pit_samples(values, measured),
         lower_quartile=quartiles[0],
@@ -292,7 +282,7 @@ def _warn_of_certainty(channels: Sequence[Channel], certain: np.ndarray, samples
     which = [f"{c.name} ({k} of {n})" for c, k, n in zip(channels, certain, samples, strict=True) if k]
     warnings.warn(
         f"score: the predicted standard deviation of measured samples is zero: {', '.join(which)}. They are left out "
-        "of the log score and of the PIT. Predict with noise=True; for a noise that is a share of the response, state "
+        "of the PIT. Predict with noise=True; for a noise that is a share of the response, state "
         "the noise of the sensors too, such as GaussianNoise(model.channels, sensor=...)",
         stacklevel=4,
     )

@@ -7,7 +7,6 @@ of measurements in a band (coverage) is not a score: a band that is ten times to
 =====================  ===============================================================================================
 CRPS                   Integral of the squared difference between the predicted distribution function and the step at
                        the measured value, in the unit of the quantity; the absolute error if the prediction is a number
-log score              Minus the logarithm of the predicted density at the measured value
 interval score         Width of an interval plus a penalty for every measured value outside it
 PIT                    Probability integral transform: the predicted probability of a value below the measured one;
                        uniform between 0 and 1 if the predictions are calibrated
@@ -19,9 +18,6 @@ References
 ----------
 T. Gneiting, A. E. Raftery (2007), Strictly proper scoring rules, prediction, and estimation, Journal of the American
 Statistical Association 102, 359-378, doi:10.1198/016214506000001437.
-
-A. P. Dawid, P. Sebastiani (1999), Coherent dispersion criteria for optimal experimental design, The Annals of
-Statistics 27, 65-81, doi:10.1214/aos/1018031101.
 
 C. A. T. Ferro (2014), Fair scores for ensemble forecasts, Quarterly Journal of the Royal Meteorological Society 140,
 1917-1923, doi:10.1002/qj.2270.
@@ -38,7 +34,6 @@ __all__ = [
     "crps_normal",
     "crps_samples",
     "interval_score",
-    "log_score_normal",
     "pit_normal",
     "pit_samples",
     "share_within",
@@ -73,37 +68,6 @@ def crps_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarr
         z = error / sd
         score = sd * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * _density(z) - 1.0 / np.sqrt(np.pi))
     return np.where(sd > 0.0, score, np.abs(error))
-
-
-def log_score_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
-    """Minus the logarithm of the normal density with a mean and a standard deviation at the measured values.
-
-    For a prediction that is not normal this is, up to a constant, half the score of Dawid and Sebastiani (1999). It is
-    proper too, but judges mean and standard deviation only.
-
-    Parameters
-    ----------
-    mean, sd : (...) array_like
-        Mean and standard deviation of the predictions.
-    observed : (...) array_like
-        Measured values, NaN where missing.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        The scores, for values in the unit that they are given in. A unit that is f times larger lowers them by log(f).
-        A standard deviation of zero gives inf.
-
-    Raises
-    ------
-    ValueError
-        If a standard deviation is negative.
-    """
-    mean, sd, observed = _normal("log_score_normal", mean, sd, observed)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = (observed - mean) / sd
-        score = 0.5 * np.log(2.0 * np.pi) + np.log(sd) + 0.5 * z * z
-    return np.where((sd > 0.0) | np.isnan(observed), score, np.inf)
 
 
 def crps_samples(values: ArrayLike, observed: ArrayLike, effective_sample_size: float | None = None) -> np.ndarray:

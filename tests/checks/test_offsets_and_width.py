@@ -6,7 +6,7 @@ import pytest
 from fe_likelihoods import Channel, Measurements
 from fe_likelihoods.checks.compared import ChannelFit, Compared, Fit, Fits
 from fe_likelihoods.checks.finding import judge
-from fe_likelihoods.checks.fit import check_residuals, check_responses, describe_residuals
+from fe_likelihoods.checks.fit import check_other_events, check_residuals, check_responses, describe_residuals
 from fe_likelihoods.checks.table import ParameterRow
 from fe_likelihoods.noise.residuals import residual_checks
 
@@ -88,3 +88,20 @@ def test_a_wider_standard_deviation_is_between_that_of_the_data_and_the_prior():
     assert row(0.99, 1.0).widened(100.0) == pytest.approx(1.0, abs=1e-3)
     assert row(0.5, 1.0).widened(1.0) == pytest.approx(0.5)
     assert row(1.2, 1.0).widened(3.0) == 1.2 and row(0.0, 1.0).widened(3.0) == 0.0
+
+
+def test_one_event_says_by_which_factor_its_errors_are_too_small_for_another_one():
+    """Two events differ by the square root of two times the spread between events; other parameters are not named."""
+    nan = float("nan")
+
+    def row(name, mean, sd):
+        return ParameterRow(name, name, "", "", 1.0, 1.0, mean, nan, sd, sd / mean, 0.0, 2.0, nan, nan, 0.0, np.inf)
+
+    (found,) = check_other_events([row("frequency", 4.0, 0.002), row("damping", 0.1, 0.01), row("share", 0.8, 0.01)])
+    expected = {
+        "frequency": np.sqrt(1.0 + 2.0 * (0.02 / 0.0005) ** 2),
+        "damping": np.sqrt(1.0 + 2.0 * (0.2 / 0.1) ** 2),
+    }
+    assert found.numbers == pytest.approx(expected) and found.severity == "note"
+    assert "too small by factors of 57 (frequency)" in found.text and "3 (damping)" in found.text
+    assert check_other_events([row("share", 0.8, 0.01)]) == check_other_events([row("damping", 0.1, 0.0)]) == []

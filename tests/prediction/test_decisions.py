@@ -137,16 +137,16 @@ def test_what_the_events_tell_of_a_probability_without_the_form_of_their_ratios(
 
 
 @pytest.mark.parametrize("slope", [-0.22, 0.22])
-def test_events_at_other_levels_are_no_trials_of_the_predicted_one(slope, rng):
+def test_events_at_other_levels_are_trials_of_the_predicted_one_along_their_line(slope, rng):
     """Ratios with a trend: the share of the raw ones was below the probability, or far above it."""
     levels = np.geomspace(0.1, 2.0, 12)
     values = np.exp(0.3 + slope * np.log(levels / 0.1) + 0.03 * rng.standard_normal(12))
     predicted = 2.0 * np.exp(0.01 * rng.standard_normal(400))
     limits = 2.0 * np.exp(0.3 + slope * np.log(20.0)) * np.array([0.95, 1.0, 1.05])
-    found = exceedance(predicted, limits, ratios=EventRatios(values, prior_events=0, levels=levels, form="linear"))
+    found = exceedance(predicted, limits, ratios=EventRatios(values, prior_events=0, levels=levels, slope_sd=1.0))
     assert np.all((found.lower <= found.probability) & (found.probability <= found.upper))
     assert 0.7 < found.probability[0] and found.probability[2] < 0.3
-    assert found.upper_by_events is None and "events alone" not in str(found)
+    assert found.upper_by_events[0] > 0.9 and found.upper_by_events[2] < 0.5
     # control: the same ratios without levels are trials of one population, of which the share is known
     middle = 2.0 * np.exp(np.log(values).mean())
     share = np.mean([(predicted * each > middle).mean() for each in values])

@@ -35,7 +35,7 @@ def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_w
     assert ratios.degrees_of_freedom == 9.0
     assert ratios.sd == pytest.approx(np.sqrt((6.0 * 0.04 + squares) / 9.0))
     assert ratios.prior_share == pytest.approx(0.24 / (0.24 + squares))
-    assert f"{ratios.prior_share:.0%}" in str(ratios) and "prior of the scatter 0.2, worth 6 events" in str(ratios)
+    assert f"{ratios.prior_share:.0%}" in str(ratios) and "is worth 6 events" in str(ratios)
     certain = EventRatios(np.exp(LOGS), prior_sd=0.3, prior_events=1e6)  # replaces the scatter of the events
     assert np.log(certain.quantile(0.95) / certain.quantile(0.5)) == pytest.approx(
         0.3 * np.sqrt(1.25) * stats.norm.ppf(0.95), rel=1e-4
@@ -49,26 +49,55 @@ def test_the_prior_of_the_scatter_is_worth_its_events_and_says_how_much_of_the_w
     assert both.of_quantity(1).sd == pytest.approx(both.sd[1])
 
 
-def test_a_line_is_the_regression_of_the_textbook(events):
+def test_each_ratio_counts_by_its_expected_scatter(rng):
+    """The conjugate posterior of a weighted regression with a prior of its slope, in matrices."""
+    levels, sd = np.exp(rng.standard_normal((8, 2))), 0.05 + 0.2 * rng.random((8, 2))
+    values = np.exp(0.1 + 0.2 * np.log(levels) + sd * rng.standard_normal((8, 2)))
+    ratios = EventRatios(values, sd, 6.0, levels, slope_sd=0.3, new_sd=[0.1, 0.2])
+    at, p = 1.7, np.array([0.05, 0.5, 0.95])
+    for k, new_sd in enumerate((0.1, 0.2)):
+        y, x, w = np.log(values[:, k]), np.log(levels[:, k]), sd[:, k] ** -2
+        rows = np.column_stack([np.ones(8), x])
+        precision = rows.T @ (w[:, None] * rows) + np.diag([0.0, 0.3**-2])
+        line = np.linalg.solve(precision, rows.T @ (w * y))
+        factor = (6.0 + w @ np.square(y - rows @ line) + line[1] ** 2 / 0.3**2) / 13.0
+        row = np.array([1.0, at])
+        scale = np.sqrt(factor * (new_sd**2 + row @ np.linalg.solve(precision, row)))
+        expected = stats.t(13, row @ line, scale).ppf(p)
+        single = ratios.of_quantity(k)
+        for found in (single.quantile(p, np.exp(at)), ratios.quantile(p[:, None], np.exp(at))[:, k]):
+            np.testing.assert_allclose(np.log(found), expected, rtol=1e-9)
+        assert single.sd == pytest.approx(np.sqrt(factor) * new_sd)
+
+
+def test_a_flat_prior_of_the_slope_gives_the_regression_of_the_textbook(events):
     values, levels = events
-    ratios = EventRatios(values, prior_events=0, levels=levels, form="linear")
+    ratios = EventRatios(values, prior_events=0, levels=levels, slope_sd=1e6)
     x, at = np.log(levels), np.array([-2.0, 0.0, 0.7, 3.0])
     slope, offset = np.polyfit(x, np.log(values), 1)
-    np.testing.assert_allclose(np.log(ratios.quantile(0.5, np.exp(at))), offset + slope * at, atol=1e-10)
-    residual = np.sqrt(np.square(np.log(values) - offset - slope * x).sum() / 6)
+    np.testing.assert_allclose(np.log(ratios.quantile(0.5, np.exp(at))), offset + slope * at, atol=1e-8)
+    residual = np.sqrt(np.square(np.log(values) - offset - slope * x).sum() / 7)
     textbook = residual * np.sqrt(1.0 + 1.0 / 8 + (at - x.mean()) ** 2 / np.square(x - x.mean()).sum())
     width = np.log(ratios.quantile(0.95, np.exp(at)) / ratios.quantile(0.5, np.exp(at)))
-    np.testing.assert_allclose(width, stats.t.ppf(0.95, 6) * textbook, rtol=1e-10)
-    several = EventRatios(np.stack([values, values], axis=1), levels=np.stack([levels, levels], axis=1), form="linear")
-    single = EventRatios(values, levels=levels, form="linear")
-    np.testing.assert_allclose(several.quantile(0.9, [2.0, 5.0]), single.quantile(0.9, [2.0, 5.0]))
-    np.testing.assert_allclose(several.of_quantity(0).quantile(0.9, 2.0), single.quantile(0.9, 2.0))
+    np.testing.assert_allclose(width, stats.t.ppf(0.95, 7) * textbook, rtol=1e-8)
+    np.testing.assert_allclose(
+        EventRatios(values, levels=levels, slope_sd=0.0).quantile(0.9, 5.0), EventRatios(values).quantile(0.9)
+    )
 
 
-@pytest.mark.parametrize("form", ("constant", "linear"))
-def test_draws_populations_and_probabilities_belong_together(events, form):
+def test_one_event_predicts_another_level_with_the_uncertainty_of_the_slope():
+    """No event tells of the slope: it adds its prior to the variance, and nothing at the level of the event."""
+    one = EventRatios([1.2], levels=[0.1], slope_sd=0.05)
+    width = np.log(one.quantile(0.95, [0.1, 1.0]) / one.quantile(0.5, [0.1, 1.0])) / stats.t.ppf(0.95, PRIOR_EVENTS)
+    line = 0.05 * np.log(10.0)
+    # the prior of the slope is in units of the scatter's factor, which is one here
+    np.testing.assert_allclose(width, [np.sqrt(2.0) * PRIOR_SD, np.sqrt(2.0 * PRIOR_SD**2 + line**2)])
+
+
+@pytest.mark.parametrize("slope_sd", (0.0, 1.0))
+def test_draws_populations_and_probabilities_belong_together(events, slope_sd):
     values, levels = events
-    ratios, rng = EventRatios(values, levels=levels, form=form), np.random.default_rng(1)
+    ratios, rng = EventRatios(values, levels=levels, slope_sd=slope_sd), np.random.default_rng(1)
     populations = ratios.draw_populations(4000, rng)
     for level in (0.05, 1.0, 8.0):
         limit = ratios.quantile(0.8, level)
@@ -114,11 +143,11 @@ def test_the_prior_covers_where_scatters_differ_as_it_states_and_helps_the_worst
 
 @pytest.mark.parametrize("truth", ("slope 0", "slope 0.2"))
 def test_lines_cover_new_events_and_constant_ratios_miss_far_ones(truth):
-    found = [ratio_twin(truth, 10, "linear", seed) for seed in range(40)]
+    found = [ratio_twin(truth, 10, 1.0, seed) for seed in range(40)]
     inside, far, score = (np.array(each) for each in zip(*found, strict=True))
     for k, level in enumerate((0.5, 0.9)):
         assert abs(inside[:, k].mean() - level) < 4.0 * inside[:, k].std() / np.sqrt(40)
-    found = [ratio_twin(truth, 10, "constant", seed) for seed in range(40)]
+    found = [ratio_twin(truth, 10, 0.0, seed) for seed in range(40)]
     _, far_constant, score_constant = (np.array(each) for each in zip(*found, strict=True))
     shares = [each[:, 1].sum() / each[:, 2].sum() for each in (far, far_constant)]
     assert shares[0] > 0.8
@@ -134,19 +163,17 @@ def test_what_cannot_be_used_is_refused():
             EventRatios(bad)
     with pytest.raises(ValueError, match="prior_sd must be positive"):
         EventRatios([1.0, 1.1], prior_sd=0.0)
-    with pytest.raises(ValueError, match=r"one prior_sd, or one per quantity, \(2,\)"):
+    with pytest.raises(ValueError, match=r"one prior_sd, one per quantity, \(2,\)"):
         EventRatios([[1.0, 1.1]], prior_sd=[0.1, 0.1, 0.1])
-    for too_few in ({"values": [1.1]}, {"values": [1.0, 1.1], "levels": [1.0, 2.0], "form": "linear"}):
-        with pytest.raises(ValueError, match="do not show how ratios scatter"):
-            EventRatios(**too_few, prior_events=0)
+    with pytest.raises(ValueError, match="does not show how ratios scatter"):
+        EventRatios([1.1], prior_events=0)
+    with pytest.raises(ValueError, match="new_sd must be positive"):
+        EventRatios([1.0, 1.1], new_sd=0.0)
+    with pytest.raises(ValueError, match="slope_sd zero or more"):
+        EventRatios([1.0, 1.1], slope_sd=-0.1)
     for bad in ([1.0], [1.0, 0.0], [1.0, np.inf]):
         with pytest.raises(ValueError, match="one positive predicted value for each ratio"):
             EventRatios([1.0, 1.1], levels=bad)
-    with pytest.raises(ValueError, match="form must be one of constant, linear"):
-        EventRatios([1.0, 1.1], levels=[1.0, 2.0], form="smooth")
-    for levels in (None, [2.0, 2.0]):
-        with pytest.raises(ValueError, match="a linear form needs levels= of events that differ"):
-            EventRatios([1.0, 1.1], levels=levels, form="linear")
     for p, level in ((1.5, 1.0), (0.5, 0.0)):
         with pytest.raises(ValueError, match="expected probabilities between 0 and 1 and positive"):
             EventRatios([1.0, 1.1]).quantile(p, level)

@@ -122,10 +122,10 @@ def test_the_unit_of_an_intensity_of_the_users_own_is_not_invented():
 
 def test_ratios():
     text = str(RATIOS)
-    assert text.startswith("Ratios of measured to predicted values in 3 events, form constant; prior of the scatter")
+    assert text.startswith("Ratios of measured to predicted values in 3 events, and in a new one; the expected scatter")
     low, high = RATIOS.quantile([0.05, 0.95])
-    assert cells(text, 2) == ["1", "any", "1", f"{low:.3g} to {high:.3g}", f"{RATIOS.prior_share:.0%}"]
-    line = EventRatios([1.3, 1.2, 1.1, 0.98, 0.9], levels=[0.1, 0.3, 0.5, 1.0, 2.0], form="linear")
+    assert cells(text, 2) == ["1", "any", "1", f"{low:.3g} to {high:.3g}", "0.12", f"{RATIOS.prior_share:.0%}"]
+    line = EventRatios([1.3, 1.2, 1.1, 0.98, 0.9], levels=[0.1, 0.3, 0.5, 1.0, 2.0], slope_sd=1.0)
     text = str(line)
     assert [cells(text, row)[1] for row in (2, 3)] == ["0.1", "2"]
     assert float(cells(text, 2)[2]) == pytest.approx(line.quantile(0.5, 0.1), rel=5e-3)

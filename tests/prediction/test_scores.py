@@ -18,7 +18,6 @@ from fe_likelihoods.prediction.scores import (
     crps_normal,
     crps_samples,
     interval_score,
-    log_score_normal,
     pit_normal,
     pit_samples,
     share_within,
@@ -37,14 +36,12 @@ def test_scores_of_a_normal_distribution_are_those_of_its_definitions(y):
     below = integrate.quad(lambda x: stats.norm.cdf(x, mean, sd) ** 2, -12.0, y)[0]
     above = integrate.quad(lambda x: stats.norm.sf(x, mean, sd) ** 2, y, 12.0)[0]
     assert crps_normal(mean, sd, y) == pytest.approx(below + above, abs=1e-7)
-    assert log_score_normal(mean, sd, y) == pytest.approx(-stats.norm.logpdf(y, mean, sd), rel=1e-12)
     assert pit_normal(mean, sd, y) == pytest.approx(stats.norm.cdf(y, mean, sd), rel=1e-12)
 
 
 def test_a_prediction_without_spread_scores_its_absolute_error():
     assert crps_normal(1.0, 0.0, 3.5) == 2.5
     assert crps_samples([1.0, 1.0, 1.0], 3.5) == 2.5
-    assert log_score_normal(1.0, 0.0, 3.5) == np.inf
 
 
 def test_crps_of_samples_is_the_sum_over_pairs_and_unbiased(rng):
@@ -68,7 +65,7 @@ def test_scores_are_proper_and_coverage_is_not(rng):
 
     def scores(mean, sd):
         band = mean - half * sd, mean + half * sd
-        return crps_normal(mean, sd, y), log_score_normal(mean, sd, y), interval_score(*band, y, 0.9)
+        return crps_normal(mean, sd, y), interval_score(*band, y, 0.9)
 
     truth = scores(0.0, 1.0)
     for wrong in ((0.3, 1.0), (0.0, 0.6), (0.0, 1.6), (0.0, 10.0)):
@@ -100,8 +97,6 @@ def test_missing_values_have_no_score():
     observed = np.array([np.nan, 1.0])
     for scores in (
         crps_normal(0.0, 1.0, observed),
-        log_score_normal(0.0, 1.0, observed),
-        log_score_normal(0.0, [0.0, 1.0], observed),
         interval_score(-1.0, 1.0, observed, 0.9),
         pit_normal(0.0, 1.0, observed),
         pit_samples(np.zeros((3, 2)), observed),
@@ -113,7 +108,7 @@ def test_missing_values_have_no_score():
 def test_what_is_no_distribution_or_interval_is_refused():
     with pytest.raises(ValueError, match="2 of 3 are above: exchange them"):
         interval_score([1.0, 1.0, np.nan], [-1.0, 0.5, 2.0], 0.0, 0.9)
-    for score in (crps_normal, log_score_normal, pit_normal):
+    for score in (crps_normal, pit_normal):
         with pytest.raises(ValueError, match=r"zero or more; the smallest is -1\.0"):
             score(0.0, [1.0, -1.0, np.nan], 0.3)
     np.testing.assert_array_equal(pit_samples([[1.0, 1.0], [np.nan, 2.0]], [2.0, 1.5]), [np.nan, 0.5])
@@ -200,7 +195,6 @@ def test_scores_of_histories_are_averages_over_the_measured_samples(oscillator, 
         mean, sd, y = (each[k, there[k]] for each in (prediction.mean, prediction.sd, values))
         lower, upper = (prediction.quantile(p)[k, there[k]] for p in (0.05, 0.95))
         assert scores.crps[k] == pytest.approx(crps_normal(mean, sd, y).mean(), rel=1e-12)
-        assert scores.log_score[k] == pytest.approx(log_score_normal(mean, sd, y).mean(), rel=1e-12)
         assert scores.interval_score[k] == pytest.approx(interval_score(lower, upper, y, 0.9).mean(), rel=1e-12)
         assert scores.pit[k].sum() == pytest.approx(1.0)
     np.testing.assert_array_equal(scores.coverage, prediction.coverage(measured))
@@ -217,7 +211,7 @@ def test_the_true_noise_scores_best_and_covers_every_level(rng):
     right, narrow, wide = (
         propagate(posterior, samples(400, f), noise=True, seed=1, progress=False).score(measured) for f in (1, 0.3, 4)
     )
-    for name in ("crps", "log_score", "interval_score"):
+    for name in ("crps", "interval_score"):
         assert (getattr(right, name) < getattr(narrow, name)).all() and (
             getattr(right, name) < getattr(wide, name)
         ).all()
@@ -274,7 +268,7 @@ def test_what_cannot_be_scored_is_refused(oscillator, rng):
         final_value("displacement", 0)
 
 
-def test_samples_at_rest_are_left_out_of_log_score_and_pit(rng):
+def test_samples_at_rest_are_left_out_of_the_pit(rng):
     """A windowed share of the response predicts no noise before the motion: the score counts and names such samples."""
     n = 600
     shape = np.where(np.arange(n) < 200, 0.0, np.sin(0.3 * np.arange(n)))
@@ -293,7 +287,7 @@ def test_samples_at_rest_are_left_out_of_log_score_and_pit(rng):
     with pytest.warns(UserWarning, match=r"is zero: top \(198 of 600\)\. .*sensor="):
         scores = predicted().score(measured)
     assert scores.without_spread.tolist() == [198, 0] and str(scores).endswith("is zero: 198 of top")
-    assert np.isfinite(scores.log_score).all() and np.isfinite(scores.crps).all()
+    assert np.isfinite(scores.crps).all()
     np.testing.assert_allclose(scores.pit.sum(axis=1), 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -327,8 +321,6 @@ def test_quantities_are_scored_for_the_effective_sample_size_of_the_prediction(o
     scores, values = prediction.score(measured), prediction.values[:, None]
     assert scores.crps[0] == pytest.approx(crps_samples(values, scores.measured, 10.0)[0], rel=1e-12)
     assert scores.crps[0] < crps_samples(values, scores.measured)[0]
-    expected = log_score_normal(values.mean(), values.std(ddof=1), scores.measured)
-    assert scores.log_score[0] == pytest.approx(expected[0], rel=1e-12)
 
 
 def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator, rng):
@@ -341,7 +333,7 @@ def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator
     )
     with pytest.warns(UserWarning, match=r"noise=True"):  # equal samples without noise
         scores = prediction.score(coarse)
-    assert scores.without_spread.tolist() == [25] and np.isnan(scores.log_score[0])
+    assert scores.without_spread.tolist() == [25] and np.isnan(scores.pit[0]).all()
     assert scores.samples.tolist() == [25] and scores.rrmse[0] < 1e-9
 
 

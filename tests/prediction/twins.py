@@ -48,7 +48,7 @@ _PROBABILITIES = np.linspace(0.05, 0.95, 9)  # of the true curve at the intensit
 _GRID = np.meshgrid(np.linspace(-2.0, 2.0, 161), np.linspace(0.0025, 1.2, 120), indexing="ij")
 
 
-def ratio_twin(truth: str, events: int, form: str, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+def ratio_twin(truth: str, events: int, slope_sd: float, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Shares of new events within intervals of 50 and 90 %, the counts of far ones (and their number), and the score.
 
     The ratios have no prior of their scatter.
@@ -56,7 +56,7 @@ def ratio_twin(truth: str, events: int, form: str, seed: int) -> tuple[np.ndarra
     rng = np.random.default_rng([seed, events])
     x = _LEVEL_SD * rng.standard_normal(events + _NEW)
     logs = TRUTHS[truth](x) + _SD * rng.standard_normal(len(x))
-    ratios = EventRatios(np.exp(logs[:events]), prior_events=0, levels=np.exp(x[:events]), form=form)
+    ratios = EventRatios(np.exp(logs[:events]), prior_events=0, levels=np.exp(x[:events]), slope_sd=slope_sd)
     new, at = logs[events:], x[events:]
     above = ratios.probability_above(np.exp(new), at)
     inside = np.stack([np.abs(above - 0.5) <= 0.5 * level for level in (0.5, 0.9)])
