@@ -70,7 +70,7 @@ class LoadTest:
     @property
     def measurements(self) -> Measurements:
         """The values as measurements with one step per load case."""
-        return Measurements(self.channels, 1.0, self.values, f"load cases {', '.join(self.cases)}")
+        return Measurements(self.channels, 1.0, self.values, "load test", axis="load case", points=self.cases)
 
     @property
     def known(self) -> dict[str, float]:
@@ -79,9 +79,7 @@ class LoadTest:
 
     def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> FunctionModel:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
-        model = FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
-        model.time_label = "load case"
-        return model
+        return FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
 
     def table(self, response: Any) -> str:
         """Measured and computed values (n_channels, n_cases) in the units of the channels, as text."""

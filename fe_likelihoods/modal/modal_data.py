@@ -38,6 +38,8 @@ class ModalData:
         Known standard deviation of a component of a shape with a norm of 1, for example 0.02.
     mode_numbers : sequence of int, optional
         Numbers of the modes, used as names and to find the computed modes without a measured shape. Default: 1 to m.
+    description : str
+        What was measured, where and when.
 
     Attributes
     ----------
@@ -66,6 +68,7 @@ class ModalData:
     covariance: Any = None
     shape_error: Any = None
     mode_numbers: Sequence[int] | None = None
+    description: str = ""
 
     def __post_init__(self) -> None:
         frequencies = _numbers("frequencies", self.frequencies, (1, 2))

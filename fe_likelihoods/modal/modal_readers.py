@@ -70,6 +70,7 @@ def read_modal_data(
         return _of_result(source, sensors, options)
     if not isinstance(source, str | Path):
         raise ValueError(f"read_modal_data: expected a path, or a result with Fn and Phi; got {type(source).__name__}")
+    options = {"description": Path(source).name} | options
     if Path(source).suffix.lower() == ".mat":
         return _of_matlab(Path(source), sensors, unit, variables or {}, options)
     return _of_table(read_table(source), sensors, unit, options)

@@ -59,7 +59,7 @@ class PairedModes:
 
     dt = 1.0
     path_dependent = False
-    time_label = "frequency, then components of the shape"
+    axis = "frequency, then components of the shape"
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
         self.model, self.data, self.close = model, data, close
@@ -98,7 +98,10 @@ class PairedModes:
     def measurements(self) -> Measurements:
         """The data as measurements of the channels."""
         values = self._joined(self._there.astype(float), self._measured.shapes)
-        return Measurements(self.channels, self.dt, values, "natural frequencies and mode shapes")
+        sets = [f" of set {k + 1}" if self.data.n_sets > 1 else "" for k in range(self.data.n_sets)]
+        points = [f"{what}{end}" for end in sets for what in ("frequency", *self.data.sensors)]
+        text = " of ".join(filter(None, ["natural frequencies and mode shapes", self.data.description]))
+        return Measurements(self.channels, self.dt, values, text, axis=self.axis, points=points)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
