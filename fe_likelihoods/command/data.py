@@ -83,7 +83,7 @@ def read_base_motion(job: Job) -> Record | None:
     """
     given = job.record
     if not given:
-        if job.kind in ("column", "bridge", "oscillator", "frame"):
+        if job.kind in ("column", "bridge", "oscillator", "frame", "grouped frame"):
             raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
         return None
     _one_source(job, "record")

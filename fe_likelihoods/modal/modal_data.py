@@ -195,6 +195,15 @@ class ModalData:
         columns = [self.sensors.index(name) for name in sensors]
         return replace(self, shapes=self.shapes[:, :, columns], sensors=tuple(sensors))
 
+    def named(self, sensors: Sequence[str]) -> "ModalData":
+        """Return the data with other names of the sensors, in their order."""
+        return replace(self, sensors=tuple(sensors))
+
+    def with_errors(self, frequency_cv: Any = None, shape_error: Any = None) -> "ModalData":
+        """Return the data with known errors, as those of the class; None keeps the present ones."""
+        errors = {"frequency_cv": frequency_cv, "shape_error": shape_error}
+        return replace(self, **{name: value for name, value in errors.items() if value is not None})
+
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.
 

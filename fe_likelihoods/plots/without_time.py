@@ -136,7 +136,7 @@ def _name(axes: Axes, names: list[str]) -> None:
     axes.set_xlim(-0.6, len(names) - 0.4)
 
 
-def plot_modes(modes: PredictedModes, before: PredictedModes | None = None) -> Figure:
+def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, label: str = "posterior, 90 %") -> Figure:
     """Plot measured and computed natural frequencies, and the mode shapes at the sensors.
 
     Parameters
@@ -145,6 +145,8 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None) -> F
         Modes at samples of the posterior (`ModalLikelihood.predict_modes`).
     before : PredictedModes, optional
         Modes at draws of the prior.
+    label : str
+        What `modes` are.
 
     Returns
     -------
@@ -167,7 +169,7 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None) -> F
             places - 0.2, middle, reach, fmt="D", color=GREY, fillstyle="none", label="prior, 90 %", capsize=3
         )
     middle, reach = _interval(modes.frequencies / measured)
-    first.errorbar(places + 0.2, middle, reach, fmt="s", color=BLUE, markersize=3, label="posterior, 90 %", capsize=3)
+    first.errorbar(places + 0.2, middle, reach, fmt="s", color=BLUE, markersize=3, label=label, capsize=3)
     errors = modes.paired.frequency_cv
     text = "measured" if errors is None else "measured, with its standard deviation"
     for each in data.frequencies / measured:
