@@ -20,10 +20,10 @@ from ..signals.records import Record
 from ..simulation.model import Model
 from .data import is_dataset, read_base_motion, read_bundled, read_measured
 from .job import Job
+from .modes_and_loads import FRAMES, has_no_time, load_likelihood, modal_likelihood
 from .noises import make_noise
 from .priors import parse_prior
 from .schema import did_you_mean, part_keys
-from .modes_and_loads import FRAMES, has_no_time, load_likelihood, modal_likelihood
 
 __all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
