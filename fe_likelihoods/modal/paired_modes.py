@@ -13,7 +13,7 @@ import numpy as np
 from ..models.base import digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
-from ..simulation.model import Model, SimulationFailed
+from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from ..simulation.user_code import is_of_user
 from .modal_data import ModalData
 from .pairing import Paired, pair_modes
@@ -90,6 +90,8 @@ class PairedModes:
             return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
         if model is not None and name in _OF_THE_MODEL:
             return getattr(model, name)
+        if model is not None and name == "simulate_together" and hasattr(model, "simulate_together"):
+            return self._simulate_together
         if model is not None and name == "jacobian" and getattr(model, "jacobian", None) is not None:
             return self._differentiate
         raise AttributeError(f"{type(self).__name__} has no {name}")
@@ -105,7 +107,22 @@ class PairedModes:
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
-        paired = self.pair(self.model.simulate(theta))
+        return self._response(self.model.simulate(theta))
+
+    def _simulate_together(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
+        """Responses at parameters (n, n_parameters), from a run that answers other data sets too."""
+        batch = self.model.simulate_together(thetas, pool)
+        found, reasons = np.full((len(thetas), len(self.channels), self.n_steps), np.nan), list(batch.reasons)
+        for row, modes in enumerate(batch.response):
+            if not reasons[row]:
+                try:
+                    found[row] = self._response(modes)
+                except SimulationFailed as error:
+                    reasons[row] = error.reason
+        return SimulationBatch(found, reasons)
+
+    def _response(self, modes: np.ndarray) -> np.ndarray:
+        paired = self.pair(modes)
         return self._joined(self._ratios(paired.frequencies), paired.shapes)
 
     def pair(self, modes: np.ndarray) -> Paired:
