@@ -41,10 +41,10 @@ def check_modes(fit: Any) -> list[Finding]:
 def _check_errors(fit: Any) -> list[Finding]:
     """Stated errors that samples show to be too small."""
     likelihood, noise = fit.likelihood, fit.likelihood.noise
-    if fit.samples is None or noise.parameter_names or not hasattr(noise, "deviations"):
+    if fit.samples is None or noise.parameter_names or getattr(noise, "student", True):
         return []
     sums = likelihood.simulator.statistics(fit.points[:, : len(likelihood.model.parameter_names)])
-    deviations = np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1)
+    deviations = np.repeat(np.concatenate(noise.deviations(np.zeros((1, 0))), axis=1), noise.n_sets, axis=1)
     squares = sums[:, len(noise.channels) :] / np.square(deviations)
     least, data = float(np.nanmin(squares.sum(axis=1))), sum(noise.counts) + sum(noise.freedoms)
     if not chi2.sf(least, data) < SMALL_PROBABILITY:

@@ -83,8 +83,8 @@ def _without_time(job: Job, cache: SimulationCache | None) -> Problem:
         likelihood, known = _located(
             job, "load_test", lambda: load_likelihood(job, workers, cache, channels, make_model)
         )
-        law = _located(job, "noise", lambda: make_noise(job, likelihood.model))
-        likelihood = likelihood.with_noise(law)
+        if job.noise:
+            likelihood = likelihood.with_noise(_located(job, "noise", lambda: make_noise(job, likelihood.model)))
     if twice := [name for name in known if name in job.priors]:
         raise ValueError(
             f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"

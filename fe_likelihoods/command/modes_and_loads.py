@@ -12,6 +12,7 @@ from ..modal.modal_data import ModalData
 from ..modal.modal_likelihood import ModalLikelihood
 from ..modal.modal_readers import read_modal_data
 from ..modal.mode_models import FunctionModes, modal_channels
+from ..noise.student import StudentNoise
 from ..signals.channels import Channel
 from .job import Job
 from .schema import read_quantity
@@ -55,7 +56,8 @@ def modal_likelihood(
         else:
             model = make_model(None, modal_channels(tuple(sensors)), 1.0, n_modes)
     unknown = given.get("unknown_errors")
-    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, close=given.get("close", 0.02))
+    options = {key: given[key] for key in ("close", "student_t") if key in given}
+    return ModalLikelihood(model, data, unknown, unknown, pool, cache=cache, **options)
 
 
 def _modal_data(job: Job, given: dict[str, Any]) -> ModalData:
@@ -85,7 +87,10 @@ def load_likelihood(
     for key, value in (("dt", 1.0), ("n_steps", n)):
         if job.model.get(key, value) != value:
             raise ValueError(f"{job.where('model')} {key}: a load test has {n} load cases and no time: leave it out")
-    return FELikelihood(make_model(None, channels, 1.0, n), test.measurements, None, pool, cache=cache), test.known
+    noise = StudentNoise(channels, given["student_t"]) if "student_t" in given else None
+    if noise is not None and job.noise:
+        raise ValueError(f"{job.where('noise')} leave this section out, or student_t in [load_test]")
+    return FELikelihood(make_model(None, channels, 1.0, n), test.measurements, noise, pool, cache=cache), test.known
 
 
 def _load_test(job: Job, given: dict[str, Any], channels: tuple[Channel, ...]) -> LoadTest:

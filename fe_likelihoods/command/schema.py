@@ -240,6 +240,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
             '"common" or "mode": parameters frequency_error and shape_error, of all modes or of each, are added to the '
             "known errors; by default where no error is known",
         ),
+        Key("student_t", "number", "Degrees of freedom of Student-t errors, such as 4, for wrong identifications"),
         Key("n_modes", "whole number >= 1", "Modes that the model computes (twice as many as were measured)"),
         Key(
             "close",

@@ -8,6 +8,7 @@ import numpy as np
 from ..likelihood.likelihood import FELikelihood
 from ..models.linear_structure import LinearStructure
 from ..noise.protocol import Noise
+from ..noise.student import check_degrees
 from ..priors.points import as_points
 from ..simulation.model import Model, SimulationFailed, simulate_batch
 from ..text_tables import text_table
@@ -43,6 +44,9 @@ class ModalLikelihood(FELikelihood):
         data have known errors, else ``"common"``.
     pool : optional
         As for `FELikelihood`.
+    student_t : float, optional
+        Degrees of freedom, above 2, of Student-t errors, such as 4: wrong identifications move the parameters little.
+        Errors are then scales. Default: Gaussian errors.
     close : float
         Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
         frequencies by the order in the pair. Zero compares each shape.
@@ -71,6 +75,7 @@ class ModalLikelihood(FELikelihood):
         shape_error: str | None = None,
         pool: Any = None,
         *,
+        student_t: float | None = None,
         close: float = _CLOSE,
         **options: Any,
     ) -> None:
@@ -79,7 +84,10 @@ class ModalLikelihood(FELikelihood):
         if not 0.0 <= close < 1.0:
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         paired = PairedModes(_with_modes(model), data, close)
-        noise = _noise(paired, data, frequency_error, shape_error)
+        student = 0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t)
+        if student and data.covariance is not None:
+            raise ValueError("ModalLikelihood: student_t is for independent errors: give frequency_cv, no covariance")
+        noise = _noise(paired, data, frequency_error, shape_error, student)
         super().__init__(paired, paired.measurements, noise, pool, **options)
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
@@ -122,7 +130,8 @@ class ModalLikelihood(FELikelihood):
         rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
         cheap = isinstance(paired.model, StructureModes)
-        batch = simulate_batch(paired.model, rows, None if cheap else self.simulator.pool)
+        batch = simulate_batch(paired.model, paired.of_model(rows), None if cheap else self.simulator.pool)
+        batch.response[:, 0] *= paired.at_mean_temperature(rows)
         good = (batch.response[:, 0] > 0.0).all(axis=1)
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
@@ -136,12 +145,12 @@ def _with_modes(model: Any) -> Model:
     return StructureModes(model) if hasattr(model, "assemble") else model
 
 
-def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any) -> ModalNoise:
+def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any, student: float) -> ModalNoise:
     """The errors, from what the data and the arguments say."""
     sizes = np.ones(data.n_modes, dtype=int)
     for group in paired.groups:
         sizes[list(group)] = len(group)
-    shapes = data.has_shape.sum(axis=0)
+    freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
     if data.covariance is not None and frequency_error is not None:
         raise ValueError(
             "ModalLikelihood: the covariance of the frequencies is known; leave frequency_error out, or give the data "
@@ -153,12 +162,13 @@ def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_err
         channels=paired.channels,
         n_sets=data.n_sets,
         n_sensors=data.n_sensors,
-        counts=tuple((~np.isnan(data.frequencies)).sum(axis=0).tolist()),
-        freedoms=tuple((shapes * np.maximum(data.n_sensors - sizes, 0)).tolist()),
+        counts=tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
+        freedoms=tuple(freedoms.ravel().tolist()),
         frequency_known=frequency_known,
         shape_known=shape_known,
         frequency=frequency,
-        shape=shape if shapes.any() and data.n_sensors > 1 else "",
+        shape=shape if freedoms.any() else "",
+        student=student,
     )
 
 

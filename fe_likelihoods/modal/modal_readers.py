@@ -162,6 +162,11 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         squares = np.full(shape, np.nan)
         squares[rows] = np.square(_coefficients(table, found["deviation"], frequencies))
         options = {"frequency_cv": np.sqrt(np.nanmean(squares, axis=0))} | options
+    if values["temperature"] is not None:
+        by_set = [np.unique(values["temperature"][sets == each]) for each in order]
+        if any(len(each) > 1 for each in by_set):
+            raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
+        options = {"temperatures": np.concatenate(by_set)} | options
     if values["damping"] is not None:
         placed["damping"] = np.full(shape, np.nan)
         named = stated_unit(table, found["damping"], "dimensionless")

@@ -4,6 +4,9 @@ Each measured mode is a channel. Its samples are, for each identification, the c
 measured one, and the projection of the measured shape on the computed one, at all sensors. They are smooth functions of
 the parameters as long as the pairing stays, so emulators and searches of modes of the posterior need nothing else. The
 residuals are the relative frequency errors and the vectors of squared length 1 - MAC.
+
+With temperatures T of the identifications there is one more parameter, ``temperature_slope`` s [1/K], common to all
+modes: frequencies are f (1 + s (T - 20 °C)).
 """
 
 from typing import Any
@@ -18,13 +21,15 @@ from ..simulation.user_code import is_of_user
 from .modal_data import ModalData
 from .pairing import Paired, pair_modes
 
-__all__ = ["PairedModes", "sensor_rows"]
+__all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "PairedModes", "sensor_rows"]
+
+REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
+SLOPE = "temperature_slope"
 
 _OF_THE_MODEL = (
     "code_parts",
     "nominal",
     "nominal_units",
-    "parameter_units",
     "range_remark",
     "response_tolerance",
     "time_limit",
@@ -72,7 +77,9 @@ class PairedModes:
             factor = np.linalg.cholesky(data.covariance / np.outer(data.mean_frequencies, data.mean_frequencies))
             self.frequency_cv = np.diag(factor).copy()
             self._whitening = self.frequency_cv[:, None] * np.linalg.inv(factor)
-        self.parameter_names = tuple(model.parameter_names)
+        self._warmer = None if data.temperatures is None else data.temperatures - REFERENCE_TEMPERATURE
+        self.parameter_names = (*model.parameter_names, *(() if self._warmer is None else (SLOPE,)))
+        self._n_own = len(model.parameter_names)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
         self.groups = self._measured.groups
@@ -81,7 +88,26 @@ class PairedModes:
     def fingerprint(self) -> str:
         """Digest of the model, the data and the groups of close modes."""
         parts = type(self).__name__, self.model.fingerprint, self.data.fingerprint, repr(self.groups)
-        return digest(*parts, array_digest(self._whitening))
+        temperatures = [] if self._warmer is None else [array_digest(self._warmer)]
+        return digest(*parts, array_digest(self._whitening), *temperatures)
+
+    @property
+    def parameter_units(self) -> dict[str, str]:
+        """Units of parameters in words."""
+        own = {} if self._warmer is None else {SLOPE: "1/K"}
+        return dict(getattr(self.model, "parameter_units", {})) | own
+
+    def of_model(self, thetas: np.ndarray) -> np.ndarray:
+        """The parameters of the model (..., n) among all (..., n_parameters)."""
+        return np.asarray(thetas, dtype=float)[..., : self._n_own]
+
+    def at_mean_temperature(self, thetas: np.ndarray) -> np.ndarray:
+        """Factors of frequencies (n, 1) at the mean temperature, for parameters (n, n_parameters)."""
+        return np.ones((len(thetas), 1)) if self._warmer is None else 1.0 + thetas[:, [-1]] * self._warmer.mean()
+
+    def _warmed(self, theta: np.ndarray) -> np.ndarray | float:
+        """Factors of frequencies (n_sets, 1) at parameters (n_parameters,)."""
+        return 1.0 if self._warmer is None else 1.0 + theta[-1] * self._warmer[:, None]
 
     def __getattr__(self, name: str) -> Any:
         """Optional members of the model, such as `code_parts`, and `jacobian` if the model has it."""
@@ -107,23 +133,23 @@ class PairedModes:
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
-        return self._response(self.model.simulate(theta))
+        return self._response(self.model.simulate(self.of_model(theta)), theta)
 
     def _simulate_together(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
         """Responses at parameters (n, n_parameters), from a run that answers other data sets too."""
-        batch = self.model.simulate_together(thetas, pool)
+        batch = self.model.simulate_together(self.of_model(thetas), pool)
         found, reasons = np.full((len(thetas), len(self.channels), self.n_steps), np.nan), list(batch.reasons)
         for row, modes in enumerate(batch.response):
             if not reasons[row]:
                 try:
-                    found[row] = self._response(modes)
+                    found[row] = self._response(modes, thetas[row])
                 except SimulationFailed as error:
                     reasons[row] = error.reason
         return SimulationBatch(found, reasons)
 
-    def _response(self, modes: np.ndarray) -> np.ndarray:
+    def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
         paired = self.pair(modes)
-        return self._joined(self._ratios(paired.frequencies), paired.shapes)
+        return self._joined(self._ratios(paired.frequencies) * self._warmed(theta), paired.shapes)
 
     def pair(self, modes: np.ndarray) -> Paired:
         """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
@@ -143,7 +169,8 @@ class PairedModes:
 
     def _differentiate(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, m, n_steps) of the response while the pairing stays."""
-        modes, slopes = self.model.simulate(theta), np.asarray(self.model.jacobian(theta))
+        own = self.of_model(theta)
+        modes, slopes = self.model.simulate(own), np.asarray(self.model.jacobian(own))
         paired = self.pair(modes)
         shapes = np.zeros((len(slopes), *paired.shapes.shape))
         for mode, space in enumerate(paired.spaces):
@@ -156,4 +183,8 @@ class PairedModes:
                 moved = turned @ (inverse @ target)
                 moved = moved - moved @ inverse.T @ basis.T
                 shapes[:, k, mode] = moved + (target - projected) @ turned @ inverse
-        return self._joined(self._ratios(slopes[:, 0, paired.columns]), shapes)
+        ratios = self._ratios(slopes[:, 0, paired.columns]) * self._warmed(theta)
+        if self._warmer is not None:
+            ratios = np.concatenate([ratios, (self._ratios(paired.frequencies) * self._warmer[:, None])[None]])
+            shapes = np.concatenate([shapes, np.zeros((1, *shapes.shape[1:]))])
+        return self._joined(ratios, shapes)

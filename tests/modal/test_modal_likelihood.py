@@ -21,6 +21,7 @@ from fe_likelihoods import (
     ShearFrame,
     SimulationCache,
     SimulationFailed,
+    Uniform,
 )
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -111,7 +112,88 @@ def test_a_covariance_of_the_frequencies(rng):
     assert ModalLikelihood(FRAME, correlated)(theta) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["single", "sets", "pair", "modal model"])
+def test_student_errors_have_the_density_of_scipy(rng):
+    from scipy.stats import multivariate_t, t
+
+    theta = np.array([1.02, 0.95, 1.05, 0.98])
+    data = identified([1.0, 0.9, 1.1, 1.0], [3, 1], rng, n_sets=2)
+    frequencies = data.frequencies.copy()
+    frequencies[1, 0] = np.nan
+    shapes = np.where(np.isnan(frequencies)[:, :, None], np.nan, data.shapes)
+    data = ModalData(frequencies, shapes, data.sensors, mode_numbers=[3, 1])
+    found = ModalLikelihood(FRAME, data, student_t=4)([*theta, 0.02, 0.04])
+    computed = StructureModes(FRAME).simulate(theta)[:, [2, 0]]
+    c, sigma, expected = np.hypot(0.02, 1e-4), np.hypot(0.04, 1e-3), 0.0
+    for k, j in ((0, 0), (0, 1), (1, 1)):
+        expected += t.logpdf(computed[0, j] / frequencies[k, j] - 1.0, 4, scale=c)
+        mac = (computed[1:, j] @ shapes[k, j]) ** 2 / (computed[1:, j] @ computed[1:, j])
+        expected += multivariate_t.logpdf([np.sqrt(1.0 - mac), 0.0, 0.0], np.zeros(3), sigma**2 * np.eye(3), 4)
+    assert found == pytest.approx(expected, rel=1e-10)
+    with pytest.raises(ValueError, match="degrees of freedom above 2"):
+        ModalLikelihood(FRAME, data, student_t=1)
+
+
+@pytest.mark.slow
+def test_a_wrong_identification_moves_student_errors_little(rng):
+    from samplers import SMCSampler
+
+    data = identified(np.ones(4), [1, 2, 3, 4], rng, cv=0.005, error=0.02)
+    frequencies = data.frequencies[0] * [1.0, 1.0, 1.1, 1.0]
+    data = ModalData(frequencies, data.shapes[0], data.sensors, frequency_cv=0.005, shape_error=0.02)
+    distances = []
+    for student in (None, 4):
+        posterior = Posterior(ModalLikelihood(FRAME, data, student_t=student), PRIOR)
+        sampler = SMCSampler(100, 4, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+        sampler.run_mcmc(None, 1)
+        samples = sampler.get_chain(flat=True)
+        distances.append(np.abs((samples.mean(axis=0) - 1.0) / samples.std(axis=0)).max())
+    assert distances[0] > 6.0 and distances[1] < 4.0
+
+
+def of_days(rng):
+    """Stiffnesses, temperature slope and modes that were identified on five days."""
+    truth, slope = np.array([1.0, 0.9, 1.1, 1.0]), -2e-3
+    temperatures = np.array([-5.0, 5.0, 12.0, 25.0, 33.0])
+    data = identified(truth, [1, 2, 3], rng, cv=0.002, error=0.02, n_sets=5)
+    frequencies = data.frequencies * (1.0 + slope * (temperatures - 20.0))[:, None]
+    data = ModalData(
+        frequencies, data.shapes, data.sensors, temperatures=temperatures, frequency_cv=0.002, shape_error=0.02
+    )
+    return truth, slope, data
+
+
+def test_frequencies_of_several_days_have_a_common_temperature_slope(rng):
+    truth, slope, data = of_days(rng)
+    temperatures, frequencies = data.temperatures, data.frequencies
+    likelihood = ModalLikelihood(FRAME, data)
+    assert likelihood.parameter_names == (*PRIOR, "temperature_slope")
+    at_zero = likelihood.model.simulate([*truth, slope])
+    ratios = at_zero.reshape(3, 5, 5)[:, :, 0].T * frequencies
+    expected = StructureModes(FRAME).simulate(truth)[0, :3] * (1.0 + slope * (temperatures - 20.0))[:, None]
+    np.testing.assert_allclose(ratios, expected, rtol=1e-12)
+    posterior = Posterior(likelihood, PRIOR | {"temperature_slope": Uniform(-0.01, 0.01)})
+    mean = ModalLikelihood(FRAME, data.mean())
+    assert mean.model.data.temperatures == pytest.approx(14.0)
+    assert posterior.parameters[4].label == "temperature_slope [1/K]"
+
+
+@pytest.mark.slow
+def test_a_guide_finds_the_temperature_slope(rng):
+    truth, slope, data = of_days(rng)
+    likelihood = ModalLikelihood(FRAME, data)
+    posterior = Posterior(likelihood, PRIOR | {"temperature_slope": Uniform(-0.01, 0.01)})
+    from samplers import SMCSampler
+
+    sampler = SMCSampler(100, 5, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    assert (abs(samples.mean(axis=0) - [*truth, slope]) < 4.0 * samples.std(axis=0)).all()
+    assert samples[:, 4].std() < 2e-4
+    predicted = likelihood.predict_modes(samples)
+    assert (abs(np.median(predicted.frequencies, axis=0) / data.mean_frequencies - 1.0) < 0.005).all()
+
+
+@pytest.mark.parametrize("kind", ["single", "sets", "pair", "modal model", "temperatures"])
 def test_derivatives_agree_with_differences(kind, rng):
     frame, theta = FRAME, np.array([1.0, 0.9, 1.1, 1.0])
     data = identified(theta, [3, 1], rng, n_sets=2 if kind == "sets" else 1)
@@ -121,8 +203,12 @@ def test_derivatives_agree_with_differences(kind, rng):
     if kind == "modal model":
         frame, theta = ModalModel(list(FLOORS), 2), np.array([1.0, 3.0, *rng.normal(size=8)])
         data = ModalData([1.0, 3.1], rng.normal(size=(2, 4)), tuple(FLOORS))
+    if kind == "temperatures":
+        data = ModalData(np.tile(data.frequencies, (2, 1)), None, temperatures=[-5.0, 30.0], mode_numbers=[3, 1])
     model = ModalLikelihood(frame, data).model
     names = [name for name in frame.parameter_names if not name.startswith("damping")]
+    if kind == "temperatures":
+        names, theta = [*names, "temperature_slope"], np.append(theta, -0.001)
     assert list(model.parameter_names) == names and hasattr(model, "jacobian")
     found = model.jacobian(theta)
     for p, unit in enumerate(np.eye(len(theta))):

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from fe_likelihoods import (
     Channel,
@@ -79,6 +80,7 @@ def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
     assert "Predicted values" in text and not OF_TIME.findall(text)
 
 
+@pytest.mark.slow
 def test_modes_a_load_test_and_histories_are_in_one_report(rng, tmp_path):
     model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
     response = model.simulate([*TRUTH, 0.02, 0.02])
