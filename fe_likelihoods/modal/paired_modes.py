@@ -48,7 +48,7 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
     if unknown := [name for name in data.sensors if name not in names[1:]]:
         raise ValueError(
             f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
-            "them, or leave them out of the data with data.at(sensors)"
+            'them, or leave them out with data.at(sensors); in a TOML file, columns = {sensor = "its column"}'
         )
     by_number = [data.mode_numbers[mode] for mode in np.flatnonzero(~data.has_shape.any(axis=0))]
     if max([data.n_modes, *by_number]) > model.n_steps:
