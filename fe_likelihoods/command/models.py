@@ -18,7 +18,7 @@ from ..priors.distributions import Distribution, HalfNormal, LogNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import is_dataset, read_base_motion, read_bundled, read_measured
+from .data import is_dataset, read_base_motion, read_bundled, read_measured, read_supports
 from .job import Job
 from .modes_and_loads import FRAMES, has_no_time, load_likelihood, modal_likelihood
 from .noises import make_noise
@@ -190,7 +190,11 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
 
         return LinearOscillator(record, **values)
     from ..models.linear_structure import LinearStructure
+    from ..models.linear_structure_parts import BridgeDeck
 
+    if job.kind == "bridge deck":
+        supports = [reduce_data(job, each, None)[0] for each in read_supports(job)]
+        return LinearStructure(BridgeDeck(**values), supports, outputs=names)
     return LinearStructure(_frame(job), record, outputs=names)
 
 

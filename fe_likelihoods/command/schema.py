@@ -148,6 +148,7 @@ _BUILT_IN: dict[str, tuple[str, dict[str, str]]] = {
         "tall_buildings.GroupedFrame",
         dict(names="groups rayleigh", required="groups", rayleigh="whole numbers"),
     ),
+    "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
 }
 _PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
 MODEL_KINDS = (*_BUILT_IN, *_OWN)
@@ -186,6 +187,12 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
             "text",
             "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, or a data set "
             "(.h5)",
+        ),
+        Key(
+            "supports",
+            "texts",
+            'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
+            "the column, the first end and the second end",
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
         Key(
@@ -298,7 +305,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 
 
 EVENT: tuple[Key, ...] = (
-    *(key for key in SECTIONS["record"] if key.name != "every"),
+    *(key for key in SECTIONS["record"] if key.name not in ("every", "supports")),
     Key("measured", "text", "Measured response in this event, to be compared: a file as in [measurements]"),
     Key("zero", _ZERO, "Time in this file at which the base motion begins; by default as in [measurements]"),
     Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),

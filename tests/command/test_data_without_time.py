@@ -3,8 +3,10 @@
 import csv
 import itertools
 
+import numpy as np
 import pytest
 
+from fe_likelihoods import BridgeDeck, LinearStructure, Record
 from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.command.runs import run_job
@@ -141,3 +143,44 @@ def test_columns_and_errors_of_modes(tmp_path):
 def test_what_does_not_fit_is_refused(kind, changes, text, tmp_path):
     with pytest.raises(ValueError, match=text):
         make_problem(read_job(changed(tmp_path, kind, *changes)))
+
+
+DECK = """
+[model]
+kind = "bridge deck"
+middle = "ch7"
+shape = 0.7
+[record]
+supports = ["supports.csv:base [g]", "supports.csv:south [g]", "supports.csv:north [g]"]
+[measurements]
+file = "deck.csv"
+columns = {ch7 = "ch7 [g]"}
+[priors]
+frequency = "log-normal(3, 0.2)"
+damping = "log-normal(0.05, 0.3)"
+share = "uniform(0, 1)"
+sigma_ch7 = "half-normal(0.1 g)"
+"""
+
+
+def test_a_bridge_deck_has_three_supports(tmp_path):
+    motion = np.random.default_rng(1).normal(size=(3, 200))
+    rows = [f"{0.02 * k:.2f}," + ",".join(f"{x:.6f}" for x in motion[:, k]) for k in range(200)]
+    (tmp_path / "supports.csv").write_text("\n".join(["time_s,base [g],south [g],north [g]", *rows]))
+    supports = [Record("a", 0.02, 9.80665 * each.round(6)) for each in motion]
+    (response,) = LinearStructure(BridgeDeck("ch7", shape=0.7), supports).simulate([3.0, 0.05, 0.6]) / 9.80665
+    rows = [f"{0.02 * k:.2f},{x!r}" for k, x in enumerate(response.tolist())]
+    (tmp_path / "deck.csv").write_text("\n".join(["time_s,ch7 [g]", *rows]))
+    path = tmp_path / "deck.toml"
+    path.write_text(DECK)
+    likelihood = make_problem(read_job(path)).posterior.likelihood
+    assert likelihood.model.parameter_names == ("frequency", "damping", "share")
+    assert np.abs(likelihood.residuals([3.0, 0.05, 0.6])).max() < 1e-6
+    for old, new, text in (
+        ("supports =", "file = 'deck.csv'\nsupports =", "file: leave it out with supports"),
+        ('"bridge deck"\nmiddle = "ch7"\nshape = 0.7', '"oscillator"\nperiod = 1.0', "supports: a bridge deck needs"),
+        (', "supports.csv:north [g]"', "", "one record for each of the 3 supports"),
+    ):
+        path.write_text(DECK.replace(old, new))
+        with pytest.raises(ValueError, match=text):
+            make_problem(read_job(path))
