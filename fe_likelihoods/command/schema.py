@@ -191,8 +191,8 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key(
             "supports",
             "texts",
-            'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the base of '
-            "the column, the first end and the second end",
+            'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the '
+            "base of the column, the first end and the second end",
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
         Key(
