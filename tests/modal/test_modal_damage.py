@@ -10,6 +10,7 @@ from fe_likelihoods import (
     Posterior,
     ShearFrame,
     StoredPosterior,
+    Uniform,
     stiffness_loss,
 )
 from fe_likelihoods.modal.mode_models import StructureModes
@@ -44,3 +45,27 @@ def test_a_loss_is_found_and_a_warmer_day_is_none(seed):
         assert loss.presence() > 0.9 and loss.location().argmax() == storey
     else:
         assert loss.presence() < 0.1
+
+
+@pytest.mark.slow
+def test_a_building_with_23_parameters_takes_few_simulations():
+    """20 storeys, six sensors, three modes on five days: an effective sample size of 100 in 308 simulations."""
+    rng, n = np.random.default_rng(4), 20
+    floors = {f"floor {i}": i for i in (2, 5, 9, 13, 17, 20)}
+    frame = ShearFrame(floors, [300e3] * n, np.linspace(900e6, 400e6, n).tolist())
+    truth, temperatures = np.exp(0.1 * rng.normal(size=n)), np.array([2.0, 10.0, 18.0, 25.0, 33.0])
+    modes = StructureModes(frame).simulate(truth)[:, :3]
+    shapes = modes[1:].T / np.linalg.norm(modes[1:], axis=0)[:, None] + 0.02 * rng.normal(size=(5, 3, 6))
+    frequencies = modes[0] * (1.0 - 0.001 * (temperatures[:, None] - 20.0)) * (1.0 + 0.004 * rng.normal(size=(5, 3)))
+    likelihood = ModalLikelihood(frame, ModalData(frequencies, shapes, tuple(floors), temperatures=temperatures))
+    prior = {f"stiffness_{i}": LogNormal(1.0, 0.15) for i in range(1, n + 1)} | {
+        "temperature_slope": Uniform(-0.01, 0.01)
+    }
+    prior |= {"frequency_error": LogNormal(0.005, 0.5), "shape_error": LogNormal(0.03, 0.5)}
+    posterior = Posterior(likelihood, prior)
+    sampler = SMCSampler(100, 23, posterior, guide=posterior.guide(starts=2), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    assert sampler.verdict.status == "converged" and likelihood.simulations < 400
+    distance = (samples.mean(axis=0) - [*truth, -0.001, 0.004, 0.02]) / samples.std(axis=0)
+    assert np.abs(distance).max() < 4.0
