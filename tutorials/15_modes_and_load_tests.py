@@ -116,7 +116,7 @@ figure.savefig(args.out / "modes.png", dpi=120)
 # A truck test of a girder
 # ------------------------
 #
-# A truck of 400 kN stands at three places of a simple span. A load case is a sample, in place of a time, and the noise
+# A truck of 400 kN stands at three places of a simple span. A load case is a sample, instead of a time, and the noise
 # of the sensors is a known number in the mapping of priors.
 
 SPAN, TRUCK, EI = 30.0, 400e3, 12e9  # m, N, N m2

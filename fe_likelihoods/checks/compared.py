@@ -23,7 +23,7 @@ from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import relative_errors
 from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
-from ..simulation.model import simulate_batch
+from ..simulation.model import SimulationFailed, simulate_batch
 from .run import FinishedRun
 
 __all__ = ["ChannelFit", "Compared", "Fit", "Fits", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
@@ -58,6 +58,16 @@ class Compared(NamedTuple):
     fitted: bool  # whether the first response is the fit, not one more draw of the prior
     parts: dict[str, np.ndarray]  # shares of each support's motion in the responses of a linear structure
     draws: slice = slice(None)  # the responses that are draws of the prior
+    modal: "ModalFit | None" = None  # modes of the responses, instead of these
+
+
+class ModalFit(NamedTuple):
+    """Measured and computed modes, `PredictedModes` of `fe_likelihoods.modal`."""
+
+    likelihood: Any
+    draws: Any  # modes at draws of the prior; None if none can be simulated
+    points: np.ndarray | None = None  # samples of the posterior (n, ndim); None before a run
+    samples: Any = None  # modes there
 
 
 class ChannelFit(NamedTuple):
@@ -86,6 +96,8 @@ class Fit(NamedTuple):
     residuals: np.ndarray | None  # (n_channels, n_samples) [SI], measured minus simulated
     channels: tuple[ChannelFit, ...]
     noise: str
+    modal: ModalFit | None = None  # of modal data, instead of responses and residuals
+    deviations: np.ndarray | None = None  # of the errors, of the shape of the residuals [SI]; None if not known
 
 
 class Fits(NamedTuple):
@@ -125,6 +137,8 @@ def windows_of(likelihood: FELikelihood, key: str = "") -> list[Window]:
             np.where(inside, measured.values, np.nan)[np.ix_(rows, columns)],
             measured.description,
             tuple(measured.starts[row] + columns[0] * measured.steps[row] for row in rows),
+            measured.axis,
+            () if measured.is_history else np.array(measured.points, dtype=object)[columns],
         )
         found.append(Window(title, part, inside, rows, columns))
     return found
@@ -155,13 +169,20 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
     return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 
-def compare(likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "") -> tuple[Compared, ...]:
+def compare(
+    likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str = "", samples: np.ndarray | None = None
+) -> tuple[Compared, ...]:
     """Responses at points (n, ndim), and those that a guide has left in memory, beside the measurements of each event.
 
     The points are draws of the prior, after the fit if it is `fitted`. Failed simulations are left out; the result is
-    empty if all fail, or the first one fails and is the fit. `key` is the name of the data set.
+    empty if all fail, or the first one fails and is the fit. `key` is the name of the data set. Of modal data, modes at
+    draws and `samples` are compared.
     """
     n = len(likelihood.model.parameter_names)
+    if hasattr(likelihood, "predict_modes"):
+        modal = _modes(likelihood, points[int(fitted) :], samples if fitted else None)
+        no = np.empty((0, *likelihood.measurements.values.shape))
+        return (Compared(key, likelihood.measurements, no, fitted, {}, modal=modal),)
     try:
         batch = likelihood.simulate(points[:, :n])
     except (ChangedModel, StaleCache, TooManyFailures) as error:  # concerns the next sampling, not this result
@@ -202,6 +223,21 @@ def compare(likelihood: FELikelihood, points: np.ndarray, fitted: bool, key: str
     )
 
 
+def _modes(likelihood: Any, draws: np.ndarray, samples: np.ndarray | None) -> ModalFit:
+    """Modes at draws of the prior, and at as many samples of the posterior (n, ndim)."""
+    found: list[Any] = []
+    if samples is not None:
+        rows = np.linspace(0, len(samples) - 1, max(min(len(draws), len(samples)), 1)).round().astype(int)
+        samples = samples[np.unique(rows)]
+    for points in (draws, samples):
+        try:
+            found.append(likelihood.predict_modes(points) if points is not None and len(points) else None)
+        except SimulationFailed as error:
+            logger.warning("modes are not compared: %s", error)
+            found.append(None)
+    return ModalFit(likelihood, found[0], samples, found[1])
+
+
 def _support_parts(model: Any, thetas: np.ndarray, responses: np.ndarray) -> dict[str, np.ndarray]:
     """Contribution of each support to the responses (n, n_channels, n_steps); empty unless they add up to these."""
     supports = getattr(model, "supports", ())
@@ -229,6 +265,11 @@ def fit_data_sets(run: FinishedRun) -> Fits:
     fits, failures, compared, simulations = [], [], [], run.likelihood.simulations
     for key, likelihood, columns in data_sets_of(run):
         point, n = run.centre[columns], len(likelihood.model.parameter_names)
+        draws = draws_to_compare(run.posterior)[:, columns]
+        compared += compare(likelihood, np.stack([point, *draws]), True, key, run.samples[:, columns])
+        if hasattr(likelihood, "predict_modes"):
+            fits.append(Fit(key, likelihood.measurements, {}, None, (), "modal", compared[-1].modal))
+            continue
         points = np.stack([np.concatenate([start[columns][:n], point[n:]]), point])  # with the time shifts of the fit
         batch = likelihood.simulate(points[:, :n])
         residuals = {}
@@ -238,8 +279,6 @@ def fit_data_sets(run: FinishedRun) -> Fits:
             else:
                 residuals[name] = likelihood.residuals_of(response, theta)
         fits += _split(likelihood, key, residuals, names, dict(zip(likelihood.parameter_names, point, strict=True)))
-        draws = draws_to_compare(run.posterior)[:, columns]
-        compared += compare(likelihood, np.stack([point, *draws]), True, key)
     made = run.likelihood.simulations - simulations
     return Fits(tuple(fits), *names, made, tuple(failures), tuple(compared))
 
@@ -278,7 +317,12 @@ def _split(
     if checked is not None and hasattr(sampled, "whitened"):
         parameters = np.array([values[name] for name in sampled.parameter_names])
         checked = sampled.whitened(checked, likelihood.measurements.values - checked, parameters)
-    fits = []
+    fits, history, deviations = [], likelihood.measurements.is_history, None
+    if not history:  # samples without an order
+        checked = None
+        if hasattr(sampled, "standard_deviations") and set(sampled.parameter_names) <= set(values):
+            parameters = np.array([values[name] for name in sampled.parameter_names])
+            deviations = sampled.standard_deviations(parameters[None])[0][:, None]
     for window in windows_of(likelihood, key):
         part = window.measurements
         own = {name: window.of(each) for name, each in residuals.items()}
@@ -293,7 +337,9 @@ def _split(
             before, after = (float(errors.get(name, missing)[row]) for name in names)
             channels.append(ChannelFit(channel, samples, before, after, checks, float(assumed)))
         responses = {name: part.values - each for name, each in own.items()}
-        fits.append(Fit(window.title, part, responses, own.get(names[1]), tuple(channels), noise))
+        errors_of = None if deviations is None else deviations[window.rows]
+        residuals_of = own.get(names[1])
+        fits.append(Fit(window.title, part, responses, residuals_of, tuple(channels), noise, deviations=errors_of))
     return fits
 
 

@@ -101,8 +101,8 @@ def find_faults(
             gain, before, after = errors[best].sum() - total[row], errors[best, c].mean(), each.errors[row].mean()
             value = float(each.value[row])
             is_large = value < 0.0 or _is_factor(value) if each.kind == "factor" else True
-            if "lag" in each.kind:
-                is_large = round(abs(value) / steps[c].max()) > 1  # one step is a convention of files
+            if "lag" in each.kind:  # one step is a convention of files
+                is_large = measurements.is_history and round(abs(value) / steps[c].max()) > 1
             clear = after < min(math.log(better) + before, math.log(EXPLAINED)) and gain > -math.log(better) * len(c)
             if is_large and clear and SIMPLE[each.kind] * gain > most:
                 most, explained = SIMPLE[each.kind] * gain, (each, value, math.exp(before), math.exp(after))

@@ -15,6 +15,7 @@ from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
 from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
+from .modal_faults import check_modes
 from .table import Moments, ParameterRow, rows_of
 
 __all__ = [
@@ -69,7 +70,8 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
         rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none, none), none)
     compared: list[Compared] = []
     for key, likelihood, columns in data_sets_of(posterior):
-        compared += compare(likelihood, points[:, columns], samples is not None, key)
+        own = None if samples is None else samples[:, columns]
+        compared += compare(likelihood, points[:, columns], samples is not None, key, own)
     return (*check_responses(compared), *check_parameters(rows))
 
 
@@ -79,6 +81,7 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     A fault that draws of the prior show before a run is named after it as well: a fit may make up for it.
     """
     found, compared = [], list(compared)
+    modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
         faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
         found += [_of_a_fault(each, fault, WRONG) for fault in faults]
@@ -89,8 +92,8 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
             found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
     far = not found
     for each in compared:
-        found += _check_offset(each) if each.fitted else []
-    return found + _check_errors(compared, far)
+        found += _check_offset(each) if each.fitted and each.measurements.is_history else []
+    return found + _check_errors(compared, far) + [fault for each in modal for fault in check_modes(each)]
 
 
 def _where(names: Sequence[str], compared: Compared | Fit) -> str:

@@ -30,6 +30,7 @@ from .steps import (
     StepTest,
     check_stronger_motion,
     halve_steps,
+    has_steps,
     motions_to_replace,
     not_tested,
     relative_difference,
@@ -258,16 +259,17 @@ class _BestFit(NamedTuple):
 
 def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _BestFit:
     """The error of step and mesh at the best fit, where a search for it takes a minute at most."""
-    n = len(posterior.likelihood.model.parameter_names)
+    n, test = len(posterior.likelihood.model.parameter_names), StepTest([], {})
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
     if limit < 10 * (n + 1):
-        return _BestFit(not_tested(f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"))
+        why = f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"
+        return _BestFit(not_tested(why) if has_steps(posterior.likelihood) else test)
     try:
         target, mode, searched = _search(stage, posterior, limit)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return _BestFit(not_tested(f"no fit was found: {error}"))
+        return _BestFit(not_tested(f"no fit was found: {error}") if has_steps(posterior.likelihood) else test)
     if mode is None:
-        return _BestFit(not_tested("no fit was found"), searched)
+        return _BestFit(not_tested("no fit was found") if has_steps(posterior.likelihood) else test, searched)
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
     test = halve_steps(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)

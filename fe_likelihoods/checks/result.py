@@ -20,6 +20,7 @@ from .steps import (
     StepTest,
     check_stronger_motion,
     halve_steps,
+    has_steps,
     motions_to_replace,
     not_tested,
     simulations_of_the_test,
@@ -119,12 +120,12 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     """Names of the tests of a run, and what was tested or why it was not."""
     checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
-    responses = max((len(each.responses) for each in fits.compared), default=0)
+    responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
     return [
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
         (
-            "Units, signs, clocks, swapped channels",
+            "Units, signs, clocks, swapped channels" if has_steps(run.likelihood) else "Units, signs, swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
@@ -158,9 +159,9 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
             found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
             unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
     test = StepTest([], {})
-    if not unread and not run.is_inconclusive:
+    if not unread and not run.is_inconclusive and has_steps(run.likelihood):
         test = _test_steps(run, simulate)
-    test = StepTest(unread + test.findings, {"Motion": motion} | test.tests)
+    test = StepTest(unread + test.findings, {"Motion": motion} | test.tests if has_steps(run.likelihood) else {})
     return test, run.likelihood.simulations - before + others
 
 

@@ -26,6 +26,7 @@ __all__ = [
     "UNREAD",
     "StepTest",
     "check_stronger_motion",
+    "has_steps",
     "motions_to_replace",
     "not_tested",
     "relative_difference",
@@ -60,12 +61,19 @@ def not_tested(why: str) -> StepTest:
     return StepTest([Finding("Step and mesh were not tested", NOTE, text, action)], {STEP: f"not tested: {why}"})
 
 
+def has_steps(likelihood: Any) -> bool:
+    """Whether any data of a likelihood, or None, may be histories; modes and load cases have no steps."""
+    return likelihood is None or any(part.measurements.is_history for part, _ in likelihood.parts())
+
+
 def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulate: Simulate) -> StepTest:
     """Halve step and mesh at a fit (ndim,), and compare the parameters' change with their standard deviations (ndim,).
 
     ``simulate(model, points)`` returns a `SimulationBatch`. A model that fails with half a step, or whose response does
     not change, keeps a step of its own, which is not tested.
     """
+    if not has_steps(posterior.likelihood):
+        return StepTest([], {})
     prior_sd = np.array([row[3] for row in posterior.prior.table()[1]])
     parts, changes, left = [], {}, {STEP: "the model takes neither a motion nor a step that could be halved"}
     for likelihood, columns in posterior.likelihood.parts():

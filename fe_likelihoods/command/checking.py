@@ -70,11 +70,17 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         if record.source:
             say(f"  from {record.source}")
     say(f"Measurements: {measured.description or 'without a description'}")
-    for channel, values in zip(measured.channels, measured.values, strict=True):
+    modal = hasattr(likelihood, "predict_modes")
+    if modal:
+        say(str(model.data))
+    for channel, values in () if modal else zip(measured.channels, measured.values, strict=True):
         shown = from_si(values[np.isfinite(values)], channel.unit)
         missing = f", {len(values) - len(shown)} missing" if len(shown) < len(values) else ""
-        say(f"  {channel.name}: {len(shown)} samples{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
-    say(f"Model: {type(model).__name__}, {len(model.parameter_names)} parameters; with the noise {posterior.ndim}:")
+        what = "samples" if measured.is_history else "values"
+        say(f"  {channel.name}: {len(shown)} {what}{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
+    inner = getattr(model, "model", model) if modal else model
+    name, n = type(getattr(inner, "parts", inner)).__name__, len(model.parameter_names)
+    say(f"Model: {name}, {n} parameters; with the noise {posterior.ndim}:")
     width, channels = max(len(parameter.label) for parameter in posterior.parameters), noise_channels_of(likelihood)
     for parameter in posterior.parameters:
         prior = posterior.prior.distributions[parameter.name]
@@ -113,11 +119,14 @@ def _say_simulation(
             "check [model] and [priors]"
         )
     checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
-    response = likelihood.simulate(mean[None, :n]).response[0]
-    errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
-    fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
     say(f"One simulation takes {checked.seconds:.2g} s")
-    say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
+    if hasattr(likelihood, "predict_modes"):
+        say(f"At the mean of the prior:\n{likelihood.predict_modes(mean[None, :n]).short()}")
+    else:
+        response = likelihood.simulate(mean[None, :n]).response[0]
+        errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
+        fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
+        say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):
         say(line)
     if checked.best_fit is not None:
@@ -163,6 +172,7 @@ def _say_cost(
 def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     """Simulations at draws of the prior with the measurements, as a PNG file."""
     from ..plots.predictions import plot_bands
+    from ..plots.without_time import plot_modes, plot_points
     from ..prediction.propagation import propagate
     from ..reporting.pictures import save_picture
 
@@ -170,7 +180,13 @@ def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
     structural = len(posterior.likelihood.model.parameter_names)
     draws = posterior.sample_prior(n, np.random.RandomState(1))[:, :structural]
+    if hasattr(posterior.likelihood, "predict_modes"):
+        save_picture(
+            plot_modes(posterior.likelihood.predict_modes(draws), label=f"{n} draws of the prior, 90 %"), picture
+        )
+        return
     prediction = propagate(posterior.likelihood.model, draws, quantiles=(0.05, 0.95), progress=False)
-    figure = plot_bands(prediction, posterior.likelihood.measurements)
+    measured = posterior.likelihood.measurements
+    figure = plot_bands(prediction, measured) if measured.is_history else plot_points(measured, prediction=prediction)
     figure.suptitle(f"{n} draws of the prior and the measurements")
     save_picture(figure, picture)

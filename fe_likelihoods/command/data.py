@@ -1,6 +1,7 @@
 """The record and the measurements that a TOML file names."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,16 @@ from ..signals.records import Record
 from .job import Job
 from .schema import did_you_mean
 
-__all__ = ["BUNDLED", "FEWEST_SAMPLES", "is_dataset", "read_base_motion", "read_bundled", "read_measured", "within"]
+__all__ = [
+    "BUNDLED",
+    "FEWEST_SAMPLES",
+    "is_dataset",
+    "read_base_motion",
+    "read_bundled",
+    "read_measured",
+    "read_supports",
+    "within",
+]
 
 BUNDLED = {
     "column-short": ("bridge_column_data", ("short",)),
@@ -82,8 +92,15 @@ def read_base_motion(job: Job) -> Record | None:
     ValueError, which names the key, if the file does not exist or cannot be read.
     """
     given = job.record
+    if (job.kind == "bridge deck") != ("supports" in given):
+        raise ValueError(
+            f'{job.where("record")} supports: a bridge deck needs three, supports = ["base.csv", "first.csv", '
+            '"second.csv"], and other structures have one motion, file'
+        )
+    if "supports" in given:
+        return read_supports(job)[0]
     if not given:
-        if job.kind in ("column", "bridge", "oscillator", "frame"):
+        if job.kind in ("column", "bridge", "oscillator", "frame", "grouped frame"):
             raise ValueError(f"{job.where('record')} file: this key is missing; the {job.kind} needs a base motion")
         return None
     _one_source(job, "record")
@@ -93,6 +110,18 @@ def read_base_motion(job: Job) -> Record | None:
         path = job.path("record", "file", given["file"])
         record = _within_messages(job, "record", lambda: _read_record(job, path))
     return record.scale(given["scale"]) if "scale" in given else record
+
+
+def read_supports(job: Job) -> list[Record]:
+    """The motions of several supports, as `read_base_motion`."""
+    if more := [key for key in ("file", "bundled", "column") if key in job.record]:
+        raise ValueError(f"{job.where('record')} {more[0]}: leave it out with supports, which name files and columns")
+    found = []
+    for text in job.record["supports"]:
+        file, _, column = text.partition(":")
+        given = {key: value for key, value in job.record.items() if key != "supports"} | {"file": file}
+        found.append(read_base_motion(replace(job, kind="", record=given | ({"column": column} if column else {}))))
+    return found
 
 
 def _read_record(job: Job, path: Path) -> Record:

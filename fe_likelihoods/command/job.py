@@ -12,6 +12,9 @@ from .schema import EVENT, FREE_SECTIONS, MODEL_KINDS, SECTIONS, Key, did_you_me
 __all__ = ["Job", "parse_job", "read_job"]
 
 
+_WITHOUT_TIME = "modes", "load_test"  # sections of data instead of [measurements]
+
+
 @dataclass(frozen=True)
 class Job:
     """Contents of a TOML file, section by section. Values are in SI units; files are relative to `folder`."""
@@ -28,6 +31,8 @@ class Job:
     sampler: dict[str, Any]
     budget: dict[str, Any]
     prediction: dict[str, Any]
+    modes: dict[str, Any] = field(default_factory=dict)
+    load_test: dict[str, Any] = field(default_factory=dict)
     events: dict[str, dict[str, Any]] = field(default_factory=dict)  # keys of the events to predict, by name
     event: str = ""  # to which record and measurements belong; empty for the calibration
 
@@ -92,7 +97,16 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
     if "model" not in content:
         raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
     kind, model = _read_model(content["model"], file.name)
-    values = {name: read_keys(content.get(name, {}), keys, f"{file.name}: [{name}]") for name, keys in SECTIONS.items()}
+    values = {
+        name: read_keys(content[name], keys, f"{file.name}: [{name}]") if name in content else {}
+        for name, keys in SECTIONS.items()
+    }
+    data = [name for name in ("measurements", *_WITHOUT_TIME) if name in content]
+    if len(data) > 1 or (data[0:1] != ["measurements"] and data and "record" in content):
+        raise ValueError(
+            f"{file.name}: [{data[-1]}]: a file describes one data set, and modes and load tests have no [record]; "
+            f"got {', '.join(data)}: use JointLikelihood in Python for several"
+        )
     priors = content.get("priors", {})
     for name, prior in priors.items():
         try:

@@ -20,7 +20,7 @@ __all__ = ["NOT_USABLE", "main"]
 ERROR, INTERRUPTED = 1, 130
 NOT_USABLE = 3
 _FILE = click.Path(path_type=Path)
-_KINDS = ("column", "bridge", "opensees", "function", "executable")
+_KINDS = ("column", "bridge", "opensees", "function", "executable", "modal", "load-test")
 
 
 @contextlib.contextmanager

@@ -14,12 +14,13 @@ from ..cache.simulation_cache import SimulationCache
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
-from ..priors.distributions import Distribution, HalfNormal, Uniform
+from ..priors.distributions import Distribution, HalfNormal, LogNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
 from ..simulation.model import Model
-from .data import is_dataset, read_base_motion, read_bundled, read_measured
+from .data import is_dataset, read_base_motion, read_bundled, read_measured, read_supports
 from .job import Job
+from .modes_and_loads import FRAMES, has_no_time, load_likelihood, modal_likelihood
 from .noises import make_noise
 from .priors import parse_prior
 from .schema import did_you_mean, part_keys
@@ -27,6 +28,7 @@ from .schema import did_you_mean, part_keys
 __all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
 
 USER_MODELS = ("function", "opensees", "executable")
+ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
 NOISE_SCALE = 0.3  # half-normal prior of a sigma without one in the file, in root mean squares of the channel (assumed)
 
 
@@ -41,6 +43,8 @@ class Problem(NamedTuple):
 
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
+    if has_no_time(job):
+        return _without_time(job, cache)
     record = read_base_motion(job)
     sensors = _all_channels(job, record)
     measured = read_measured(job, sensors, record)
@@ -57,6 +61,47 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     posterior = Posterior(likelihood, priors)
     posterior = _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior
     return Problem(posterior, record, assumed, _truth(job, posterior, record))
+
+
+def _without_time(job: Job, cache: SimulationCache | None) -> Problem:
+    """The posterior of modes or of a load test."""
+    workers, known = job.budget.get("workers"), {}
+    section = "modes" if job.modes else "load_test"
+    if job.kind not in USER_MODELS and (job.kind not in FRAMES or not job.modes):
+        kinds = (*(FRAMES if job.modes else ()), *USER_MODELS)
+        raise ValueError(f"{job.where('model')} kind: with [{section}], expected one of {', '.join(kinds)}")
+
+    def make_model(make: Any, channels: tuple[Channel, ...], dt: float | None, n_steps: int | None) -> Model:
+        return _user_model(job, None, channels, make, {"dt": dt, "n_steps": n_steps} if n_steps else {})
+
+    if job.modes:
+        likelihood = _located(
+            job, "modes", lambda: modal_likelihood(job, workers, cache, lambda: _frame(job), make_model)
+        )
+    else:
+        channels = _user_channels(job)
+        likelihood, known = _located(
+            job, "load_test", lambda: load_likelihood(job, workers, cache, channels, make_model)
+        )
+        if job.noise:
+            likelihood = likelihood.with_noise(_located(job, "noise", lambda: make_noise(job, likelihood.model)))
+    if twice := [name for name in known if name in job.priors]:
+        raise ValueError(
+            f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
+        )
+    priors, assumed = _make_priors(job, likelihood, known)
+    posterior = Posterior(likelihood, priors)
+    return Problem(
+        _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior, None, assumed
+    )
+
+
+def _frame(job: Job) -> Any:
+    """A shear frame."""
+    from ..models.linear_structure_parts import ShearFrame
+    from ..models.tall_buildings import GroupedFrame
+
+    return _located(job, "model", lambda: (GroupedFrame if job.kind == "grouped frame" else ShearFrame)(**job.model))
 
 
 def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, float] | None:
@@ -145,9 +190,12 @@ def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured:
 
         return LinearOscillator(record, **values)
     from ..models.linear_structure import LinearStructure
-    from ..models.linear_structure_parts import ShearFrame
+    from ..models.linear_structure_parts import BridgeDeck
 
-    return LinearStructure(ShearFrame(**values), record, outputs=names)
+    if job.kind == "bridge deck":
+        supports = [reduce_data(job, each, None)[0] for each in read_supports(job)]
+        return LinearStructure(BridgeDeck(**values), supports, outputs=names)
+    return LinearStructure(_frame(job), record, outputs=names)
 
 
 def _changed(job: Job, part: str, usual: Any, changes: Mapping[str, Any]) -> Any:
@@ -169,6 +217,11 @@ def _check_names(job: Job, key: str, names: Any, known: tuple[str, ...]) -> None
 
 def _user_channels(job: Job) -> tuple[Channel, ...]:
     channels = []
+    if "channels" not in job.model or "sensors" in job.model:
+        raise ValueError(
+            f"{job.where('model')} channels: give the channels of the response, such as "
+            '{top = "relative displacement [mm]"}; sensors are for [modes]'
+        )
     for name, text in job.model["channels"].items():
         match = re.fullmatch(r"\s*(.+?)\s*\[(.+)\]\s*", text)
         try:
@@ -180,12 +233,15 @@ def _user_channels(job: Job) -> tuple[Channel, ...]:
     return tuple(channels)
 
 
-def _user_model(job: Job, record: Record | None) -> Model:
-    given = dict(job.model)
-    names, channels = given.pop("parameters"), _user_channels(job)
-    given.pop("channels")
+def _user_model(
+    job: Job, record: Record | None, channels: tuple[Channel, ...] = (), make: Any = None, steps: Any = None
+) -> Model:
+    """A model of the user; `channels`, a maker of the model of a function, and `steps` of data without a time."""
+    given = dict(job.model) | (steps or {})
+    names, channels = given.pop("parameters"), _user_channels(job) if make is None and not channels else channels
+    given.pop("channels", None), given.pop("sensors", None)
     given["depends_on"] = [job.path("model", "depends_on", name) for name in given.get("depends_on", ())]
-    common = {"record": record} | given
+    common = ({} if has_no_time(job) else {"record": record}) | given
     if job.kind == "executable":
         from ..models.executable import ExecutableModel
 
@@ -203,7 +259,7 @@ def _user_model(job: Job, record: Record | None) -> Model:
         return OpenSeesModel(function, names, channels, **common)
     from ..models.function import FunctionModel
 
-    return FunctionModel(function, names, channels, **common)
+    return (make or FunctionModel)(function, names, channels, **common)
 
 
 def load_function(job: Job, text: str) -> Callable:
@@ -233,8 +289,10 @@ def load_function(job: Job, text: str) -> Callable:
     return function
 
 
-def _make_priors(job: Job, likelihood: FELikelihood) -> tuple[dict[str, Distribution], dict[str, Distribution]]:
-    """The priors of all parameters, and the assumed ones, which the file does not give."""
+def _make_priors(
+    job: Job, likelihood: FELikelihood, known: Mapping[str, float] | None = None
+) -> tuple[dict[str, Any], dict[str, Distribution]]:
+    """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
     names, structural = likelihood.parameter_names, tuple(likelihood.model.parameter_names)
     channels = noise_channels_of(likelihood)
     for name in job.priors:
@@ -254,9 +312,11 @@ def _make_priors(job: Job, likelihood: FELikelihood) -> tuple[dict[str, Distribu
             f'{missing[0]} = "normal(1, 0.3)"'
         )
     assumed = {
-        name: _default_prior(name, channels.get(name), likelihood.measurements) for name in names if name not in given
+        name: _default_prior(name, channels.get(name), likelihood.measurements)
+        for name in names
+        if name not in given and name not in (known or {})
     }
-    return {name: (given | assumed)[name] for name in names}, assumed
+    return {name: (given | assumed | dict(known or {}))[name] for name in names}, assumed
 
 
 def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
@@ -267,6 +327,9 @@ def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
 def _default_prior(name: str, channel: Channel | None, measured: Measurements) -> Distribution:
     if name.startswith("rho_"):
         return Uniform(-1.0, 1.0)
+    for error, median in ERRORS_OF_MODES.items():
+        if name.startswith(error):
+            return LogNormal(median, 1.0)
     if channel is None:
         return HalfNormal(NOISE_SCALE)
     rms = measured.select([channel.name]).root_mean_squares[0]

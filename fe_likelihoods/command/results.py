@@ -31,7 +31,8 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     with np.errstate(divide="ignore", invalid="ignore"):
         cv = sd / np.abs(mean)
     moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
-    fit = _fit_rows(posterior, run.samples)
+    modal = hasattr(posterior.likelihood, "predict_modes")
+    fit = _mode_rows(posterior, run.samples) if modal else _fit_rows(posterior, run.samples)
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
         str(judgement),
@@ -41,9 +42,12 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
         *_of_the_sampler(run),
         *_model_runs(posterior.likelihood, simulations),
         "",
-        "Relative RMS error of the response (RRMSE):",
     ]
-    lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
+    if modal:
+        lines.append(str(posterior.likelihood.predict_modes(run.samples)))
+    else:
+        lines.append("Relative RMS error of the response (RRMSE):")
+        lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal")
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
@@ -111,6 +115,21 @@ def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]
         {"channel": channel.name, "rrmse": float(error)}
         for channel, error in zip(measured.channels, errors, strict=True)
     ]
+
+
+def _mode_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
+    """Measured and computed modes [Hz] at samples of the posterior."""
+    modes = posterior.likelihood.predict_modes(samples)
+    low, high = modes.interval()
+    columns = {
+        "mode": modes.data.mode_numbers,
+        "measured_Hz": modes.data.mean_frequencies.tolist(),
+        "median_Hz": np.median(modes.frequencies, axis=0).tolist(),
+        "q05_Hz": low.tolist(),
+        "q95_Hz": high.tolist(),
+        "mac": np.median(modes.assurance, axis=0).tolist(),
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -263,7 +263,7 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
 
 
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
-    if not len(drawn):
+    if not len(drawn) or job.modes:  # modes are in the table and the figure of the fit
         return None
     cache = problem.posterior.likelihood.simulator.cache
     try:

@@ -102,7 +102,13 @@ _KINDS_OF_TYPES = {
 }
 USER = (
     Key("parameters", "texts", "Names of the structural parameters, in the order of theta", True),
-    Key("channels", "table of texts", 'Channels of the response: name = "quantity [unit]", in order', True),
+    Key("channels", "table of texts", 'Channels of the response: name = "quantity [unit]", in order'),
+    Key(
+        "sensors",
+        "table of whole numbers or texts",
+        "With [modes], instead of channels: sensor = row of the matrices, from 0, that a function returns; a list of "
+        "names for other models",
+    ),
     *documented_keys(FunctionModel, "dt n_steps time_limit", n_steps="whole number >= 1"),
     Key("depends_on", "texts", "Files that the response depends on besides the code"),
     Key("version", "text", "Text that stands for the code in the cache; change it when the results change"),
@@ -138,6 +144,11 @@ _BUILT_IN: dict[str, tuple[str, dict[str, str]]] = {
         "linear_structure_parts.ShearFrame",
         dict(required="floors masses stiffnesses", floors="table of whole numbers"),
     ),
+    "grouped frame": (
+        "tall_buildings.GroupedFrame",
+        dict(names="groups rayleigh", required="groups", rayleigh="whole numbers"),
+    ),
+    "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
 }
 _PARTS = {"column": ("rc_column_parts", _COLUMN_PARTS), "bridge": ("isolated_bridge_parts", _BRIDGE_PARTS)}
 MODEL_KINDS = (*_BUILT_IN, *_OWN)
@@ -155,7 +166,10 @@ def model_keys(kind: str) -> tuple[Key, ...]:
     if kind in _OWN:
         return _OWN[kind]
     name, options = _BUILT_IN[kind]
-    return documented_keys(_in_models(name), **options)
+    storeys = ()
+    if kind == "grouped frame":
+        storeys = tuple(key for key in model_keys("frame") if key.name in ("floors", "masses", "stiffnesses"))
+    return (*storeys, *documented_keys(_in_models(name), **options))
 
 
 def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
@@ -165,6 +179,7 @@ def part_keys(kind: str) -> dict[str, tuple[Key, ...]]:
 
 
 _TABLE = documented_keys(read_record, "time time_unit dt skip resample", time="text", skip="whole number >= 0")
+_ERRORS = "number or numbers"
 SECTIONS: dict[str, tuple[Key, ...]] = {
     "record": (
         Key(
@@ -172,6 +187,12 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
             "text",
             "Acceleration of the base: AT2, V1, V2, SMC, GeoNet, K-NET, ESM, miniSEED, SAC, CSV, Excel, or a data set "
             "(.h5)",
+        ),
+        Key(
+            "supports",
+            "texts",
+            'Motions of several supports instead of file, as "file.csv" or "file.csv:column"; of a bridge deck the '
+            "base of the column, the first end and the second end",
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
         Key(
@@ -197,6 +218,49 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         *_TABLE,
         Key("zero", _ZERO, "Time in the file at which the base motion begins"),
         Key("missing", "numbers", "Numbers that stand for missing samples"),
+    ),
+    "modes": (
+        Key(
+            "file",
+            "text",
+            "Identified modes, instead of [measurements]: CSV, Excel or MATLAB (`read_modal_data`)",
+            True,
+        ),
+        Key("unit", "text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"'),
+        Key(
+            "columns", "table of texts", "Sensor of the model = name of its column; by default the column of this name"
+        ),
+        Key(
+            "variables", "table of texts", "Of a MATLAB file: frequencies, shapes and damping = names of the variables"
+        ),
+        Key("modes", "whole numbers", "Numbers of the modes to compare; by default all"),
+        Key("mean", "yes or no", "Take the mean of several identifications, and their scatter as the errors (no)"),
+        Key(
+            "frequency_cv", _ERRORS, "Known coefficient of variation of the frequencies, such as 0.005, or one per mode"
+        ),
+        Key(
+            "shape_error", _ERRORS, "Known standard deviation of a component of a shape with a norm of 1, such as 0.02"
+        ),
+        Key(
+            "unknown_errors",
+            "text",
+            '"common" or "mode": parameters frequency_error and shape_error, of all modes or of each, are added to the '
+            "known errors; by default where no error is known",
+        ),
+        Key("student_t", "number", "Degrees of freedom of Student-t errors, such as 4, for wrong identifications"),
+        Key("n_modes", "whole number >= 1", "Modes that the model computes (twice as many as were measured)"),
+        Key(
+            "close",
+            "number",
+            "Frequencies that differ by less than this share are compared as a plane of shapes (0.02)",
+        ),
+    ),
+    "load_test": (
+        Key("file", "text", "Load test, instead of [measurements]: CSV or Excel with a line for each load case", True),
+        Key("columns", "table of texts", "Channel = name of its column; by default the column of this name"),
+        Key("units", "table of texts", "Channel = unit, if the file does not state it"),
+        Key("cases", "text", "Column with the names of the load cases, or with positions; by default the first one"),
+        Key("errors", "table of quantities", 'Channel = known standard deviation of its sensor, such as "0.1 mm"'),
     ),
     "noise": (
         Key(
@@ -241,7 +305,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
 
 
 EVENT: tuple[Key, ...] = (
-    *(key for key in SECTIONS["record"] if key.name != "every"),
+    *(key for key in SECTIONS["record"] if key.name not in ("every", "supports")),
     Key("measured", "text", "Measured response in this event, to be compared: a file as in [measurements]"),
     Key("zero", _ZERO, "Time in this file at which the base motion begins; by default as in [measurements]"),
     Key("from_state", "text", '"virgin" (the default), or "end" to begin with the state after the record'),
@@ -304,6 +368,14 @@ _KINDS = {
         'numbers with units by name, such as {top = "0.01 g"}',
     ),
     "table of whole numbers": (_all(_is_whole, dict), "whole numbers by name, such as {top = 2}"),
+    "table of whole numbers or texts": (
+        lambda value: _all(_is_whole, dict)(value) or _all(_is_text, list)(value),
+        'whole numbers by name, such as {top = 2}, or a list of names, such as ["top"]',
+    ),
+    "number or numbers": (
+        lambda value: _is_number(value) or _all(_is_number, list)(value),
+        "a number, or a list of numbers, such as [0.005, 0.01]",
+    ),
 }
 
 

@@ -11,6 +11,8 @@ TEMPLATES = {
     "bridge": ("bridge.toml",),
     "function": ("function.toml", "my_function.py", *_DATA),
     "opensees": ("opensees.toml", "my_opensees.py", *_DATA),
+    "modal": ("modal.toml", "synthetic_modes.csv"),
+    "load-test": ("load-test.toml", "my_girder.py", "synthetic_load_test.csv"),
     "executable": ("executable.toml", "my_program.py", "my_input.txt", "synthetic_logger.csv"),
 }
 """Files of each kind, in the folder ``templates`` of the bundled data."""

@@ -304,8 +304,8 @@ class Simulator:
 
     @property
     def streams(self) -> bool:
-        """Whether simulations can be submitted to the pool one by one."""
-        return bool(getattr(self.pool, "submits", False))
+        """Whether simulations can be submitted to the pool one by one, and not for several data sets at once."""
+        return bool(getattr(self.pool, "submits", False)) and not hasattr(self.model, "simulate_together")
 
     def check_failures(self) -> None:
         """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""

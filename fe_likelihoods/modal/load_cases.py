@@ -1,17 +1,21 @@
 """Static load tests: deflections, strains or rotations under several load cases, as data without time."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..models.function import FunctionModel
 from ..signals.channels import Channel, Measurements
+from ..signals.tables import read_table, stated_unit
 from ..text_tables import text_table
-from ..units import from_si
+from ..units import from_si, to_si
+from .modal_readers import cells_of
 
-__all__ = ["LoadTest"]
+__all__ = ["LoadTest", "read_load_test"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,12 +30,16 @@ class LoadTest:
     ----------
     channels : sequence of Channel
         The sensors.
-    cases : sequence of str
-        Names of the load cases.
+    cases : sequence of str, or of float
+        Names of the load cases, or numbers such as positions of a load.
     values : (n_channels, n_cases) array_like
         Measured values [SI]; NaN where one is missing.
     errors : mapping of str to float, optional
         Known standard deviations of sensors [SI], by the names of channels.
+    axis : str
+        What the load cases are, for figures, such as "position of the truck [m]".
+    description : str
+        What was measured, where and when.
 
     Raises
     ------
@@ -46,13 +54,15 @@ class LoadTest:
     """
 
     channels: Sequence[Channel]
-    cases: Sequence[str]
+    cases: Sequence[str | float]
     values: Any
     _: KW_ONLY
     errors: Mapping[str, float] | None = None
+    axis: str = "load case"
+    description: str = "load test"
 
     def __post_init__(self) -> None:
-        channels, cases = tuple(self.channels), tuple(map(str, self.cases))
+        channels, cases = tuple(self.channels), tuple(self.cases)
         errors, names = dict(self.errors or {}), [channel.name for channel in channels]
         if isinstance(self.cases, str) or not cases or len(set(cases)) != len(cases):
             raise ValueError(f"LoadTest: expected different names of load cases; got {self.cases!r}")
@@ -70,7 +80,7 @@ class LoadTest:
     @property
     def measurements(self) -> Measurements:
         """The values as measurements with one step per load case."""
-        return Measurements(self.channels, 1.0, self.values, f"load cases {', '.join(self.cases)}")
+        return Measurements(self.channels, 1.0, self.values, self.description, axis=self.axis, points=self.cases)
 
     @property
     def known(self) -> dict[str, float]:
@@ -79,9 +89,7 @@ class LoadTest:
 
     def model(self, function: Callable[..., Any], parameter_names: Sequence[str], **options: Any) -> FunctionModel:
         """Model of a function of theta that returns (n_channels, n_cases) [SI], options of `FunctionModel`."""
-        model = FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
-        model.time_label = "load case"
-        return model
+        return FunctionModel(function, parameter_names, self.channels, 1.0, len(self.cases), **options)
 
     def table(self, response: Any) -> str:
         """Measured and computed values (n_channels, n_cases) in the units of the channels, as text."""
@@ -90,5 +98,77 @@ class LoadTest:
         for place, case in enumerate(self.cases):
             pairs = zip(self.values[:, place], response[:, place], self.channels, strict=True)
             shown = [float(from_si(x, c.unit, c.dimension)) for one, other, c in pairs for x in (one, other)]
-            rows.append([case, *(f"{x:.4g}" for x in shown)])
+            rows.append([str(case), *(f"{x:.4g}" for x in shown)])
         return text_table(rows)
+
+
+def read_load_test(
+    path: str | Path,
+    channels: Sequence[Channel],
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    cases: str | None = None,
+    errors: Mapping[str, float] | None = None,
+) -> LoadTest:
+    """Read a load test from a CSV file or workbook with a header line and a line for each load case.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    channels : sequence of Channel
+        The sensors.
+    columns : mapping of str to str, optional
+        Names of the columns, by the names of channels. Default: the column with the name of the channel, with or
+        without a unit.
+    units : mapping of str to str, optional
+        Units by the names of channels, where the file does not state them.
+    cases : str, optional
+        Name of the column with the names of the load cases, or with numbers such as positions. Default: the first
+        column, if it is no channel; else numbers from 1.
+    errors : mapping of str to float, optional
+        Known standard deviations of sensors [SI], by the names of channels.
+
+    Returns
+    -------
+    LoadTest
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or a unit is unknown or not stated.
+
+    Examples
+    --------
+    >>> test = read_load_test("truck.csv", [Channel("midspan", "displacement", "mm")], errors={"midspan": 1e-4})
+    """
+    table = read_table(path)
+    names, values = [column.name for column in table.columns], []
+    plain = [re.sub(r"\s*[\[(].*", "", name).strip() for name in names]
+    for channel in channels:
+        wanted = (columns or {}).get(channel.name, channel.name)
+        places = [k for k in range(len(names)) if wanted in (names[k], plain[k])]
+        if len(places) != 1:
+            raise ValueError(
+                f"{table.file}: expected one column {wanted!r} of the channel {channel.name}; the columns are "
+                f"{', '.join(names)}"
+            )
+        given, stated = (units or {}).get(channel.name), stated_unit(table, places[0], channel.dimension)
+        if (given is None) == (stated is None):
+            found = f"the file states {stated} and {given!r} is given: leave it out" if stated else "it is not stated"
+            raise ValueError(f"{table.file}: unit of {channel.name}: {found}; units={{{channel.name!r}: 'mm'}}")
+        values.append(to_si(table.columns[places[0]].values, stated or given, channel.dimension))
+        plain[places[0]] = ""
+    first = names[0] if plain[0] else None
+    chosen = first if cases is None else cases
+    if chosen is None:
+        return LoadTest(channels, [str(k + 1) for k in range(len(table.lines))], values, errors=errors)
+    if chosen not in names:
+        raise ValueError(f"{table.file}: no column {chosen!r} of load cases; the columns are {', '.join(names)}")
+    column = table.columns[names.index(chosen)]
+    points: list[Any] = column.values.tolist()
+    axis = chosen
+    if column.kind == "text" or np.isnan(points).any():  # names
+        cells = cells_of(Path(path))[-len(table.lines) :]
+        points, axis = [row[names.index(chosen)] for row in cells], "load case"
+    return LoadTest(channels, points, values, errors=errors, axis=axis, description=f"load test of {Path(path).name}")

@@ -36,8 +36,13 @@ class ModalData:
         Known covariance of the frequencies of one identification [Hz²], instead of `frequency_cv`.
     shape_error : float or (m,) array_like, optional
         Known standard deviation of a component of a shape with a norm of 1, for example 0.02.
+    temperatures : float or (n_sets,) array_like, optional
+        Temperature of the structure in each identification [°C]. The likelihood then has a parameter
+        ``temperature_slope`` [1/K], the relative change of all frequencies; the model has those at 20 °C.
     mode_numbers : sequence of int, optional
         Numbers of the modes, used as names and to find the computed modes without a measured shape. Default: 1 to m.
+    description : str
+        What was measured, where and when.
 
     Attributes
     ----------
@@ -65,7 +70,9 @@ class ModalData:
     frequency_cv: Any = None
     covariance: Any = None
     shape_error: Any = None
+    temperatures: Any = None
     mode_numbers: Sequence[int] | None = None
+    description: str = ""
 
     def __post_init__(self) -> None:
         frequencies = _numbers("frequencies", self.frequencies, (1, 2))
@@ -91,6 +98,7 @@ class ModalData:
             "frequency_cv": _share("frequency_cv", self.frequency_cv, m, "0.005 for 0.5 %"),
             "covariance": self._checked_covariance(frequencies),
             "shape_error": _share("shape_error", self.shape_error, m, "0.02, for shapes with a norm of 1"),
+            "temperatures": _temperatures(self.temperatures, n_sets),
             "mode_numbers": tuple(int(number) for number in numbers),
         }
         for name, value in values.items():
@@ -192,6 +200,15 @@ class ModalData:
         columns = [self.sensors.index(name) for name in sensors]
         return replace(self, shapes=self.shapes[:, :, columns], sensors=tuple(sensors))
 
+    def named(self, sensors: Sequence[str]) -> "ModalData":
+        """Return the data with other names of the sensors, in their order."""
+        return replace(self, sensors=tuple(sensors))
+
+    def with_errors(self, frequency_cv: Any = None, shape_error: Any = None) -> "ModalData":
+        """Return the data with known errors, as those of the class; None keeps the present ones."""
+        errors = {"frequency_cv": frequency_cv, "shape_error": shape_error}
+        return replace(self, **{name: value for name, value in errors.items() if value is not None})
+
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.
 
@@ -217,6 +234,7 @@ class ModalData:
             damping=None if self.damping is None else np.nanmean(self.damping, axis=0),
             frequency_cv=np.nanstd(self.frequencies, axis=0, ddof=1) / frequencies,
             covariance=None,
+            temperatures=None if self.temperatures is None else self.temperatures.mean(),
             shape_error=errors if (errors > 0.0).all() else self.shape_error,
         )
 
@@ -283,6 +301,19 @@ def _share(what: str, given: Any, m: int, example: str) -> np.ndarray | None:
             f"as {example}; got {given!r}"
         )
     return np.broadcast_to(values, (m,)).copy()
+
+
+def _temperatures(given: Any, n_sets: int) -> np.ndarray | None:
+    """Temperatures (n_sets,) [°C]; None where none are given."""
+    if given is None:
+        return None
+    values = np.atleast_1d(np.array(given, dtype=float))
+    if values.shape != (n_sets,) or not (np.isfinite(values) & (values > -80.0) & (values < 80.0)).all():
+        raise ValueError(
+            f"ModalData: temperatures must be a number [°C] for each of {n_sets} identifications, from -80 to 80; got "
+            f"{given!r}"
+        )
+    return values
 
 
 def _checked_shapes(given: Any, n_sets: int, m: int, sensors: Sequence[str], known: np.ndarray) -> np.ndarray:

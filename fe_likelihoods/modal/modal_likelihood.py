@@ -1,8 +1,6 @@
 """Log-likelihood of natural frequencies and mode shapes, and the modes that samples of a posterior predict."""
 
-import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +8,7 @@ import numpy as np
 from ..likelihood.likelihood import FELikelihood
 from ..models.linear_structure import LinearStructure
 from ..noise.protocol import Noise
+from ..noise.student import check_degrees
 from ..priors.points import as_points
 from ..simulation.model import Model, SimulationFailed, simulate_batch
 from ..text_tables import text_table
@@ -21,9 +20,6 @@ from .paired_modes import PairedModes
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
-_RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
-_CHANGES = 0.05  # share of the samples with another pairing that is reported
-_RADIANS = 2.0 * np.pi, 0.25  # rad/s over Hz, and how near to it the ratios of all modes are [log]
 
 
 class ModalLikelihood(FELikelihood):
@@ -48,17 +44,14 @@ class ModalLikelihood(FELikelihood):
         data have known errors, else ``"common"``.
     pool : optional
         As for `FELikelihood`.
+    student_t : float, optional
+        Degrees of freedom, above 2, of Student-t errors, such as 4: wrong identifications move the parameters little.
+        Errors are then scales. Default: Gaussian errors.
     close : float
         Measured frequencies that differ by less than this share are compared by the plane of their shapes, and their
         frequencies by the order in the pair. Zero compares each shape.
     **options
         Of `FELikelihood`, such as ``cache``.
-
-    Warns
-    -----
-    UserWarning
-        If frequencies seem to be in rad/s; if an error is unknown, and one identification has no more data of its kind
-        than there are parameters.
 
     Raises
     ------
@@ -82,6 +75,7 @@ class ModalLikelihood(FELikelihood):
         shape_error: str | None = None,
         pool: Any = None,
         *,
+        student_t: float | None = None,
         close: float = _CLOSE,
         **options: Any,
     ) -> None:
@@ -90,14 +84,11 @@ class ModalLikelihood(FELikelihood):
         if not 0.0 <= close < 1.0:
             raise ValueError(f"ModalLikelihood: close must be a share from 0 to 1, such as {_CLOSE}; got {close!r}")
         paired = PairedModes(_with_modes(model), data, close)
-        noise = _noise(paired, data, frequency_error, shape_error)
-        if undetermined := noise.undetermined(len(paired.parameter_names)):
-            warnings.warn(undetermined, stacklevel=2)
+        student = 0.0 if student_t is None else check_degrees("ModalLikelihood: student_t", student_t)
+        if student and data.covariance is not None:
+            raise ValueError("ModalLikelihood: student_t is for independent errors: give frequency_cv, no covariance")
+        noise = _noise(paired, data, frequency_error, shape_error, student)
         super().__init__(paired, paired.measurements, noise, pool, **options)
-        if isinstance(paired.model, StructureModes):
-            with suppress(SimulationFailed):  # at the nominal values, of which most parameters are multiples
-                if radians := _in_radians(self.predict_modes(np.ones(len(paired.parameter_names)))):
-                    warnings.warn(f"With all parameters at 1: {radians}", stacklevel=2)
 
     def with_noise(self, noise: Noise) -> "ModalLikelihood":
         """The same likelihood with other errors, as `FELikelihood.with_noise`."""
@@ -131,9 +122,7 @@ class ModalLikelihood(FELikelihood):
 
         Examples
         --------
-        Before a run, draws of the prior show wrong units, and modes that the model does not have:
-
-        >>> print(likelihood.predict_modes(posterior.sample_prior(100)))
+        >>> print(likelihood.predict_modes(sampler.get_chain(flat=True), held_out))
         """
         paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
         names = paired.parameter_names
@@ -141,21 +130,13 @@ class ModalLikelihood(FELikelihood):
         rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
         cheap = isinstance(paired.model, StructureModes)
-        batch = simulate_batch(paired.model, rows, None if cheap else self.simulator.pool)
-        failed = [reason for reason in batch.reasons if reason]
-        if len(failed) == len(rows):
-            raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {failed[0]}")
-        simulated = (modes for modes, reason in zip(batch.response, batch.reasons, strict=True) if not reason)
-        found = [paired.pair(modes) for modes in simulated]
-        result = PredictedModes(
-            paired.data,
-            np.stack([each.frequencies for each in found]),
-            np.stack([each.assurance for each in found]),
-            np.stack([each.columns for each in found]) + 1,
-            (),
-        )
-        left_out = [f"{len(failed)} samples are left out, whose simulations fail: {failed[0]}"] if failed else []
-        return result._replace(remarks=(*left_out, *_remarks(result)))
+        batch = simulate_batch(paired.model, paired.of_model(rows), None if cheap else self.simulator.pool)
+        batch.response[:, 0] *= paired.at_mean_temperature(rows)
+        good = (batch.response[:, 0] > 0.0).all(axis=1)
+        if not good.any():
+            reason = batch.reasons[0] or "a frequency is not positive"
+            raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {reason}")
+        return PredictedModes.of(paired, batch.response[good])
 
 
 def _with_modes(model: Any) -> Model:
@@ -164,12 +145,12 @@ def _with_modes(model: Any) -> Model:
     return StructureModes(model) if hasattr(model, "assemble") else model
 
 
-def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any) -> ModalNoise:
+def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_error: Any, student: float) -> ModalNoise:
     """The errors, from what the data and the arguments say."""
     sizes = np.ones(data.n_modes, dtype=int)
     for group in paired.groups:
         sizes[list(group)] = len(group)
-    shapes = data.has_shape.sum(axis=0)
+    freedoms = (data.has_shape * np.maximum(data.n_sensors - sizes, 0)).T
     if data.covariance is not None and frequency_error is not None:
         raise ValueError(
             "ModalLikelihood: the covariance of the frequencies is known; leave frequency_error out, or give the data "
@@ -181,12 +162,13 @@ def _noise(paired: PairedModes, data: ModalData, frequency_error: Any, shape_err
         channels=paired.channels,
         n_sets=data.n_sets,
         n_sensors=data.n_sensors,
-        counts=tuple((~np.isnan(data.frequencies)).sum(axis=0).tolist()),
-        freedoms=tuple((shapes * np.maximum(data.n_sensors - sizes, 0)).tolist()),
+        counts=tuple((~np.isnan(data.frequencies)).T.astype(int).ravel().tolist()),
+        freedoms=tuple(freedoms.ravel().tolist()),
         frequency_known=frequency_known,
         shape_known=shape_known,
         frequency=frequency,
-        shape=shape if shapes.any() and data.n_sensors > 1 else "",
+        shape=shape if freedoms.any() else "",
+        student=student,
     )
 
 
@@ -207,64 +189,64 @@ class PredictedModes(NamedTuple):
 
     Attributes
     ----------
-    data : ModalData
-        The measured modes.
+    paired : PairedModes
+        The measured modes (``paired.data``), and the model.
+    computed : ndarray, shape (n, 1 + n_sensors, n_modes)
+        All computed modes: frequencies [Hz], and shapes at the sensors of the model.
     frequencies : ndarray, shape (n, m)
-        Computed frequencies [Hz].
+        Computed frequencies of the measured modes [Hz].
     assurance : ndarray, shape (n, m)
         Modal assurance criterion; NaN for modes without a measured shape.
     numbers : ndarray, shape (n, m)
         Numbers of the computed modes, from 1.
-    remarks : tuple of str
-        Modes that no computed mode resembles, pairings that change between the samples, and units that look wrong.
+    shapes : ndarray, shape (n, m, n_sensors)
+        Computed shapes with the scale and sign of the measured ones (of the first identification that has them).
     """
 
-    data: ModalData
+    paired: PairedModes
+    computed: np.ndarray
     frequencies: np.ndarray
     assurance: np.ndarray
     numbers: np.ndarray
-    remarks: tuple[str, ...]
+    shapes: np.ndarray
+
+    @classmethod
+    def of(cls, paired: PairedModes, computed: np.ndarray) -> "PredictedModes":
+        """Pair computed modes (n, 1 + n_sensors, n_modes) with the measured ones; ValueError if n is zero."""
+        found, first = [paired.pair(modes) for modes in computed], paired.data.has_shape.argmax(axis=0)
+        return cls(
+            paired,
+            computed,
+            np.stack([each.frequencies for each in found]),
+            np.stack([each.assurance for each in found]),
+            np.stack([each.columns for each in found]) + 1,
+            np.stack([each.shapes[first, np.arange(len(first))] for each in found]),
+        )
+
+    @property
+    def data(self) -> ModalData:
+        """The measured modes."""
+        return self.paired.data
+
+    def against(self, data: ModalData) -> "PredictedModes":
+        """The same computed modes beside other measured ones; nothing is simulated."""
+        return self.of(PairedModes(self.paired.model, data, self.paired.close), self.computed)
 
     def interval(self, level: float = 0.9) -> np.ndarray:
         """Central intervals (2, m) of the computed frequencies [Hz], without the error of the identification."""
         return np.quantile(self.frequencies, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
 
-    def __str__(self) -> str:
-        low, high = self.interval()
-        rows = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC"]]
+    def rows(self) -> list[list[str]]:
+        """The table as texts: number, measured frequency, median and 90 % interval of the computed one, median MAC."""
+        rows, (low, high) = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC"]], self.interval()
         for k, number in enumerate(self.data.mode_numbers):
             values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]
             rows.append([str(number), *(f"{x:.4g}" for x in values), f"{np.median(self.assurance[:, k]):.3f}"])
-        return "\n".join([text_table(rows), *self.remarks])
+        return rows
 
+    def short(self) -> str:
+        """The table without intervals, as text."""
+        return text_table([[*row[:3], row[5]] for row in self.rows()])
 
-def _remarks(modes: PredictedModes) -> list[str]:
-    """What is wrong with pairs of measured and computed modes, in words."""
-    data, remarks = modes.data, [text] if (text := _in_radians(modes)) else []
-    resembling = np.median(modes.assurance, axis=0)
-    for k in np.flatnonzero(resembling < _RESEMBLES):
-        others = [number for number in data.mode_numbers if number != data.mode_numbers[k]]
-        remarks.append(
-            f"No computed mode resembles the measured mode {data.mode_numbers[k]} ({data.mean_frequencies[k]:.4g} Hz): "
-            f"its best MAC is {resembling[k]:.2f}. It is compared all the same; if its identification is doubtful, "
-            f"leave it out, data.select({others}), else look for what the model lacks, or compute more modes."
-        )
-    for k, numbers in enumerate(modes.numbers.T):
-        values, counts = np.unique(numbers, return_counts=True)
-        if len(values) > 1 and counts.max() < (1.0 - _CHANGES) * len(numbers):
-            shares = ", ".join(f"{v} ({c / len(numbers):.0%})" for v, c in zip(values, counts, strict=True))
-            remarks.append(
-                f"The measured mode {data.mode_numbers[k]} is paired with different computed modes: {shares}. The "
-                "posterior may have several modes; more sensors tell the shapes apart."
-            )
-    return remarks
-
-
-def _in_radians(modes: PredictedModes) -> str:
-    """A sentence if measured and computed frequencies of resembling modes differ by the factor of rad/s to Hz."""
-    resemble = ~(np.median(modes.assurance, axis=0) < _RESEMBLES)
-    logs = np.log(modes.data.mean_frequencies / np.median(modes.frequencies, axis=0))[resemble]
-    for sign, whose in ((1.0, "measured"), (-1.0, "computed")):
-        if len(logs) and (np.abs(sign * logs - np.log(_RADIANS[0])) < _RADIANS[1]).all():
-            return f"The {whose} frequencies are about 6.28 times the others: are they in rad/s instead of Hz?"
-    return ""
+    def __str__(self) -> str:
+        return text_table(self.rows())

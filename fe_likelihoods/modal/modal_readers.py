@@ -1,6 +1,8 @@
 """Modal data from files and from programs of operational modal analysis."""
 
 import logging
+import re
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,21 @@ from ..signals.tables import Table, read_table, stated_unit
 from ..units import to_si
 from .modal_data import ModalData, real_shapes
 
-__all__ = ["read_modal_data"]
+__all__ = ["cells_of", "read_modal_data"]
 
 logger = logging.getLogger(__name__)
 
-_FREQUENCY, _DAMPING, _MODE, _SET = ("frequency", "freq", "f"), ("damping", "xi"), ("mode",), ("set", "identification")
+# words in the names of columns that are no sensors, and whole names
+_WORDS = {
+    "deviation": ("std", "stdev", "sd", "cv"),
+    "frequency": ("frequency", "frequencies", "freq", "eigenfrequency"),
+    "period": ("period",),
+    "damping": ("damping",),
+    "temperature": ("temperature", "temp"),
+    "set": ("set", "identification"),
+    "mode": ("mode",),
+}
+_NAMES = {"f": "frequency", "f_hz": "frequency", "fn": "frequency", "fn_hz": "frequency", "xi": "damping", "no": "mode"}
 
 
 def read_modal_data(
@@ -32,8 +44,10 @@ def read_modal_data(
     ----------
     source : path, or result of an identification
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
-          its unit, such as ``frequency_Hz``; optional columns ``mode`` (its number), ``damping`` and ``set`` (the
-          number of the identification, where there are several); all other columns are sensors.
+          its unit, such as ``frequency_Hz``, or ``period_s``; optional columns ``mode`` (its number), ``damping``,
+          ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` (the number of the
+          identification, where there are several); all other columns are sensors. A CSV file with a column for each
+          mode is transposed.
         * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
         * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``.
     sensors : sequence of str, optional
@@ -70,19 +84,56 @@ def read_modal_data(
         return _of_result(source, sensors, options)
     if not isinstance(source, str | Path):
         raise ValueError(f"read_modal_data: expected a path, or a result with Fn and Phi; got {type(source).__name__}")
+    options = {"description": Path(source).name} | options
     if Path(source).suffix.lower() == ".mat":
         return _of_matlab(Path(source), sensors, unit, variables or {}, options)
-    return _of_table(read_table(source), sensors, unit, options)
+    table = read_table(source)
+    if not {"frequency", "period"} & set(map(_kind, _names_of(table))):
+        table = _transposed(Path(source)) or table
+    return _of_table(table, sensors, unit, options)
+
+
+def _names_of(table: Table) -> list[str]:
+    """Names of the columns."""
+    return [column.name for column in table.columns]
+
+
+def _kind(name: str) -> str:
+    """What a column is, by its name; empty for a sensor."""
+    name = re.sub(r"[\[(].*", "", name.lower()).strip(" ._")
+    words = set(re.split(r"[^a-z]+", name))
+    return next((kind for kind, known in _WORDS.items() if words & set(known)), _NAMES.get(name, ""))
+
+
+def cells_of(path: Path) -> list[list[str]]:
+    """Cells of a text file with one delimiter, without empty lines and comments."""
+    lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,;\t")]
+    lines = [line for line in lines if not line.startswith("#")]
+    delimiter = max(";\t,", key=lines[0].count)
+    return [[cell.strip(' "') for cell in line.split(delimiter)] for line in lines]
+
+
+def _transposed(path: Path) -> Table | None:
+    """Table of a text file with a column for each mode, below a line of their names; None if it is no such file."""
+    if path.suffix.lower() not in (".csv", ".txt", ".dat", ".tsv"):
+        return None
+    first, *others = cells_of(path)
+    if not {"frequency", "period"} & {_kind(row[0]) for row in others} or {len(row) for row in others} != {len(first)}:
+        return None
+    digits = [re.sub(r"\D", "", name) for name in first[1:]]
+    numbers = digits if all(digits) else [str(k + 1) for k in range(len(digits))]
+    lines = zip(["mode", *numbers], *others, strict=True)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / path.name
+        file.write_text("\n".join("\t".join(line) for line in lines), encoding="utf-8")
+        return read_table(file)
 
 
 def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
-    names = [column.name for column in table.columns]
-    words = [name.lower().replace("[", " ").replace("(", " ").replace("_", " ").split()[0] for name in names]
-    found = {
-        what: next((place for place, word in enumerate(words) if word in known), None)
-        for what, known in (("frequency", _FREQUENCY), ("damping", _DAMPING), ("mode", _MODE), ("set", _SET))
-    }
-    if found["frequency"] is None:
+    names = _names_of(table)
+    kinds = list(map(_kind, names))
+    found = {what: kinds.index(what) if what in kinds else None for what in _WORDS}
+    if found["frequency"] is None and found["period"] is None:
         raise ValueError(
             f"{table.file}: expected a column of frequencies, such as frequency_Hz; the columns are {', '.join(names)}"
         )
@@ -91,8 +142,7 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
     sensors = tuple(sensors) or tuple(others)
     values = {what: None if place is None else table.columns[place].values for what, place in found.items()}
-    stated = stated_unit(table, found["frequency"], "frequency")
-    frequencies = _in_hertz(values["frequency"], stated, unit, f"{table.file}, column {names[found['frequency']]!r}")
+    frequencies = _frequencies(table, found, unit)
     shapes = np.array([table.columns[names.index(name)].values for name in sensors]).reshape(len(sensors), -1).T
     sets = np.zeros(len(frequencies)) if values["set"] is None else values["set"]
     modes = values["mode"]
@@ -108,11 +158,40 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         )
     placed = {"frequencies": np.full(shape, np.nan), "shapes": np.full((*shape, len(sensors)), np.nan)}
     placed["frequencies"][rows], placed["shapes"][rows] = frequencies, shapes
+    if found["deviation"] is not None:  # the mean square of several identifications
+        squares = np.full(shape, np.nan)
+        squares[rows] = np.square(_coefficients(table, found["deviation"], frequencies))
+        options = {"frequency_cv": np.sqrt(np.nanmean(squares, axis=0))} | options
+    if values["temperature"] is not None:
+        by_set = [np.unique(values["temperature"][sets == each]) for each in order]
+        if any(len(each) > 1 for each in by_set):
+            raise ValueError(f"{table.file}: expected one temperature for each identification (column 'set')")
+        options = {"temperatures": np.concatenate(by_set)} | options
     if values["damping"] is not None:
         placed["damping"] = np.full(shape, np.nan)
         named = stated_unit(table, found["damping"], "dimensionless")
         placed["damping"][rows] = to_si(values["damping"], named or "1", "dimensionless")
     return ModalData(sensors=sensors, mode_numbers=numbers.astype(int).tolist(), **placed, **options)
+
+
+def _frequencies(table: Table, found: Mapping[str, int | None], unit: str | None) -> np.ndarray:
+    """Frequencies [Hz] from a column of frequencies or periods."""
+    place = found["frequency"]
+    if place is None:
+        stated = stated_unit(table, found["period"], "time")
+        if stated is None:
+            raise ValueError(f"{table.file}: the unit of the periods is not stated; name the column period_s")
+        return 1.0 / to_si(table.columns[found["period"]].values, stated, "time")
+    stated = stated_unit(table, place, "frequency")
+    return _in_hertz(table.columns[place].values, stated, unit, f"{table.file}, column {_names_of(table)[place]!r}")
+
+
+def _coefficients(table: Table, place: int, frequencies: np.ndarray) -> np.ndarray:
+    """Coefficients of variation from a column ``frequency_std`` [Hz, rad/s] or ``frequency_cv``."""
+    name, stated = _names_of(table)[place], stated_unit(table, place)
+    if "cv" in re.split(r"[^a-z]+", name.lower()):
+        return to_si(table.columns[place].values, stated or "1", "dimensionless")
+    return _in_hertz(table.columns[place].values, stated, None, f"{table.file}, column {name!r}") / frequencies
 
 
 def _of_matlab(

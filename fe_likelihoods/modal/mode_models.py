@@ -189,7 +189,6 @@ class StructureModes(ExternalModel):
     """
 
     path_dependent = False
-    time_label = "mode"
 
     def __init__(self, parts: Parts, n_modes: int | None = None) -> None:
         known = len(getattr(parts, "masses", ())) or getattr(parts, "n_modes", None)

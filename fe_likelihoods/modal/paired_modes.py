@@ -4,6 +4,9 @@ Each measured mode is a channel. Its samples are, for each identification, the c
 measured one, and the projection of the measured shape on the computed one, at all sensors. They are smooth functions of
 the parameters as long as the pairing stays, so emulators and searches of modes of the posterior need nothing else. The
 residuals are the relative frequency errors and the vectors of squared length 1 - MAC.
+
+With temperatures T of the identifications there is one more parameter, ``temperature_slope`` s [1/K], common to all
+modes: frequencies are f (1 + s (T - 20 °C)).
 """
 
 from typing import Any
@@ -13,18 +16,20 @@ import numpy as np
 from ..models.base import digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
-from ..simulation.model import Model, SimulationFailed
+from ..simulation.model import Model, SimulationBatch, SimulationFailed
 from ..simulation.user_code import is_of_user
 from .modal_data import ModalData
 from .pairing import Paired, pair_modes
 
-__all__ = ["PairedModes", "sensor_rows"]
+__all__ = ["REFERENCE_TEMPERATURE", "SLOPE", "PairedModes", "sensor_rows"]
+
+REFERENCE_TEMPERATURE = 20.0  # [°C], of the frequencies of the model
+SLOPE = "temperature_slope"
 
 _OF_THE_MODEL = (
     "code_parts",
     "nominal",
     "nominal_units",
-    "parameter_units",
     "range_remark",
     "response_tolerance",
     "time_limit",
@@ -43,7 +48,7 @@ def sensor_rows(model: Model, data: ModalData) -> list[int]:
     if unknown := [name for name in data.sensors if name not in names[1:]]:
         raise ValueError(
             f"the model has no sensors {', '.join(unknown)}; its sensors are {', '.join(names[1:]) or 'none'}: rename "
-            "them, or leave them out of the data with data.at(sensors)"
+            'them, or leave them out with data.at(sensors); in a TOML file, columns = {sensor = "its column"}'
         )
     by_number = [data.mode_numbers[mode] for mode in np.flatnonzero(~data.has_shape.any(axis=0))]
     if max([data.n_modes, *by_number]) > model.n_steps:
@@ -59,7 +64,7 @@ class PairedModes:
 
     dt = 1.0
     path_dependent = False
-    time_label = "frequency, then components of the shape"
+    axis = "frequency, then components of the shape"
 
     def __init__(self, model: Model, data: ModalData, close: float) -> None:
         self.model, self.data, self.close = model, data, close
@@ -72,7 +77,9 @@ class PairedModes:
             factor = np.linalg.cholesky(data.covariance / np.outer(data.mean_frequencies, data.mean_frequencies))
             self.frequency_cv = np.diag(factor).copy()
             self._whitening = self.frequency_cv[:, None] * np.linalg.inv(factor)
-        self.parameter_names = tuple(model.parameter_names)
+        self._warmer = None if data.temperatures is None else data.temperatures - REFERENCE_TEMPERATURE
+        self.parameter_names = (*model.parameter_names, *(() if self._warmer is None else (SLOPE,)))
+        self._n_own = len(model.parameter_names)
         self.channels = tuple(Channel(f"mode {number}", "dimensionless", "1") for number in data.mode_numbers)
         self.n_steps = data.n_sets * (1 + data.n_sensors)
         self.groups = self._measured.groups
@@ -81,7 +88,26 @@ class PairedModes:
     def fingerprint(self) -> str:
         """Digest of the model, the data and the groups of close modes."""
         parts = type(self).__name__, self.model.fingerprint, self.data.fingerprint, repr(self.groups)
-        return digest(*parts, array_digest(self._whitening))
+        temperatures = [] if self._warmer is None else [array_digest(self._warmer)]
+        return digest(*parts, array_digest(self._whitening), *temperatures)
+
+    @property
+    def parameter_units(self) -> dict[str, str]:
+        """Units of parameters in words."""
+        own = {} if self._warmer is None else {SLOPE: "1/K"}
+        return dict(getattr(self.model, "parameter_units", {})) | own
+
+    def of_model(self, thetas: np.ndarray) -> np.ndarray:
+        """The parameters of the model (..., n) among all (..., n_parameters)."""
+        return np.asarray(thetas, dtype=float)[..., : self._n_own]
+
+    def at_mean_temperature(self, thetas: np.ndarray) -> np.ndarray:
+        """Factors of frequencies (n, 1) at the mean temperature, for parameters (n, n_parameters)."""
+        return np.ones((len(thetas), 1)) if self._warmer is None else 1.0 + thetas[:, [-1]] * self._warmer.mean()
+
+    def _warmed(self, theta: np.ndarray) -> np.ndarray | float:
+        """Factors of frequencies (n_sets, 1) at parameters (n_parameters,)."""
+        return 1.0 if self._warmer is None else 1.0 + theta[-1] * self._warmer[:, None]
 
     def __getattr__(self, name: str) -> Any:
         """Optional members of the model, such as `code_parts`, and `jacobian` if the model has it."""
@@ -90,6 +116,8 @@ class PairedModes:
             return lambda: {"model": model} | (model.code_parts() if hasattr(model, "code_parts") else {})
         if model is not None and name in _OF_THE_MODEL:
             return getattr(model, name)
+        if model is not None and name == "simulate_together" and hasattr(model, "simulate_together"):
+            return self._simulate_together
         if model is not None and name == "jacobian" and getattr(model, "jacobian", None) is not None:
             return self._differentiate
         raise AttributeError(f"{type(self).__name__} has no {name}")
@@ -98,12 +126,30 @@ class PairedModes:
     def measurements(self) -> Measurements:
         """The data as measurements of the channels."""
         values = self._joined(self._there.astype(float), self._measured.shapes)
-        return Measurements(self.channels, self.dt, values, "natural frequencies and mode shapes")
+        sets = [f" of set {k + 1}" if self.data.n_sets > 1 else "" for k in range(self.data.n_sets)]
+        points = [f"{what}{end}" for end in sets for what in ("frequency", *self.data.sensors)]
+        text = " of ".join(filter(None, ["natural frequencies and mode shapes", self.data.description]))
+        return Measurements(self.channels, self.dt, values, text, axis=self.axis, points=points)
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (m, n_sets (1 + n_sensors)) at the parameters (n_parameters,)."""
-        paired = self.pair(self.model.simulate(theta))
-        return self._joined(self._ratios(paired.frequencies), paired.shapes)
+        return self._response(self.model.simulate(self.of_model(theta)), theta)
+
+    def _simulate_together(self, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
+        """Responses at parameters (n, n_parameters), from a run that answers other data sets too."""
+        batch = self.model.simulate_together(self.of_model(thetas), pool)
+        found, reasons = np.full((len(thetas), len(self.channels), self.n_steps), np.nan), list(batch.reasons)
+        for row, modes in enumerate(batch.response):
+            if not reasons[row]:
+                try:
+                    found[row] = self._response(modes, thetas[row])
+                except SimulationFailed as error:
+                    reasons[row] = error.reason
+        return SimulationBatch(found, reasons)
+
+    def _response(self, modes: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        paired = self.pair(modes)
+        return self._joined(self._ratios(paired.frequencies) * self._warmed(theta), paired.shapes)
 
     def pair(self, modes: np.ndarray) -> Paired:
         """Pair modes (1 + n_sensors, n_modes), a response of the model, with the measured ones."""
@@ -123,7 +169,8 @@ class PairedModes:
 
     def _differentiate(self, theta: np.ndarray) -> np.ndarray:
         """Derivatives (n_parameters, m, n_steps) of the response while the pairing stays."""
-        modes, slopes = self.model.simulate(theta), np.asarray(self.model.jacobian(theta))
+        own = self.of_model(theta)
+        modes, slopes = self.model.simulate(own), np.asarray(self.model.jacobian(own))
         paired = self.pair(modes)
         shapes = np.zeros((len(slopes), *paired.shapes.shape))
         for mode, space in enumerate(paired.spaces):
@@ -136,4 +183,8 @@ class PairedModes:
                 moved = turned @ (inverse @ target)
                 moved = moved - moved @ inverse.T @ basis.T
                 shapes[:, k, mode] = moved + (target - projected) @ turned @ inverse
-        return self._joined(self._ratios(slopes[:, 0, paired.columns]), shapes)
+        ratios = self._ratios(slopes[:, 0, paired.columns]) * self._warmed(theta)
+        if self._warmer is not None:
+            ratios = np.concatenate([ratios, (self._ratios(paired.frequencies) * self._warmer[:, None])[None]])
+            shapes = np.concatenate([shapes, np.zeros((1, *shapes.shape[1:]))])
+        return self._joined(ratios, shapes)

@@ -24,30 +24,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-__all__ = ["MeasuredModes", "Paired", "best_scale", "close_groups", "modal_assurance", "pair_modes", "shape_misfit"]
+__all__ = ["MeasuredModes", "Paired", "close_groups", "pair_modes"]
 
 _FREQUENCY_WEIGHT = 0.1  # of |log(f / measured f)| beside 1 - MAC: decides only where the shapes hardly do
 _COINCIDENT = 1e-6  # relative difference of computed frequencies whose shapes are any basis of their space
 _SAME = 1e-6  # smallest singular value of shapes that the sensors tell apart, as a share of the largest
 _FORCED = 1e3  # cost of any pairing but the one by number
-
-
-def modal_assurance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Modal assurance criterion (m, n) between the shapes in the rows of two arrays, (m, n_sensors), (n, n_sensors).
-
-    It is 1 for shapes that differ by a factor only, and 0 for orthogonal shapes.
-    """
-    return np.square(_normed(first) @ _normed(second).T)
-
-
-def best_scale(shape: np.ndarray, measured: np.ndarray) -> float:
-    """Factor of a computed shape (n_sensors,) that brings it nearest to a measured one."""
-    return float(shape @ measured / (shape @ shape))
-
-
-def shape_misfit(shape: np.ndarray, measured: np.ndarray) -> float:
-    """Squared distance ``|m|² (1 - MAC)`` of a measured shape (n_sensors,) from the best multiple of a computed one."""
-    return float(np.square(measured - best_scale(shape, measured) * shape).sum())
 
 
 def close_groups(frequencies: Sequence[float], close: float) -> tuple[tuple[int, ...], ...]:

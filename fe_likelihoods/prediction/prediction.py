@@ -84,6 +84,8 @@ class Prediction:
         event is predicted (`fe_likelihoods.predict_new_event`).
     findings : tuple of Finding
         What speaks against the prediction, each with what to do; the warnings of `fe_likelihoods.propagate`.
+    data : Measurements or None
+        What was measured, if it is along another axis than time, such as load cases, and the histories are along it.
     """
 
     mean: np.ndarray
@@ -107,6 +109,7 @@ class Prediction:
     spread: EventSpread | None = None
     findings: tuple[Finding, ...] = ()
     collapsed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    data: Measurements | None = None
 
     @property
     def sd(self) -> np.ndarray:

@@ -304,7 +304,12 @@ def propagate(
     if noise and source.likelihood is not None:
         findings += check_gaps(source.likelihood.noise)
     warn(findings)
-    predictions = {name: replace(each, findings=tuple(findings)) for name, each in predictions.items()}
+    measured = None if source.likelihood is None or other else source.likelihood.measurements
+    data = None if measured is None or measured.is_history else measured
+    predictions = {
+        name: replace(each, findings=tuple(findings), data=None if each.dt is None else data)
+        for name, each in predictions.items()
+    }
     return predictions if isinstance(quantity, Mapping) else predictions[""]
 
 

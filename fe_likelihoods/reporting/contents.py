@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks.compared import Fits
+from ..checks.compared import Fit, Fits
 from ..checks.finding import Judgement
 from ..checks.fit import SAME_AS_PRIOR, residual_sentence
 from ..checks.run import FinishedRun
@@ -60,10 +60,16 @@ def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
     excitations = (getattr(model, name, None) for name in ("record", "loading"))
     excitation = next((_named(each) for each in excitations if isinstance(getattr(each, "name", None), str)), "")
     samples = np.isfinite(measurements.values).sum(axis=1)
+    along = "" if measurements.is_history else f" ({measurements.axis})"
     channels = [
-        f"{channel.name} [{channel.unit}], {count} samples at {step:g} s"
+        f"{channel.name} [{channel.unit}], {count} {f'values{along}' if along else f'samples at {step:g} s'}"
         for channel, count, step in zip(measurements.channels, samples, measurements.steps, strict=True)
     ]
+    if hasattr(likelihood, "predict_modes"):
+        data = model.data
+        times = f", identified {data.n_sets} times" if data.n_sets > 1 else ""
+        channels = [f"{data.n_modes} modes at {data.n_sensors} sensors{times}"]
+        model = getattr(model.model, "parts", model.model)
     noise = noise_title(likelihood.noise)
     return DataSet(key, type(model).__name__, excitation, measurements.description, noise, "; ".join(channels))
 
@@ -82,7 +88,9 @@ def summary_sentences(
     if sets:
         models = " and ".join(sorted({each.model for each in sets}))
         n_channels = sum(len(likelihood.measurements.channels) for likelihood, _ in run.likelihood.parts())
-        channels = f"{n_channels} measured channel{'s' if n_channels > 1 else ''}"
+        modal = any(hasattr(likelihood, "predict_modes") for likelihood, _ in run.likelihood.parts())
+        what = "modes" if modal and len(sets) == 1 else "modes and channels" if modal else "channels"
+        channels = f"{n_channels} measured {what if n_channels > 1 else what[:-1]}"
         what = f"{len(rows)} parameters of {models} and its noise were updated with {channels}"
         what += f" of {len(sets)} data sets" if len(sets) > 1 else ""
         what += " (synthetic data)." if any("synthetic" in each.description.lower() for each in sets) else "."
@@ -107,11 +115,23 @@ def _finding(rows: list[ParameterRow], fits: Fits) -> str:
             else "No parameter has a standard deviation clearly smaller than in its prior"
         )
     errors = [(each.before, each.after) for fit in fits.fits for each in fit.channels]
+    assured = [f"{low:.3f} to {high:.3f}" for low, high in map(_assurance, fits.fits) if np.isfinite(low)]
+    if assured:
+        fit = f"the MAC of the measured modes is {' and '.join(assured)}"
+        found = f"{found}; {fit}" if found else f"T{fit[1:]}"
     if errors and np.isfinite(errors).all():
         before, after = 100.0 * np.mean(errors, axis=0)
         fit = f"the mean relative error of the response went from {before:.3g} % to {after:.3g} %"
         found = f"{found}; {fit}" if found else f"{fit[0].upper()}{fit[1:]}"
     return f"{found}." if found else "Means and intervals of the parameters are in the table below."
+
+
+def _assurance(fit: Fit) -> tuple[float, float]:
+    """The least and largest median MAC of the modes; NaN without modes."""
+    if fit.modal is None or fit.modal.samples is None or np.isnan(fit.modal.samples.assurance).all():
+        return np.nan, np.nan
+    middle = np.median(fit.modal.samples.assurance, axis=0)
+    return float(np.nanmin(middle)), float(np.nanmax(middle))
 
 
 def _worth(run: FinishedRun) -> str:
@@ -166,8 +186,9 @@ def evidence(run: FinishedRun) -> list[str]:
 
 
 def residual_sentences(fits: Fits) -> list[str]:
-    """The checks of the residuals, one sentence per channel and event."""
-    return [residual_sentence(fit, each) for fit in fits.fits if fit.residuals is not None for each in fit.channels]
+    """The checks of the residuals, one sentence per channel and event; values without an order in time have none."""
+    histories = [fit for fit in fits.fits if fit.residuals is not None and fit.measurements.is_history]
+    return [residual_sentence(fit, each) for fit in histories for each in fit.channels]
 
 
 def cost(run: FinishedRun, fits: Fits) -> list[tuple[str, str]]:

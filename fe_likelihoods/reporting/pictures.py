@@ -13,6 +13,7 @@ from samplers import plot_corner, plot_marginals, plot_run
 from ..checks.compared import Fit
 from ..checks.run import FinishedRun
 from ..plots.fits import plot_fit
+from ..plots.without_time import plot_modes, plot_points
 from ..prediction.prediction import Prediction
 from ..prediction.score_tables import HistoryScores, QuantityScores
 from .other_events import OtherEvent
@@ -100,9 +101,21 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
 
 
 def draw_fit(fit: Fit) -> list[Picture]:
-    """Measured and simulated histories, before and after the update."""
+    """Measured and computed histories, points or modes, before and after the update."""
+    if fit.modal is not None:
+        return _draw_modes(fit)
     if not fit.responses:
         return []
+    if not fit.measurements.is_history:
+        return [
+            _picture(
+                "Measured and computed values",
+                "After the update, about two of three measured values should be within their standard deviations of "
+                "the computed ones.",
+                f"Values of {', '.join(channel.name for channel in fit.measurements.channels)}.",
+                lambda: plot_points(fit.measurements, fit.responses, fit.deviations),
+            )
+        ]
     return [
         _picture(
             "Measured and simulated response",
@@ -115,11 +128,27 @@ def draw_fit(fit: Fit) -> list[Picture]:
     ]
 
 
+def _draw_modes(fit: Fit) -> list[Picture]:
+    """Measured and computed modes."""
+    if fit.modal.samples is None:
+        return []
+    return [
+        _picture(
+            "Measured and computed modes",
+            "After the update, computed frequencies should be within the errors of the measured ones, and the shapes "
+            "should agree at all sensors. MAC is 1 for equal shapes and 0 for orthogonal ones. Scale and sign of a "
+            "shape are arbitrary.",
+            "Frequencies over measured frequencies, and shapes of the measured modes.",
+            lambda: plot_modes(fit.modal.samples, fit.modal.draws),
+        )
+    ]
+
+
 def draw_residuals(fit: Fit) -> list[Picture]:
     """Residuals against time, their autocorrelation and quantiles."""
     from ..plots.histories import plot_residuals
 
-    if fit.residuals is None or not fit.measurements.simultaneous:
+    if fit.residuals is None or not fit.measurements.simultaneous or not fit.measurements.is_history:
         return []
     return [
         _picture(
@@ -151,9 +180,20 @@ def draw_run(run: FinishedRun) -> list[Picture]:
 
 
 def draw_prediction(prediction: Prediction, measurements: Any) -> list[Picture]:
-    """Predicted histories with their band."""
+    """Predicted histories with their band, or predicted values; modes are in the figure of the fit."""
     from ..plots.predictions import plot_bands
 
+    data = prediction.data
+    if data is not None and not data.is_history:
+        return [
+            _picture(
+                "Predicted values",
+                "The error bars hold the predicted values with the stated probability. They contain the uncertainty of "
+                "the parameters.",
+                f"Predicted values of {', '.join(channel.name for channel in prediction.channels)}.",
+                lambda: plot_points(data, prediction=prediction),
+            )
+        ]
     return [
         _picture(
             "Predicted histories",

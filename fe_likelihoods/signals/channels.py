@@ -86,6 +86,11 @@ class Measurements:
         What was measured, where and when.
     start : float or sequence of float, optional
         Time of the first sample [s] after the first sample of the excitation, or one per channel. Default: zero.
+    axis : str
+        What the samples are along, if not time: for example "load case", or "position [m]". Steps are then without a
+        meaning, and the data are drawn as points.
+    points : sequence of str or float, optional
+        Names or places of the samples along such an axis. Default: numbers from 1.
 
     Attributes
     ----------
@@ -116,6 +121,8 @@ class Measurements:
     values: NDArray[np.float64]
     description: str = ""
     start: float | tuple[float, ...] = 0.0
+    axis: str = "time"
+    points: Sequence[str | float] = ()
 
     def __post_init__(self) -> None:
         channels = tuple(self.channels)
@@ -143,6 +150,18 @@ class Measurements:
         object.__setattr__(self, "dt", _single(steps))
         object.__setattr__(self, "start", _single(starts))
         object.__setattr__(self, "values", values)
+        points = tuple(self.points) or (() if self.is_history else tuple(str(k + 1) for k in range(values.shape[1])))
+        if len(points) not in (0, values.shape[1]) or (points and self.is_history):
+            raise ValueError(
+                f"expected a point for each of {values.shape[1]} samples along an axis other than time; got "
+                f"{len(points)} points along {self.axis!r}"
+            )
+        object.__setattr__(self, "points", points)
+
+    @property
+    def is_history(self) -> bool:
+        """Whether the samples are along time, and not along load cases, positions or modes."""
+        return self.axis == "time"
 
     @property
     def n_channels(self) -> int:
@@ -234,7 +253,7 @@ class Measurements:
         """
         if self.simultaneous and self.start == 0.0:
             window = sample_window("the measurements", self.n_steps, self.dt, start, stop)
-            return replace(self, values=self.values[:, window])
+            return replace(self, values=self.values[:, window], points=self.points[window])
         stop = self.end if stop is None else stop
         if not (0.0 <= start < stop <= self.end * (1.0 + 1e-12)):
             raise ValueError(
@@ -278,7 +297,7 @@ class Measurements:
         if not isinstance(factor, (int, np.integer)) or not 1 <= factor <= self.n_steps:
             raise ValueError(f"factor must be a whole number from 1 to {self.n_steps}, got {factor!r}")
         dt = self.dt * factor if self.simultaneous else tuple(dt * factor for dt in self.steps)
-        return replace(self, dt=dt, values=self.values[:, ::factor])
+        return replace(self, dt=dt, values=self.values[:, ::factor], points=self.points[::factor])
 
     def rrmse_of(self, response: "Measurements") -> dict[str, float]:
         """Return the RRMSE of each common channel [-], except channels that are zero or whose times differ."""

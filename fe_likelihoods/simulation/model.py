@@ -96,7 +96,8 @@ class Model(Protocol):
 
     A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
     ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
-    ``with_record(record)``, which returns the same model under another excitation, for predictions. An attribute
+    ``with_record(record)``, which returns the same model under another excitation, for predictions. A part of a model
+    with several responses has ``simulate_together(thetas, pool)`` (`fe_likelihoods.models.one_run`). An attribute
     ``time_limit`` is the largest duration of a simulation [s], or None. An attribute ``path_dependent`` is False if the
     response to an excitation does not depend on earlier excitations. Some predictions start from the end of the model's
     excitation. They need a `Record` in the attribute ``record``, with one response sample per sample of the record, or
@@ -176,6 +177,8 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     A pool runs the simulations one by one, even if the model has a batch method (which would run in this process).
     """
     shape = (len(model.channels), model.n_steps)
+    if getattr(model, "simulate_together", None) is not None:
+        return model.simulate_together(thetas, pool)
     if pool is None and getattr(model, "simulate_batch", None) is not None:
         with _one_by_one_if_it_fails(model):
             return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
@@ -229,6 +232,8 @@ def misfit_batch(
     a statistic; pools are as for `simulate_batch`.
     """
     shape = (statistic_width(measured, statistic),)
+    if getattr(model, "simulate_together", None) is not None:
+        return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
     own = (
         statistic is None and not isinstance(measured, Comparison) and getattr(model, "misfit_batch", None) is not None
     )

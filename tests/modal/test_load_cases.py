@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, FELikelihood, Posterior, Uniform, to_si
-from fe_likelihoods.modal.load_cases import LoadTest
+from fe_likelihoods.modal.load_cases import LoadTest, read_load_test
 
 CHANNELS = Channel("midspan", "displacement", "mm"), Channel("bottom", "strain", "microstrain")
 CASES = ("one truck", "two trucks", "four trucks")
@@ -16,7 +16,7 @@ def test_the_posterior_of_a_flexibility_is_normal():
     test = LoadTest(CHANNELS, CASES, VALUES, errors={"midspan": 2e-5, "bottom": 1e-6})
     model = test.model(lambda theta: theta[0] * UNIT, ("flexibility",))
     posterior = Posterior(FELikelihood(model, test.measurements), {"flexibility": Uniform(0.5, 2.0)} | test.known)
-    assert posterior.parameter_names == ["flexibility"] and model.time_label == "load case"
+    assert posterior.parameter_names == ["flexibility"] and test.measurements.points == CASES
     weights = UNIT / np.array([[2e-5], [1e-6]])
     weights[1, 2] = 0.0
     precision = np.square(weights).sum()
@@ -45,3 +45,24 @@ def test_a_table_has_the_units_of_the_channels():
 def test_bad_tests_are_refused(arguments, text):
     with pytest.raises(ValueError, match=text):
         LoadTest(*arguments[:3], errors=arguments[3] if len(arguments) > 3 else None)
+
+
+def test_a_file_has_a_line_for_each_load_case(tmp_path):
+    path = tmp_path / "trucks.csv"
+    path.write_text("load case,midspan [mm],gauge\none truck,1.1,22\ntwo trucks,2.2,44\n")
+    options = {"columns": {"bottom": "gauge"}, "units": {"bottom": "microstrain"}, "errors": {"midspan": 1e-4}}
+    test = read_load_test(path, CHANNELS, **options)
+    assert test.cases == ("one truck", "two trucks") and test.axis == "load case" and test.errors == {"midspan": 1e-4}
+    np.testing.assert_allclose(test.values, [[1.1e-3, 2.2e-3], [22e-6, 44e-6]], rtol=1e-12)
+    path.write_text("truck at [m];midspan [mm]\n7,5;1,1\n15;2,2\n")
+    test = read_load_test(path, CHANNELS[:1])
+    assert test.cases == (7.5, 15.0) and test.measurements.axis == "truck at [m]"
+    path.write_text("midspan [mm]\n1.1\n2.2\n")
+    assert read_load_test(path, CHANNELS[:1]).cases == ("1", "2")
+    for options, text in (
+        ({"columns": {"midspan": "top"}}, "one column 'top' of the channel midspan; the columns are midspan"),
+        ({"units": {"midspan": "m"}}, "the file states mm and 'm' is given"),
+        ({"cases": "truck"}, "no column 'truck' of load cases"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            read_load_test(path, CHANNELS[:1], **options)

@@ -1,7 +1,5 @@
 """Likelihood of modes: its density, derivatives, caches, what is refused, and what is remarked on."""
 
-import warnings
-
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -23,12 +21,12 @@ from fe_likelihoods import (
     ShearFrame,
     SimulationCache,
     SimulationFailed,
+    Uniform,
 )
 from fe_likelihoods.modal.load_cases import LoadTest
 from fe_likelihoods.modal.mode_models import StructureModes
 from fe_likelihoods.models.undamped_modes import undamped_modes
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*parameters can fit")
 FLOORS = {"floor 1": 1, "floor 2": 2, "floor 3": 3, "roof": 4}
 FRAME = ShearFrame(FLOORS, [1.0, 1.1, 0.9, 1.0], [900.0] * 4)
 PRIOR = {f"stiffness_{i}": LogNormal(1.0, 0.3) for i in range(1, 5)}
@@ -68,7 +66,7 @@ def test_the_density_of_known_and_unknown_errors(rng):
     likelihood = ModalLikelihood(FRAME, data)
     assert likelihood.parameter_names == (*PRIOR, "frequency_error", "shape_error")
     theta = np.array([1.02, 0.95, 1.05, 0.98])
-    expected = independent(theta, data, 0.02, 0.04)
+    expected = independent(theta, data, np.hypot(0.02, 1e-4), np.hypot(0.04, 1e-3))
     assert likelihood([*theta, 0.02, 0.04]) == pytest.approx(expected, rel=1e-12)
     known = ModalLikelihood(FRAME, identified([1, 1, 1, 1], [1], rng, frequency_cv=0.01, shape_error=0.02))
     assert known.parameter_names == tuple(PRIOR)
@@ -108,13 +106,94 @@ def test_a_covariance_of_the_frequencies(rng):
     theta = np.array([1.02, 0.95, 1.05, 0.98])
     found = StructureModes(FRAME).simulate(theta)[0, :2]
     measured, cv = data.frequencies[0], 0.01
-    shapes_only = alone([*theta, cv]) - norm.logpdf(found / measured, 1.0, cv).sum()
+    shapes_only = alone([*theta, cv]) - norm.logpdf(found / measured, 1.0, np.hypot(cv, 1e-4)).sum()
     relative = covariance / np.outer(measured, measured)
     expected = shapes_only + multivariate_normal.logpdf(found / measured - 1.0, None, relative)
     assert ModalLikelihood(FRAME, correlated)(theta) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["single", "sets", "pair", "modal model"])
+def test_student_errors_have_the_density_of_scipy(rng):
+    from scipy.stats import multivariate_t, t
+
+    theta = np.array([1.02, 0.95, 1.05, 0.98])
+    data = identified([1.0, 0.9, 1.1, 1.0], [3, 1], rng, n_sets=2)
+    frequencies = data.frequencies.copy()
+    frequencies[1, 0] = np.nan
+    shapes = np.where(np.isnan(frequencies)[:, :, None], np.nan, data.shapes)
+    data = ModalData(frequencies, shapes, data.sensors, mode_numbers=[3, 1])
+    found = ModalLikelihood(FRAME, data, student_t=4)([*theta, 0.02, 0.04])
+    computed = StructureModes(FRAME).simulate(theta)[:, [2, 0]]
+    c, sigma, expected = np.hypot(0.02, 1e-4), np.hypot(0.04, 1e-3), 0.0
+    for k, j in ((0, 0), (0, 1), (1, 1)):
+        expected += t.logpdf(computed[0, j] / frequencies[k, j] - 1.0, 4, scale=c)
+        mac = (computed[1:, j] @ shapes[k, j]) ** 2 / (computed[1:, j] @ computed[1:, j])
+        expected += multivariate_t.logpdf([np.sqrt(1.0 - mac), 0.0, 0.0], np.zeros(3), sigma**2 * np.eye(3), 4)
+    assert found == pytest.approx(expected, rel=1e-10)
+    with pytest.raises(ValueError, match="degrees of freedom above 2"):
+        ModalLikelihood(FRAME, data, student_t=1)
+
+
+@pytest.mark.slow
+def test_a_wrong_identification_moves_student_errors_little(rng):
+    from samplers import SMCSampler
+
+    data = identified(np.ones(4), [1, 2, 3, 4], rng, cv=0.005, error=0.02)
+    frequencies = data.frequencies[0] * [1.0, 1.0, 1.1, 1.0]
+    data = ModalData(frequencies, data.shapes[0], data.sensors, frequency_cv=0.005, shape_error=0.02)
+    distances = []
+    for student in (None, 4):
+        posterior = Posterior(ModalLikelihood(FRAME, data, student_t=student), PRIOR)
+        sampler = SMCSampler(100, 4, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+        sampler.run_mcmc(None, 1)
+        samples = sampler.get_chain(flat=True)
+        distances.append(np.abs((samples.mean(axis=0) - 1.0) / samples.std(axis=0)).max())
+    assert distances[0] > 6.0 and distances[1] < 4.0
+
+
+def of_days(rng):
+    """Stiffnesses, temperature slope and modes that were identified on five days."""
+    truth, slope = np.array([1.0, 0.9, 1.1, 1.0]), -2e-3
+    temperatures = np.array([-5.0, 5.0, 12.0, 25.0, 33.0])
+    data = identified(truth, [1, 2, 3], rng, cv=0.002, error=0.02, n_sets=5)
+    frequencies = data.frequencies * (1.0 + slope * (temperatures - 20.0))[:, None]
+    data = ModalData(
+        frequencies, data.shapes, data.sensors, temperatures=temperatures, frequency_cv=0.002, shape_error=0.02
+    )
+    return truth, slope, data
+
+
+def test_frequencies_of_several_days_have_a_common_temperature_slope(rng):
+    truth, slope, data = of_days(rng)
+    temperatures, frequencies = data.temperatures, data.frequencies
+    likelihood = ModalLikelihood(FRAME, data)
+    assert likelihood.parameter_names == (*PRIOR, "temperature_slope")
+    at_zero = likelihood.model.simulate([*truth, slope])
+    ratios = at_zero.reshape(3, 5, 5)[:, :, 0].T * frequencies
+    expected = StructureModes(FRAME).simulate(truth)[0, :3] * (1.0 + slope * (temperatures - 20.0))[:, None]
+    np.testing.assert_allclose(ratios, expected, rtol=1e-12)
+    posterior = Posterior(likelihood, PRIOR | {"temperature_slope": Uniform(-0.01, 0.01)})
+    mean = ModalLikelihood(FRAME, data.mean())
+    assert mean.model.data.temperatures == pytest.approx(14.0)
+    assert posterior.parameters[4].label == "temperature_slope [1/K]"
+
+
+@pytest.mark.slow
+def test_a_guide_finds_the_temperature_slope(rng):
+    truth, slope, data = of_days(rng)
+    likelihood = ModalLikelihood(FRAME, data)
+    posterior = Posterior(likelihood, PRIOR | {"temperature_slope": Uniform(-0.01, 0.01)})
+    from samplers import SMCSampler
+
+    sampler = SMCSampler(100, 5, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)
+    assert (abs(samples.mean(axis=0) - [*truth, slope]) < 4.0 * samples.std(axis=0)).all()
+    assert samples[:, 4].std() < 2e-4
+    predicted = likelihood.predict_modes(samples)
+    assert (abs(np.median(predicted.frequencies, axis=0) / data.mean_frequencies - 1.0) < 0.005).all()
+
+
+@pytest.mark.parametrize("kind", ["single", "sets", "pair", "modal model", "temperatures"])
 def test_derivatives_agree_with_differences(kind, rng):
     frame, theta = FRAME, np.array([1.0, 0.9, 1.1, 1.0])
     data = identified(theta, [3, 1], rng, n_sets=2 if kind == "sets" else 1)
@@ -124,8 +203,12 @@ def test_derivatives_agree_with_differences(kind, rng):
     if kind == "modal model":
         frame, theta = ModalModel(list(FLOORS), 2), np.array([1.0, 3.0, *rng.normal(size=8)])
         data = ModalData([1.0, 3.1], rng.normal(size=(2, 4)), tuple(FLOORS))
+    if kind == "temperatures":
+        data = ModalData(np.tile(data.frequencies, (2, 1)), None, temperatures=[-5.0, 30.0], mode_numbers=[3, 1])
     model = ModalLikelihood(frame, data).model
     names = [name for name in frame.parameter_names if not name.startswith("damping")]
+    if kind == "temperatures":
+        names, theta = [*names, "temperature_slope"], np.append(theta, -0.001)
     assert list(model.parameter_names) == names and hasattr(model, "jacobian")
     found = model.jacobian(theta)
     for p, unit in enumerate(np.eye(len(theta))):
@@ -174,44 +257,11 @@ def test_frequencies_alone_are_paired_by_number():
     assert np.isnan(likelihood.predict_modes([[2.0]]).assurance).all()
 
 
-def test_what_no_mode_resembles_changes_its_pair_or_is_in_other_units_is_named(rng):
-    truth = np.ones(4)
-    data = identified(truth, [1, 2, 3], rng, error=0.0, cv=0.0)
-    shapes = data.shapes[0].copy()
-    shapes[2] = shapes[0] + shapes[1] + StructureModes(FRAME).simulate(truth)[1:, 3]
-    strange = ModalData(2 * np.pi * data.frequencies[0], shapes, data.sensors)
-    found = ModalLikelihood(FRAME, data).predict_modes(truth[None], strange)
-    assert "in rad/s" in found.remarks[0] and "measured frequencies are about 6.28 times" in found.remarks[0]
-    assert "No computed mode resembles the measured mode 3" in found.remarks[1] and "select([1, 2])" in found.remarks[1]
-    with pytest.warns(UserWarning, match="With all parameters at 1: The measured .* in rad/s"):
-        ModalLikelihood(FRAME, strange)
-    partly = ModalLikelihood(FRAME, data).predict_modes([truth, -truth])
-    assert len(partly.numbers) == 1 and partly.remarks[0].startswith("1 samples are left out")
+def test_samples_that_cannot_be_simulated_are_left_out(rng):
+    likelihood = ModalLikelihood(FRAME, identified(np.ones(4), [1, 2, 3], rng))
+    assert len(likelihood.predict_modes([np.ones(4), -np.ones(4)]).numbers) == 1
     with pytest.raises(SimulationFailed, match="none of 1 samples"):
-        ModalLikelihood(FRAME, data).predict_modes(-truth)
-    assert len(found.remarks) == 2 and found.remarks[1] in str(found)
-    assert ModalLikelihood(FRAME, data).predict_modes(truth[None]).remarks == ()
-
-    def crossing(theta):
-        return np.diag([1.0, theta[0]]), np.eye(2)
-
-    turned = ModalData([0.16, 0.17], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
-    swapped = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), turned).predict_modes(
-        [[0.9], [1.1], [1.2], [0.8]]
-    )
-    assert "paired with different computed modes: 1 (50%), 2 (50%)" in swapped.remarks[0]
-
-
-def test_an_error_that_the_data_do_not_determine_is_warned_of(rng):
-    few, many = identified(np.ones(4), [1, 2], rng), identified(np.ones(4), [1, 2], rng, n_sets=2)
-    with pytest.warns(UserWarning, match=r"4 parameters can fit 2 independent data .* frequency_error"):
-        ModalLikelihood(FRAME, few)
-    with pytest.warns(UserWarning, match=r"4 parameters can fit 3 independent data .* shape_error"):
-        ModalLikelihood(FRAME, identified(np.ones(4), [1], rng, frequency_cv=0.01))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ModalLikelihood(FRAME, many)
-        ModalLikelihood(FRAME, identified(np.ones(4), [1, 2], rng, frequency_cv=0.002), "common")
+        likelihood.predict_modes(-np.ones(4))
 
 
 @pytest.mark.parametrize(
@@ -247,6 +297,27 @@ def test_a_model_without_modes_is_refused(rng):
     model = FunctionModel(lambda theta: np.zeros((1, 3)), ("a",), (Channel("u", "displacement", "m"),), 1.0, 3)
     with pytest.raises(ValueError, match="whose first channel is a frequency"):
         ModalLikelihood(model, identified(np.ones(4), [1], rng))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_guide_finds_an_error_that_the_data_do_not_determine(seed):
+    """Four stiffnesses fit two frequencies exactly; the error may be as small as its half-normal prior lets it be."""
+    from samplers import SMCSampler
+
+    prior = PRIOR | {"frequency_error": HalfNormal(0.02), "shape_error": HalfNormal(0.05)}
+    data = identified([1.0, 0.9, 1.1, 1.0], [1, 2], np.random.default_rng(seed))
+    found = []
+    for walkers, guided in ((400, True), (1000, False)):
+        posterior = Posterior(ModalLikelihood(FRAME, data), prior)
+        guide = posterior.guide(starts=4) if guided else None
+        sampler = SMCSampler(walkers, 6, posterior, guide=guide, seed=seed, vectorize=True)
+        sampler.run_mcmc(None, 1)
+        samples = sampler.get_chain(flat=True)
+        found.append((sampler.log_evidence, samples.mean(axis=0), samples.std(axis=0)))
+    (evidence, mean, deviation), other = found
+    assert evidence == pytest.approx(other[0], abs=0.5)
+    assert (abs(mean - other[1]) < 0.4 * other[2]).all() and (abs(deviation / other[2] - 1.0) < 0.4).all()
 
 
 @pytest.mark.slow

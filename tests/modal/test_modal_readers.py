@@ -29,6 +29,27 @@ def test_a_table_has_a_line_for_each_mode(tmp_path):
     assert read_modal_data(path, ["floor 3", "floor 1"]).sensors == ("floor 3", "floor 1")
 
 
+def test_other_layouts_of_a_table(tmp_path):
+    """Semicolons with decimal commas, long names, periods, deviations, and modes in columns."""
+    for lines in (
+        ("Mode No.;Natural frequency [Hz];a;b;c", "1;1,0;1;2;3", "2;3,0;-2;-1;2"),
+        ("mode,period [s],a,b,c", "1,1.0,1,2,3", f"2,{1 / 3!r},-2,-1,2"),
+        ("f [Hz],a,b,c", "1,1,2,3", "3,-2,-1,2"),
+        (",mode 1,mode 2", "frequency [Hz],1.0,3.0", "a,1,-2", "b,2,-1", "c,3,2"),
+        ("name;first;second", "frequency_rad/s;6.283185307179586;18.84955592153876", "a;1;-2", "b;2;-1", "c;3;2"),
+    ):
+        data = read_modal_data(written(tmp_path, *lines))
+        assert data.mode_numbers == (1, 2) and data.sensors == ("a", "b", "c")
+        np.testing.assert_allclose(data.frequencies, [[1.0, 3.0]], rtol=1e-12)
+        np.testing.assert_allclose(data.shapes[0], UNIT, rtol=1e-12)
+    data = read_modal_data(written(tmp_path, "frequency_Hz,frequency_std_Hz,a", "1.0,0.01,1", "3.0,0.06,1"))
+    np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
+    data = read_modal_data(written(tmp_path, "frequency_Hz,cv [%],a", "1.0,1,1", "3.0,2,1"))
+    np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
+    with pytest.raises(ValueError, match="unit of the periods"):
+        read_modal_data(written(tmp_path, "period,a", "1.0,1"))
+
+
 def test_units_are_stated_or_given(tmp_path):
     lines = ("6.283185307179586,1,2", "12.566370614359172,1,-1")
     for head, options in (("frequency [rad/s],a,b", {}), ("frequency,a,b", {"unit": "rad/s"})):

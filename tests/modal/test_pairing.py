@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ModalData
-from fe_likelihoods.modal.pairing import (
-    best_scale,
-    modal_assurance,
-    pair_modes,
-    shape_misfit,
-)
+from fe_likelihoods.modal.pairing import pair_modes
 
 
 def unit(shapes):
@@ -18,22 +13,6 @@ def unit(shapes):
 
 def measured(frequencies, shapes, close=0.02):
     return ModalData(frequencies, shapes, [f"sensor {k}" for k in range(np.shape(shapes)[-1])]).measured(close)
-
-
-def test_modal_assurance_is_a_squared_cosine():
-    angles = np.deg2rad([0.0, 30.0, 45.0, 90.0])
-    plane = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    np.testing.assert_allclose(modal_assurance(plane[:1], -7.0 * plane), [[1.0, 0.75, 0.5, 0.0]], atol=1e-15)
-    assert modal_assurance(np.zeros((1, 2)), plane).tolist() == [[0.0] * 4]
-
-
-def test_the_misfit_is_the_least_squared_distance(rng):
-    shape, other = rng.normal(size=(2, 6))
-    scales = best_scale(shape, other) + np.linspace(-0.1, 0.1, 201)
-    distances = np.square(other - scales[:, None] * shape).sum(axis=1)
-    assert distances.argmin() == 100 and distances[100] == pytest.approx(shape_misfit(shape, other), rel=1e-13)
-    expected = other @ other * (1.0 - modal_assurance(shape[None], other[None])[0, 0])
-    assert shape_misfit(-3.0 * shape, other) == pytest.approx(expected, rel=1e-12)
 
 
 def test_pairs_do_not_depend_on_scale_sign_and_order(rng):

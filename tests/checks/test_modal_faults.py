@@ -1,0 +1,110 @@
+"""Findings about modes: each fault is named, and right data are not."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    FunctionModes,
+    LogNormal,
+    ModalData,
+    ModalLikelihood,
+    Posterior,
+    ShearFrame,
+    check_fit,
+)
+from fe_likelihoods.checks.rehearsal import check_model
+from fe_likelihoods.modal.mode_models import StructureModes
+
+FLOORS = {f"floor {i}": i for i in (1, 2, 3, 4)}
+FRAME = ShearFrame(FLOORS, [20e3] * 4, [30e6] * 4)
+NAMES = [f"stiffness_{i}" for i in (1, 2, 3, 4)]
+PRIOR = {name: LogNormal(1.0, 0.2) for name in NAMES}
+KNOWN = {"frequency_cv": 0.005, "shape_error": 0.02}
+
+
+def identified(seed, modes=(1, 2, 3), cv=0.005, error=0.02, **options):
+    """Synthetic modes of a frame from the prior, with their stated errors."""
+    rng = np.random.default_rng(seed)
+    response = StructureModes(FRAME).simulate(np.exp(0.2 * rng.normal(size=4)))[:, [mode - 1 for mode in modes]]
+    shapes = response[1:].T / np.linalg.norm(response[1:], axis=0)[:, None]
+    shapes = rng.choice([-3.0, 0.2], (len(modes), 1)) * (shapes + error * rng.normal(size=shapes.shape))
+    return ModalData(response[0] * (1.0 + cv * rng.normal(size=len(modes))), shapes, tuple(FLOORS), **options)
+
+
+def changed(data, frequencies=1.0, shapes=None):
+    shapes = data.shapes[0] if shapes is None else shapes
+    return ModalData(data.frequencies * frequencies, shapes, data.sensors, frequency_cv=0.005, shape_error=0.02)
+
+
+def kinds(posterior, samples=None):
+    return [each.kind for each in check_fit(posterior, samples)]
+
+
+def before(data, model=FRAME, prior=PRIOR):
+    return kinds(Posterior(ModalLikelihood(model, data), prior))
+
+
+def test_right_data_are_not_blamed():
+    assert not [found for seed in range(20) for found in before(identified(seed, **KNOWN))]
+
+
+@pytest.mark.parametrize(
+    ("factor", "text"), [(2 * np.pi, "as with rad/s instead of Hz"), (1000**-0.5, "a stiffness in kN instead of N")]
+)
+def test_units_are_named(factor, text):
+    for seed in range(5):
+        posterior = Posterior(ModalLikelihood(FRAME, changed(identified(seed), factor)), PRIOR)
+        (found,) = check_fit(posterior)
+        assert (found.kind, found.severity) == ("A unit may be wrong", "wrong") and text in found.text
+        assert found in check_model(posterior).findings
+
+
+def test_frequencies_out_of_reach_are_named():
+    assert before(changed(identified(1), [1.0, 2.0, 1.0])) == ["The prior does not reach the measurements"]
+
+
+@pytest.mark.parametrize("fault", ["reversed", "exchanged"])
+def test_faults_of_sensors_are_named(fault):
+    """With the right names, except where a fault changes the shapes as another one does."""
+    named = 0
+    for seed in range(10):
+        data = identified(seed)
+        shapes = data.shapes[0].copy()
+        shapes[:, 3] *= -1.0 if fault == "reversed" else 1.0
+        shapes = shapes[:, [0, 3, 2, 1]] if fault == "exchanged" else shapes
+        found = check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR))
+        assert "A sensor may be reversed or exchanged" in [each.kind for each in found]
+        wanted = "sensor floor 4 counts the other way" if fault == "reversed" else "floor 2 and floor 4 are exchanged"
+        named += wanted in found[0].text
+    assert named >= 9
+
+
+def test_a_mode_without_a_counterpart_is_named():
+    data = identified(3)
+    shapes = data.shapes[0].copy()
+    shapes[2] = shapes[0] + shapes[1] + StructureModes(FRAME).simulate(np.ones(4))[1:, 3]
+    found = check_fit(Posterior(ModalLikelihood(FRAME, changed(data, shapes=shapes)), PRIOR))
+    assert "A mode has no counterpart" in [each.kind for each in found]
+    assert "measured mode 3" in found[0].text and "select([1, 2])" in found[0].action
+
+
+def test_a_pairing_that_changes_in_the_posterior_is_named():
+    def crossing(theta):
+        return np.diag([1.0, theta[0]]), np.eye(2)
+
+    data = ModalData([0.155, 0.165], [[1.0, 0.1], [0.1, 1.0]], ("x", "y"))
+    likelihood = ModalLikelihood(FunctionModes(crossing, ("k",), {"x": 0, "y": 1}, 2), data)
+    prior = {"k": LogNormal(1.0, 0.3), "frequency_error": LogNormal(0.05, 0.5), "shape_error": LogNormal(0.05, 0.5)}
+    posterior = Posterior(likelihood, prior)
+    samples = np.column_stack([[0.9, 1.1, 1.2, 0.8] * 10, [0.05] * 40, [0.05] * 40])
+    found = [each for each in check_fit(posterior, samples) if each.kind == "The pairing of modes changes"]
+    assert len(found) == 2 and "1 (50%), 2 (50%)" in found[0].text
+    assert "The pairing of modes changes" not in kinds(posterior, samples[:1])
+
+
+def test_stated_errors_that_are_too_small_are_named():
+    posterior = Posterior(ModalLikelihood(FRAME, identified(1, cv=0.03, error=0.1, **KNOWN)), PRIOR)
+    samples = posterior.sample_prior(500, 1)
+    samples = samples[np.argsort(posterior(samples))[-50:]]
+    found = check_fit(posterior, samples)
+    assert "Modes differ more than their stated errors" in [each.kind for each in found]

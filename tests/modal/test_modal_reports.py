@@ -1,0 +1,99 @@
+"""What a report says and draws of modes, load tests and histories of one structure."""
+
+import re
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    Channel,
+    FELikelihood,
+    HalfNormal,
+    JointLikelihood,
+    LinearStructure,
+    LogNormal,
+    Measurements,
+    ModalData,
+    ModalLikelihood,
+    Posterior,
+    Record,
+    ShearFrame,
+    check_result,
+    propagate,
+    report,
+)
+from fe_likelihoods.modal.load_cases import LoadTest
+from fe_likelihoods.modal.mode_models import StructureModes
+from samplers import SMCSampler
+
+FLOORS = {"floor 1": 1, "roof": 2}
+FRAME = ShearFrame(FLOORS, [20e3] * 2, [30e6] * 2)
+PRIOR = {"stiffness_1": LogNormal(1.0, 0.2), "stiffness_2": LogNormal(1.0, 0.2)}
+TRUTH = np.array([1.0, 0.9])
+OF_TIME = re.compile(r"time step|clock|spectr|histor| at 1 s|time \[s\]|Motion", re.IGNORECASE)
+
+
+def pulled(theta):
+    return np.outer(np.cumsum(1.0 / (30e6 * theta)), [10e3, 20e3])
+
+
+def modal_likelihood(rng):
+    response = StructureModes(FRAME).simulate(TRUTH)
+    shapes = response[1:].T / np.linalg.norm(response[1:], axis=0)[:, None] + 0.02 * rng.normal(size=(2, 2))
+    data = ModalData(response[0], shapes, tuple(FLOORS), frequency_cv=0.005, shape_error=0.02, description="a frame")
+    return ModalLikelihood(FRAME, data)
+
+
+def static_likelihood(rng):
+    channels = [Channel(name, "displacement", "mm") for name in FLOORS]
+    values = pulled(TRUTH) + 2e-5 * rng.normal(size=(2, 2))
+    test = LoadTest(channels, ["10 kN", "20 kN"], values, errors=dict.fromkeys(FLOORS, 2e-5))
+    return FELikelihood(test.model(pulled, tuple(PRIOR)), test.measurements), test.known
+
+
+def reported(posterior, path, predicted=False):
+    """Text of the report of a guided run, without styles and pictures, and the judgement."""
+    sampler = SMCSampler(100, posterior.ndim, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    samples = sampler.get_chain(flat=True)[:10]
+    page = report(sampler, posterior, propagate(posterior, samples) if predicted else None, out=path / "report.html")
+    text = page.read_text()
+    assert text.count("data:image/png") == 5 + predicted - 1 and "could not be drawn" not in text
+    text = re.sub(r"<style>.*?</style>|src=\"[^\"]*\"|<pre>.*?</pre>", "", text, flags=re.DOTALL)
+    return text, check_result(sampler)
+
+
+def test_modes_are_a_table_and_a_figure_and_nothing_is_said_of_time(rng, tmp_path):
+    text, judgement = reported(Posterior(modal_likelihood(rng), PRIOR), tmp_path)
+    assert judgement.status == "use" and not judgement.findings
+    assert "2 parameters of ShearFrame and its noise were updated with 2 measured modes" in text
+    assert "Data: natural frequencies and mode shapes of a frame" in text
+    assert "Measured and computed modes" in text and '<th class="n">measured [Hz]</th>' in text
+    assert not OF_TIME.findall(text) and "RRMSE" not in text
+
+
+def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
+    static, known = static_likelihood(rng)
+    text, judgement = reported(Posterior(static, PRIOR | known), tmp_path, predicted=True)
+    assert judgement.status == "use" and not judgement.findings
+    assert "roof [mm], 2 values (load case)" in text and "Measured and computed values" in text
+    assert "Predicted values" in text and not OF_TIME.findall(text)
+
+
+@pytest.mark.slow
+def test_modes_a_load_test_and_histories_are_in_one_report(rng, tmp_path):
+    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
+    response = model.simulate([*TRUTH, 0.02, 0.02])
+    shaking = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.3 * rng.normal(size=(1, 200))))
+    static, known = static_likelihood(rng)
+    parts = {"modes": modal_likelihood(rng), "static": static, "shaking": shaking}
+    joint = JointLikelihood(parts, separate=["sigma_roof"])
+    known = {"sigma_roof_static" if name == "sigma_roof" else name: error for name, error in known.items()}
+    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in (1, 2)}
+    posterior = Posterior(joint, PRIOR | damping | known | {"sigma_roof_shaking": HalfNormal(1.0)})
+    sampler = SMCSampler(100, posterior.ndim, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    text = report(sampler, posterior, out=tmp_path / "report.html").read_text()
+    for title in ("Measured and computed modes", "Measured and computed values", "Measured and simulated response"):
+        assert title in text
+    assert check_result(sampler).status == "use"

@@ -1,0 +1,162 @@
+"""One run for several data sets: what it returns, how often it runs, and what is refused."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    Channel,
+    ExecutableModel,
+    FELikelihood,
+    FunctionModel,
+    JointLikelihood,
+    LogNormal,
+    Measurements,
+    ModalData,
+    ModalLikelihood,
+    Posterior,
+    SimulationCache,
+    check_result,
+)
+from fe_likelihoods.checks.rehearsal import check_model
+from fe_likelihoods.modal.load_cases import LoadTest
+from fe_likelihoods.modal.mode_models import modal_channels, modal_response
+from fe_likelihoods.models import one_run as module
+from fe_likelihoods.models.one_run import one_run
+from samplers import SMCSampler
+
+NAMES = ("k1", "k2")
+TOP = Channel("top", "displacement", "m")
+TEST = LoadTest([TOP], ["pull", "push"], [[2.1, -2.1]], errors={"top": 0.05})
+DATA = ModalData([0.098, 0.257], [[0.6, 1.0], [-1.0, 0.6]], ("a", "b"), frequency_cv=0.01, shape_error=0.02)
+PARTS = {"modes": (modal_channels(("a", "b")), 1.0, 2), "static": ((TOP,), 1.0, 2)}
+PRIOR = {"k1": LogNormal(1.0, 0.2), "k2": LogNormal(1.0, 0.2)} | TEST.known
+PROGRAM = """
+import sys
+import numpy as np
+
+k1, k2 = map(float, sys.argv[1:3])
+values, shapes = np.linalg.eigh([[k1 + k2, -k2], [-k2, k2]])
+np.savetxt("modes.txt", np.column_stack([np.sqrt(values) / (2 * np.pi), shapes.T]))
+open("static.txt", "w").write(f"{1 / k1 + 1 / k2!r}\\n{-1 / k1 - 1 / k2!r}  # push\\n")
+"""
+
+
+def both(theta):
+    """Modes and deflections."""
+    k1, k2 = theta
+    values, shapes = np.linalg.eigh([[k1 + k2, -k2], [-k2, k2]])
+    top = 1 / k1 + 1 / k2
+    return {"modes": modal_response(np.sqrt(values) / (2 * np.pi), shapes.T), "static": [[top, -top]]}
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Numbers of runs that were made together."""
+    made, simulate = [], module.simulate_batch
+
+    def counted(model, thetas, pool=None):
+        made.append(len(thetas))
+        return simulate(model, thetas, pool)
+
+    monkeypatch.setattr(module, "simulate_batch", counted)
+    return made
+
+
+def joint(models, **options):
+    modes = ModalLikelihood(models["modes"], DATA, **options)
+    static = FELikelihood(models["static"], TEST.measurements, **options)
+    return Posterior(JointLikelihood({"modes": modes, "static": static}), PRIOR)
+
+
+def of_function(function=both):
+    return one_run(PARTS, function, lambda output, **options: FunctionModel(output, NAMES, **options, version="1"))
+
+
+def test_a_joint_posterior_runs_once_at_each_point(rng, runs):
+    posterior = joint(of_function())
+    points = rng.uniform(0.8, 1.2, (20, 2))
+    values = posterior(points)
+    assert sum(runs) == 20 and np.isfinite(values).all()
+    alone = of_function()["static"]
+    apart = [ModalLikelihood(of_function()["modes"], DATA)(points)]
+    apart.append(Posterior(FELikelihood(alone, TEST.measurements), PRIOR).log_likelihood(points))
+    made = sum(runs)
+    np.testing.assert_allclose(posterior.log_likelihood(points), sum(apart), rtol=1e-12)
+    assert sum(runs) == made
+
+
+def test_a_guided_run_with_its_checks_and_a_cache_runs_once(tmp_path, runs):
+    cache = SimulationCache(tmp_path / "both.db", verify=False)
+    posterior = joint(of_function(), cache=cache)
+    sampler = SMCSampler(100, 2, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
+    sampler.run_mcmc(None, 1)
+    assert sum(runs) == posterior.likelihood["modes"].simulations == posterior.likelihood["static"].simulations
+    made = sum(runs)
+    other = joint(of_function(), cache=cache)
+    np.testing.assert_array_equal(other(sampler.get_chain(flat=True)), sampler.get_log_prob(flat=True))
+    assert sum(runs) == made
+    assert check_result(sampler).status == "use"
+
+
+def test_a_part_that_asks_again_gets_another_run():
+    """So that responses that differ by chance are found."""
+    rng = np.random.default_rng(1)
+
+    def noisy(theta):
+        return {"modes": modal_response([0.1, 0.26], [[0.6, 1.0], [-1.0, 0.6]]), "static": rng.normal(size=(1, 2))}
+
+    models = of_function(noisy)
+    first, second = models["static"].simulate_together(np.ones((2, 2))).response
+    assert (first != second).any()
+    found = check_model(joint(of_function(noisy)))
+    assert "The model is not repeatable" in [each.kind for each in found.findings]
+
+
+@pytest.mark.parametrize(
+    ("returned", "text"),
+    [
+        ({"modes": np.ones((3, 2))}, "expected a response for each of modes, static; got modes"),
+        ({"modes": np.ones((2, 2)), "static": np.ones((1, 2))}, r"modes has shape \(2, 2\), expected \(3, 2\)"),
+        (np.ones(3), "got ndarray"),
+    ],
+)
+def test_what_does_not_fit_is_a_failed_run(returned, text):
+    batch = of_function(lambda theta: returned)["static"].simulate_together(np.ones((1, 2)))
+    assert np.isnan(batch.response).all()
+    with pytest.raises(AssertionError, match=text):
+        raise AssertionError(batch.reasons[0])
+
+
+def test_files_of_other_parts_are_refused():
+    with pytest.raises(ValueError, match="an output for each of the parts modes, static"):
+        one_run(PARTS, {"modes": "modes.txt"}, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pool", [None, 2])
+def test_a_program_that_writes_both_files_runs_once(pool, tmp_path, runs):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    command = [sys.executable, tmp_path / "program.py", "${k1}", "${k2}"]
+    files = {"modes": "modes.txt", "static": "static.txt"}
+    models = one_run(
+        PARTS,
+        files,
+        lambda output, **options: ExecutableModel(command, {}, output, NAMES, **options, time_limit=60),
+    )
+    points = np.array([[1.0, 1.0], [1.1, 0.9], [0.9, 1.2]])
+    found = joint(models, pool=pool)(points)
+    assert sum(runs) == 3
+    np.testing.assert_allclose(found, joint(of_function())(points), rtol=1e-9)
+
+
+def test_histories_keep_their_step():
+    motion = Channel("roof", "acceleration", "m/s2")
+    models = one_run(
+        {"static": PARTS["static"], "shaking": ((motion,), 0.1, 3)},
+        lambda theta: {"static": [[1.0, -1.0]], "shaking": [[0.0, theta[0], 1.0]]},
+        lambda output, **options: FunctionModel(output, ("k",), **options, version="1"),
+    )
+    measured = Measurements((motion,), 0.1, [[0.0, 2.0, 1.0]])
+    assert FELikelihood(models["shaking"], measured).misfit([[1.5]]).tolist() == [[0.25]]
