@@ -10,7 +10,7 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import labelled
 from ..checks.rehearsal import ModelCheck, check_model
-from ..checks.screening import check_noise_prior
+from ..checks.screening import check_noise_prior, repair_lines, screen
 from ..information.identifiability import of_mode
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
@@ -40,6 +40,11 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     events = read_events(job, problem)
     _say_data(problem, say)
     checked = _say_simulation(problem, events, say, progress)
+    repairs = repair_lines(screen(problem.posterior.likelihood.measurements), job.measurements)
+    if repairs:
+        say("Lines of [measurements] that deal with the sensors, instead of lines with the same keys:")
+        for line in repairs:
+            say(f"  {line}")
     for event in events:
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
