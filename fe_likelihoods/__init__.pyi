@@ -33,6 +33,7 @@ from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
 from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from .models.sensed import SensedModel, Sensor
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
@@ -109,6 +110,8 @@ __all__ = [
     "RCColumn",
     "Record",
     "ShearFlexuralBeam",
+    "SensedModel",
+    "Sensor",
     "ShearFrame",
     "SimulationCache",
     "SimulationFailed",

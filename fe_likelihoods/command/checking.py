@@ -119,7 +119,7 @@ def _say_simulation(
         )
     checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
     response = likelihood.simulate(mean[None, :n]).response[0]
-    errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
+    errors = rrmse(measured.values - likelihood.residuals_of(response), measured.values)
     fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
     say(f"One simulation takes {checked.seconds:.2g} s")
     say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
