@@ -53,7 +53,7 @@ from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
 from .prediction.new_event import event_ratios, predict_new_event
 from .prediction.propagation import fit_measures, propagate
-from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
+from .prediction.quantities import final_value, peak, rms
 from .prediction.reliability import exceedance
 from .prediction.scores import interval_score, share_within
 from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
@@ -122,7 +122,6 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
-    "arias_intensity",
     "average_predictions",
     "check_data",
     "check_fit",
@@ -131,7 +130,6 @@ __all__ = [
     "damage",
     "damage_measures",
     "damage_outputs",
-    "dissipated_energy",
     "effective_samples",
     "event_ratios",
     "exceedance",

@@ -40,13 +40,13 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
     An acceleration returns to zero, and a displacement begins there; forces and strains of dead loads do not.
     """
     x, found = np.array(values, dtype=float), list[SensorFault]()
-    if np.isfinite(x).sum() < FEWEST or np.nanmax(x) == np.nanmin(x):
-        return ()
     for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck)):
+        if not _is_judged(x):
+            return tuple(found)
         if spans := look(x):
             found.append(SensorFault(kind, spans, sum(last - first + 1 for first, last in spans) / len(x)))
             x = _without(x, spans)
-    if np.isfinite(x).sum() < FEWEST or np.nanmax(x) == np.nanmin(x):
+    if not _is_judged(x):
         return tuple(found)
     whole = ((0, len(x) - 1),)
     peak, level = _peak(x), _baseline(x, dimension)
@@ -56,6 +56,11 @@ def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorF
     if correlation < WHITE:
         found.append(SensorFault("noise", whole, correlation))
     return tuple(found)
+
+
+def _is_judged(x: np.ndarray) -> bool:
+    """Whether enough neighbouring samples are there, and not all equal."""
+    return bool(np.isfinite(np.diff(x)).sum() >= FEWEST and np.nanmax(x) > np.nanmin(x))
 
 
 def _peak(x: np.ndarray) -> float:

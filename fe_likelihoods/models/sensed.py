@@ -157,12 +157,14 @@ class SensedModel:
             return getattr(model, name)
         if model is not None and name == "with_record" and hasattr(model, "with_record"):
             return lambda record: SensedModel(model.with_record(record), self.outputs, self.inputs)
+        if model is not None and name == "first" and _can_be_shortened(model):
+            return self._first
         if model is not None and name == "simulate_batch" and has_batch_method(model):
             return self._batch
         raise AttributeError(f"{type(self).__name__} has no {name}")
 
-    def first(self, seconds: float) -> SensedModel:
-        """Return the same model under the first part of its excitation, as `first_part`."""
+    def _first(self, seconds: float) -> SensedModel:
+        """The same model under the first part of its excitation, as `first_part`."""
         last = int(seconds / self.dt + 1e-6)
         later = sum(
             max((np.abs(each.lag.ppf(ENDS)).max() for each in sensors.values() if each.lag is not None), default=0.0)
@@ -217,3 +219,9 @@ class SensedModel:
 def _motions(model: Model) -> tuple[Record, ...]:
     given = getattr(model, "supports", ()) or [getattr(model, "record", None)]
     return tuple(each for each in given if isinstance(each, Record))
+
+
+def _can_be_shortened(model: Model) -> bool:
+    return hasattr(model, "first") or (
+        hasattr(model, "with_record") and hasattr(getattr(model, "record", None), "trim")
+    )

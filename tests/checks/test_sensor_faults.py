@@ -80,7 +80,16 @@ def test_right_channels_of_other_kinds_are_left_alone():
     residual = x + 0.5 * peak / (1.0 + np.exp(-(TIME - 8.0) / 0.5))  # after yielding
     digits = np.round(x / peak * 100.0)  # a logger of eight bits
     gaps = np.where((TIME > 5.0) & (TIME < 6.0), np.nan, x)
-    for values in (x, residual, digits, gaps, np.zeros(N), np.full(N, np.nan), x[:40]):
+    for values in (
+        x,
+        residual,
+        digits,
+        gaps,
+        np.zeros(N),
+        np.full(N, np.nan),
+        np.where(np.arange(N) % 2, x, np.nan),
+        x[:40],
+    ):
         assert find_sensor_faults(values, "displacement") == ()
     assert find_sensor_faults(5.0 * peak + x, "force") == ()  # a dead load
     box, pulse = np.where((TIME > 2.0) & (TIME < 4.0), 1.0, 0.0), np.where(TIME == 2.0, 1.0, 0.0)
