@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from . import bridge, column, cost, executors, few_simulations, growth, job, samplers, startup, truth
+from . import bridge, column, cost, executors, few_simulations, growth, job, samplers, screening, startup, truth
 from .comparison import compare
 from .rows import as_table, machine, write_json
 
@@ -29,6 +29,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "job": job.job,
     "truth": truth.truth,
     "samplers": samplers.rows,
+    "screening": screening.screening,
     "few_simulations": few_simulations.few_simulations,
     "few_simulations_coverage": few_simulations.coverage,
 }
@@ -36,6 +37,7 @@ QUICK: dict[str, dict[str, Any]] = {
     "job": {"limit": 20.0},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},
+    "screening": {"every": 40},
     "few_simulations": {"problems": ("few_samples", "oscillator"), "budgets": (200,)},
     "few_simulations_coverage": {"problems": ("oscillator",), "budgets": (200,), "runs": 2},
 }

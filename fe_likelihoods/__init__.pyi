@@ -33,6 +33,7 @@ from .models.opensees import OpenSeesModel
 from .models.rc_column import RCColumn
 from .models.rc_column_curves import material_curves, moment_curvature
 from .models.rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
+from .models.sensed import SensedModel, Sensor
 from .models.tall_buildings import GroupedFrame, ModalModel, ShearFlexuralBeam
 from .models.umbridge import UMBridgeModel
 from .noise.autoregressive import AutoregressiveNoise
@@ -52,7 +53,7 @@ from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
 from .prediction.new_event import event_ratios, predict_new_event
 from .prediction.propagation import fit_measures, propagate
-from .prediction.quantities import arias_intensity, dissipated_energy, final_value, peak, rms
+from .prediction.quantities import final_value, peak, rms
 from .prediction.reliability import exceedance
 from .prediction.scores import interval_score, share_within
 from .priors.distributions import HalfNormal, LogNormal, TruncatedNormal, Uniform
@@ -109,6 +110,8 @@ __all__ = [
     "RCColumn",
     "Record",
     "ShearFlexuralBeam",
+    "SensedModel",
+    "Sensor",
     "ShearFrame",
     "SimulationCache",
     "SimulationFailed",
@@ -119,7 +122,6 @@ __all__ = [
     "Uniform",
     "Varying",
     "align",
-    "arias_intensity",
     "average_predictions",
     "check_data",
     "check_fit",
@@ -128,7 +130,6 @@ __all__ = [
     "damage",
     "damage_measures",
     "damage_outputs",
-    "dissipated_energy",
     "effective_samples",
     "event_ratios",
     "exceedance",

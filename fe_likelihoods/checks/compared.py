@@ -191,25 +191,21 @@ def compare(
     good = [i for i, reason in enumerate(batch.reasons) if not reason]
     if not good or (fitted and good[0]):
         return ()
-    pairs = [(points[i], batch.response[i]) for i in good]
+    found = [batch.response[i] for i in good]
     parts = _support_parts(likelihood.model, points[good, :n], batch.response[good])
     if not parts:
         known = likelihood.simulator.response_memory.responses(likelihood.model.fingerprint)
         simulated = set(distinct_keys(points[:, :n])[0])
         others = [each for each in known if each not in simulated]
         for place in np.unique(np.linspace(0, len(others) - 1, min(len(others), MOST_STORED)).astype(int)):
-            pairs.append((np.concatenate([np.frombuffer(others[place]), points[0, n:]]), known[others[place]]))
+            found.append(known[others[place]])
     measured = likelihood.measurements.values
 
-    def at_samples(theta: np.ndarray, response: np.ndarray) -> np.ndarray:
-        # unknown time shifts are those of the fit
-        return measured - likelihood.residuals_of(response, np.concatenate([theta[:n], points[0, n:]]))
+    def at_samples(response: np.ndarray) -> np.ndarray:
+        return measured - likelihood.residuals_of(response)
 
-    responses = np.stack([at_samples(*pair) for pair in pairs])
-    sampled = {
-        name: np.stack([at_samples(theta, one) for (theta, _), one in zip(pairs, each, strict=True)])
-        for name, each in parts.items()
-    }
+    responses = np.stack([at_samples(each) for each in found])
+    sampled = {name: np.stack([at_samples(one) for one in each]) for name, each in parts.items()}
     return tuple(
         Compared(
             window.title,
@@ -270,14 +266,13 @@ def fit_data_sets(run: FinishedRun) -> Fits:
         if hasattr(likelihood, "predict_modes"):
             fits.append(Fit(key, likelihood.measurements, {}, None, (), "modal", compared[-1].modal))
             continue
-        points = np.stack([np.concatenate([start[columns][:n], point[n:]]), point])  # with the time shifts of the fit
-        batch = likelihood.simulate(points[:, :n])
+        batch = likelihood.simulate(np.stack([start[columns], point])[:, :n])
         residuals = {}
-        for name, theta, response, reason in zip(names, points, batch.response, batch.reasons, strict=True):
+        for name, response, reason in zip(names, batch.response, batch.reasons, strict=True):
             if reason:
                 failures.append(f"{key}{', ' if key else ''}{name}: the simulation failed ({reason})")
             else:
-                residuals[name] = likelihood.residuals_of(response, theta)
+                residuals[name] = likelihood.residuals_of(response)
         fits += _split(likelihood, key, residuals, names, dict(zip(likelihood.parameter_names, point, strict=True)))
     made = run.likelihood.simulations - simulations
     return Fits(tuple(fits), *names, made, tuple(failures), tuple(compared))

@@ -132,7 +132,7 @@ def _of_a_fault(compared: Compared, fault: Fault, severity: str) -> Finding:
         )
         action = (
             "Compare the clocks of the recorders, with `align`, and shift the record before you use the result, or "
-            "make the lag a parameter (lags= of LinearStructure)."
+            "make the lag a parameter (inputs= of SensedModel)."
         )
     else:
         kind = "Clocks may differ"

@@ -1,7 +1,10 @@
 """Findings about measurements and motions, before any simulation."""
 
-from collections.abc import Sequence
-from typing import Any
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,18 +12,34 @@ from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
 from .finding import CARE, NOTE, Finding, by_severity
+from .sensor_faults import SensorFault, find_sensor_faults
 
-__all__ = ["check_data", "check_gaps", "check_noise_prior", "check_steps_of_mass"]
+__all__ = [
+    "Screened",
+    "check_data",
+    "check_gaps",
+    "check_noise_prior",
+    "check_sensors",
+    "check_steps_of_mass",
+    "repair_lines",
+    "screen",
+    "screen_motion",
+]
 
 # No horizontal ground acceleration above 2.8 g was recorded (Tsukidate 2011); responses leave room for impacts.
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
 SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
+MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
 LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
 def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
     """Look for faults that measurements and motions show by themselves; nothing is simulated.
+
+    A channel is clipped, was stuck, has spikes, an offset or a drift, or is mostly noise: each finding says when, and
+    has the line of ``[measurements]`` in a TOML file that deals with it. In Python, set these samples to NaN, or
+    subtract the offset. Sizes are relative to the channel itself (`fe_likelihoods.checks.sensor_faults`).
 
     Parameters
     ----------
@@ -31,8 +50,8 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
     Returns
     -------
     tuple of Finding
-        The most severe first, empty if nothing was found: sizes that are not plausible in SI units, channels that never
-        change, and synthetic data.
+        The most severe first, empty if nothing was found: faults of sensors, sizes that are not plausible in SI units,
+        channels that never change, and synthetic data.
 
     Examples
     --------
@@ -45,8 +64,118 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
         if np.isfinite(values).any():
             peaks.append((f"channel {channel.name}", channel.dimension, float(np.nanmax(np.abs(values)))))
     found = [each for peak in peaks for each in _check_size(*peak)]
+    found += check_sensors(screen(measurements))
+    for each in (part for motion in motions for part in getattr(motion, "records", (motion,))):
+        found += check_sensors(screen_motion(each))
     found += _check_silence(measurements) + _note_synthetic(measurements.description)
     return by_severity(found)
+
+
+class Screened(NamedTuple):
+    """Faults of one channel, its display unit (empty if it is not known), and the times of its samples."""
+
+    name: str
+    unit: str
+    step: float  # [s]
+    start: float  # of the first sample [s]
+    faults: tuple[SensorFault, ...]  # levels in the unit
+    is_motion: bool = False
+
+    def time(self, sample: float) -> str:
+        """Time of a sample, to a tenth of a step."""
+        return f"{self.start + sample * self.step:.{max(0, 1 - math.floor(math.log10(self.step)))}f}"
+
+    def missing(self) -> list[list[str]]:
+        """First and last times of the samples that are to be left out."""
+        left_out = [each for each in self.faults if each.kind in ("clipped", "stuck", "spikes")]
+        return [[self.time(sample) for sample in span] for each in left_out for span in sorted(each.spans)]
+
+    def baseline(self) -> list[str]:
+        """Points of a line through the offset or drift: time, and value with unit."""
+        level = next((each.level for each in self.faults if each.level), ())
+        last = next((each.spans[0][1] for each in self.faults if each.level), 0)
+        places = np.linspace(0.0, last, len(level)) if len(level) > 1 else [0.0] * len(level)
+        return [f'[{self.time(k)}, "{v:.4g} {self.unit or "?"}"]' for k, v in zip(places, level, strict=True)]
+
+
+def screen(measurements: Measurements) -> list[Screened]:
+    """Faults of every channel of measurements that has any."""
+    found = []
+    rows = zip(measurements.channels, measurements.steps, measurements.starts, measurements.values, strict=True)
+    for channel, step, start, values in rows:
+        shown = from_si(values, channel.unit)
+        faults = find_sensor_faults(shown, channel.dimension)
+        found += [Screened(channel.name, channel.unit, step, start, faults)] if faults else []
+    return found
+
+
+def screen_motion(motion: Record) -> list[Screened]:
+    """Faults of a motion; zeros before and after it, and white noise, are usual."""
+    ends, found = {0, motion.n_steps - 1}, []
+    for fault in find_sensor_faults(motion.acceleration, "acceleration"):
+        padding = fault.kind == "stuck" and all(ends & set(span) for span in fault.spans)
+        found += [] if padding or fault.kind == "noise" else [fault]
+    return [Screened(motion.name, "m/s²", motion.dt, 0.0, tuple(found), is_motion=True)]
+
+
+def repair_lines(channels: Sequence[Screened], given: Mapping[str, Any] | None = None) -> list[str]:
+    """Lines of ``[measurements]`` that deal with all faults; `given` are the values of these keys in the file."""
+    given = given or {}
+    missing = [json.dumps(each, ensure_ascii=False) for each in given.get("missing", ())]
+    old = len(missing)
+    missing += [f"[{json.dumps(c.name)}, {first}, {last}]" for c in channels for first, last in c.missing()]
+    lines = [f"missing = [{', '.join(missing)}]"] if len(missing) > old else []
+    points = {c.name: f"[{', '.join(c.baseline())}]" for c in channels if c.baseline()}
+    kept = {name: json.dumps(each, ensure_ascii=False) for name, each in given.get("baseline", {}).items()}
+    if points:
+        lines.append(f"baseline = {{{', '.join(f'{_key(name)} = {each}' for name, each in (kept | points).items())}}}")
+    if noisy := [c.name for c in channels if any(each.kind == "noise" for each in c.faults)]:
+        lines.append(f"# leave out of columns, or of channels: {', '.join(noisy)}")
+    return lines
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name, ensure_ascii=False)
+
+
+_KINDS = {
+    "clipped": "A sensor is clipped",
+    "stuck": "A sensor was stuck",
+    "spikes": "A channel has spikes",
+    "offset": "A channel has an offset",
+    "drift": "A channel drifts",
+    "noise": "A channel is mostly noise",
+}
+
+
+def check_sensors(channels: Sequence[Screened]) -> list[Finding]:
+    """Findings about faults of sensors, one for each channel and kind, with times and the line that deals with it."""
+    found = []
+    for channel in channels:
+        name = f"The motion {channel.name}" if channel.is_motion else channel.name
+        unit = f" {channel.unit}" if channel.unit else ""
+        for fault in channel.faults:
+            only = channel._replace(faults=(fault,))
+            places = [first if first == last else f"{first} to {last}" for first, last in only.missing()]
+            when = f"at {', '.join(places[:MOST_PLACES])} s"
+            when += f" and {len(places) - MOST_PLACES} more places" if len(places) > MOST_PLACES else ""
+            level = " to ".join(f"{value:.3g}" for value in fault.level[:: max(len(fault.level) - 1, 1)])
+            text = {
+                "clipped": f"{name} has exactly its largest or smallest value for several samples in a row, {when}.",
+                "stuck": f"{name} stands still {when}, while it moves before and after.",
+                "spikes": f"{name} has spikes of one to three samples {when}.",
+                "offset": f"{name} has the same mean in all its parts, about {level}{unit}.",
+                "drift": f"{name} has a mean that changes steadily, from {level}{unit}.",
+                "noise": f"{name} has samples that hardly depend on each other (correlation {fault.size:.2f}).",
+            }[fault.kind]
+            action = "Check the file, or take another record of the motion: a motion needs all samples."
+            if not channel.is_motion:
+                line = repair_lines([only])[0]
+                action = f"In [measurements] of a TOML file: {line.removeprefix('# ')}"
+                action += ". If it moved so: nothing." if fault.level else "."
+            severity = NOTE if fault.kind == "noise" else CARE
+            found.append(Finding(_KINDS[fault.kind], severity, text, action, {channel.name: float(fault.size)}))
+    return found
 
 
 def _check_size(name: str, kind: str, peak: float) -> list[Finding]:

@@ -83,7 +83,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
         if reason := next(filter(None, batch.reasons), ""):
             return not_tested(f"a simulation failed ({reason})")
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
-        residuals = likelihood.residuals_of(response, theta)
+        residuals = likelihood.residuals_of(response)
         parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))
         for what, name, model, every in _finer(likelihood.model):
             left.pop(name, None)

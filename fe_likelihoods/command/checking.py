@@ -10,7 +10,7 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..checks.finding import labelled
 from ..checks.rehearsal import ModelCheck, check_model
-from ..checks.screening import check_noise_prior
+from ..checks.screening import check_noise_prior, repair_lines, screen
 from ..information.identifiability import of_mode
 from ..likelihood.posterior import Posterior
 from ..signals.error_measures import rrmse
@@ -40,6 +40,11 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     events = read_events(job, problem)
     _say_data(problem, say)
     checked = _say_simulation(problem, events, say, progress)
+    repairs = repair_lines(screen(problem.posterior.likelihood.measurements), job.measurements)
+    if repairs:
+        say("Lines of [measurements] that deal with the sensors, instead of lines with the same keys:")
+        for line in repairs:
+            say(f"  {line}")
     for event in events:
         steps = f"{event.record.n_steps} samples at {event.record.dt:g} s"
         compared = "without measurements" if event.measured is None else "compared with measurements"
@@ -124,7 +129,7 @@ def _say_simulation(
         say(f"At the mean of the prior:\n{likelihood.predict_modes(mean[None, :n]).short()}")
     else:
         response = likelihood.simulate(mean[None, :n]).response[0]
-        errors = rrmse(measured.values - likelihood.residuals_of(response, mean), measured.values)
+        errors = rrmse(measured.values - likelihood.residuals_of(response), measured.values)
         fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):

@@ -1,6 +1,6 @@
 """The record and the measurements that a TOML file names."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from ..signals.read import (
 )
 from ..signals.records import Record
 from .job import Job
-from .schema import did_you_mean
+from .schema import did_you_mean, read_quantity
 
 __all__ = [
     "BUNDLED",
@@ -169,6 +169,8 @@ def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) 
         measured = _within_messages(job, "measurements", lambda: _read_columns(path, given, channels))
     if "reversed" in given:
         measured = _within_messages(job, "measurements", lambda: _turned(measured, given["reversed"]), "reversed: ")
+    measured = _within_messages(job, "measurements", lambda: _left_out(measured, given), "missing: ")
+    measured = _within_messages(job, "measurements", lambda: _straightened(measured, given), "baseline: ")
     if "channels" in given:
         measured = _within_messages(job, "measurements", lambda: measured.select(given["channels"]), "channels: ")
     if record is None or is_dataset(job, "measurements"):
@@ -189,9 +191,10 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
             f"columns: expected a column for each channel of the model, {', '.join(by_name)}; there is none for "
             f"{', '.join(missing)}"
         )
-    options = {
-        key: given[key] for key in ("dt", "time", "time_unit", "skip", "zero", "missing", "resample") if key in given
-    }
+    options = {key: given[key] for key in ("dt", "time", "time_unit", "skip", "zero", "resample") if key in given}
+    marks = [each for each in given.get("missing", ()) if not isinstance(each, list)]
+    if marks or given.get("missing") == []:
+        options["missing"] = marks
     return read_columns(
         path,
         [by_name[name] for name in chosen],
@@ -202,12 +205,50 @@ def _read_columns(path: Path, given: dict[str, Any], channels: Sequence[Channel]
     )
 
 
-def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
-    """Measurements with the channels `names` multiplied by -1; ValueError for an unknown channel."""
+def _known(measured: Measurements, names: Iterable[str]) -> tuple[str, ...]:
+    """Names of the channels; ValueError if a given name is none of them."""
     known = tuple(channel.name for channel in measured.channels)
     for name in names:
         if name not in known:
             raise ValueError(f"unknown channel {name!r}; {did_you_mean(name, known)}")
+    return known
+
+
+def _left_out(measured: Measurements, given: Mapping[str, Any]) -> Measurements:
+    """Measurements without the samples at the times that `missing` lists, for one channel or all."""
+    times = [each for each in given.get("missing", ()) if isinstance(each, list)]
+    if not times:
+        return measured
+    known = _known(measured, [each[0] for each in times if len(each) == 3])
+    values, left_out = measured.values.copy(), dict.fromkeys(known, 0)
+    for *name, first, last in times:
+        for row, (channel, step) in enumerate(zip(known, measured.steps, strict=True)):
+            at = measured.times(channel)
+            inside = (at >= first - 0.1 * step) & (at <= last + 0.1 * step) & (channel in (name or known))
+            left_out[channel] += int(np.isfinite(values[row, inside]).sum())
+            values[row, inside] = np.nan
+    text = ", ".join(f"{count} of {name}" for name, count in left_out.items() if count)
+    text = f"{measured.description}, samples left out: {text or 'none'}"
+    return replace(measured, values=values, description=text)
+
+
+def _straightened(measured: Measurements, given: Mapping[str, Any]) -> Measurements:
+    """Measurements less the polynomial through the points of `baseline`, for each channel that it names."""
+    points = given.get("baseline", {})
+    if not points:
+        return measured
+    known, values = _known(measured, points), measured.values.copy()
+    for name, each in points.items():
+        row = known.index(name)
+        levels = [read_quantity(value, measured.channels[row].dimension) for _, value in each]
+        line = np.polynomial.Polynomial.fit([time for time, _ in each], levels, len(each) - 1)
+        values[row] -= line(measured.times(name))
+    return replace(measured, values=values, description=f"{measured.description}, less a baseline: {', '.join(points)}")
+
+
+def _turned(measured: Measurements, names: Sequence[str]) -> Measurements:
+    """Measurements with the channels `names` multiplied by -1; ValueError for an unknown channel."""
+    known = _known(measured, names)
     signs = np.where(np.isin(known, names), -1.0, 1.0)[:, None]
     text = f"{measured.description}, reversed: {', '.join(names)}"
     return Measurements(measured.channels, measured.dt, signs * measured.values, text, measured.start)

@@ -48,7 +48,9 @@ class Job:
         if measured and "zero" in given:
             measured["zero"] = given.pop("zero")
         if measured and not measured["file"].lower().endswith((".h5", ".hdf5")):
-            kept = {key: value for key, value in self.measurements.items() if key not in ("file", "bundled")}
+            kept = {key: each for key, each in self.measurements.items() if key not in ("file", "bundled", "baseline")}
+            if "missing" in kept:  # times are those of the other file
+                kept["missing"] = [each for each in kept["missing"] if not isinstance(each, list)]
             measured = kept | measured
         return replace(self, record=given, measurements=measured, event=name)
 

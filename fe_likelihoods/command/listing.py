@@ -8,7 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks.finding import NOTE
+from ..checks.screening import Screened, check_data, check_sensors, repair_lines, screen, screen_motion
+from ..checks.sensor_faults import find_sensor_faults
 from ..signals.datasets import read_dataset
+from ..signals.header_statements import Statements
 from ..signals.read import read_record, recognise_reader
 from ..signals.records import Record
 from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
@@ -18,6 +22,7 @@ from ..signals.tables import (
     read_table,
     row_times,
     stated_unit,
+    table_start,
     table_step,
     text_unit,
     value_columns,
@@ -88,10 +93,20 @@ def _inline(pairs: list[tuple[str, str | int]]) -> str:
     return "{" + ", ".join(f"{name} = {_quoted(v) if isinstance(v, str) else v}" for name, v in pairs) + "}"
 
 
+def _screen(name: str, values: np.ndarray, unit: str, step: float, start: float = 0.0) -> list[Screened]:
+    """Faults of a channel in a unit, which is empty if it is not known."""
+    faults = find_sensor_faults(values, dimension_of(unit) or "displacement")
+    return [Screened(name, unit, step, start, faults)] if faults else []
+
+
+def _texts(channels: list[Screened]) -> list[str]:
+    return [f"CAUTION: {each.kind}: {each.text}" for each in check_sensors(channels)]
+
+
 def _v2(path: Path) -> _Lines:
     channels = find_v2_channels(path)
     numbers, files = [channel.channel for channel in channels], [channel.file for channel in channels]
-    rows, columns, refused = [("channel", *_HEAD, "label", "file")], [], []
+    rows, columns, refused, screened = [("channel", *_HEAD, "label", "file")], [], [], list[Screened]()
     taken: set[str] = set()
     for channel in channels:
         file = channel.file.removeprefix(f"{path}/") if channel.file != str(path) else path.name
@@ -111,7 +126,9 @@ def _v2(path: Path) -> _Lines:
             refused.append(f"{file} has channel {channel.channel or '-'} and others, which it does not number apart")
             continue
         columns.append((_name_of_channel(f"ch{channel.channel}" if alone else file, taken), column))
-    text = [f"{len(columns)} channels of acceleration", text_table(rows), *refused]
+        if series.times is None:
+            screened += _screen(columns[-1][0], from_si(values, "g"), "g", step)
+    text = [f"{len(columns)} channels of acceleration", text_table(rows), *refused, *_texts(screened)]
     if len({row[1:3] for row in rows[1:]}) > 1:
         text.append(
             "The channels differ in samples or step: they may be of several recorders, whose clocks may differ."
@@ -121,7 +138,7 @@ def _v2(path: Path) -> _Lines:
     first = columns[0][1]
     line = f"channel = {first}" if isinstance(first, int) else f"column = {_quoted(first)}"
     measured = [f"columns = {_inline(columns)}    # channel of the model = channel of the file"]
-    return _Lines(text, [f"{line}    # the channel of the base motion"], measured)
+    return _Lines(text, [f"{line}    # the channel of the base motion"], measured + repair_lines(screened))
 
 
 def _geonet(path: Path) -> _Lines:
@@ -162,6 +179,7 @@ def _single(path: Path) -> _Lines:
             raise
         record = read_record(path, **given)
     note = ["The unit is not stated: the peak is that of samples in g."] if "units" in given else []
+    note += _texts(screen_motion(record))
     return _Lines(["a ground motion", *_record_text(record), *note], lines)
 
 
@@ -171,14 +189,16 @@ def _dataset(path: Path) -> _Lines:
     rows = [("channel", "quantity", "samples", "step [s]", "missing")]
     for channel, step, values in zip(measured.channels, measured.steps, measured.values, strict=True):
         rows.append((channel.name, channel.quantity, str(values.size), f"{step:g}", str(int(np.isnan(values).sum()))))
-    return _Lines(["a data set", *_record_text(found.record), text_table(rows), measured.description], [], [])
+    text = ["a data set", *_record_text(found.record), text_table(rows), measured.description]
+    text += [f"CAUTION: {each}" for each in check_data(measured, found.record) if each.severity != NOTE]
+    return _Lines(text, [], repair_lines(screen(measured)))
 
 
 def _table(path: Path) -> _Lines:
     table = read_table(path)
     options, remarks = _sampling(table)
     rows: list[tuple[str, ...]] = [("column", "unit", "numbers", "missing", "smallest", "largest")]
-    columns, unstated, marks = [], [], set()
+    columns, unstated, marks, screened = [], [], set(), list[Screened]()
     taken: set[str] = set()
     names = [column.name for column in table.columns]
     for k in value_columns(table):
@@ -197,11 +217,15 @@ def _table(path: Path) -> _Lines:
             continue
         channel = _name_of_channel(name if table.named else f"column {name}", taken)
         columns.append((channel, name))
+        screened += _screen_column(
+            table, options, channel, np.where(np.isin(values, list(marks)), np.nan, values), unit
+        )
         if unit is None or dimension_of(unit) is None:
             unstated.append((channel, "?"))
-    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks]
-    if marks:
-        options.append(f"missing = [{', '.join(f'{mark:g}' for mark in sorted(marks))}]")
+    text = [f"a table of {len(table.lines)} rows", text_table(rows), *remarks, *_texts(screened)]
+    repairs = repair_lines(screened, {"missing": sorted(marks)})
+    if marks and not any(each.startswith("missing") for each in repairs):
+        repairs.append(f"missing = [{', '.join(f'{mark:g}' for mark in sorted(marks))}]")
     measured = [f"columns = {_inline(columns)}    # channel of the model = column", *options]
     if unstated:
         measured.append(f"units = {_inline(unstated)}    # write them: the file does not state them")
@@ -212,7 +236,28 @@ def _table(path: Path) -> _Lines:
     base = [f"column = {_quoted(columns[0][1])}    # the base motion, if it is in this file"]
     if unstated and columns[0][0] == unstated[0][0]:
         base.append('units = "?"    # write it: the file does not state it')
-    return _Lines(text, [*base, *(each for each in options if not each.startswith("missing"))], measured)
+    return _Lines(text, [*base, *options], measured + repairs)
+
+
+def _screen_column(table: Table, options: list[str], name: str, values: np.ndarray, unit: str | None) -> list[Screened]:
+    """Faults of a column, at the times that the lines for the TOML file give; nothing without times."""
+    if any(each.startswith("dt") for each in options):
+        return []
+    zero = 0.0 if table.clock is None else _clock_text(table)
+    try:
+        if any(each.startswith("resample") for each in options):
+            even = uniform_times(row_times(table), None, table.file)
+            return _screen(name, even.interpolate(values), unit or "", even.step, table_start(table, even.step, zero))
+        skipped = any(each.startswith("skip") for each in options)
+        step = table_step(table._replace(stated=Statements()) if skipped else table)
+    except ValueError:  # a remark says so
+        return []
+    return _screen(name, values, unit or "", step, table_start(table, step, zero))
+
+
+def _lines_above(table: Table) -> int:
+    """Number of lines above the header line of a table."""
+    return table.lines[0] - 1 - table.named - any(column.below for column in table.columns)
 
 
 def _clock_text(table: Table) -> str:
@@ -231,15 +276,24 @@ def _sampling(table: Table) -> tuple[list[str], list[str]]:
         if table.time is None:
             return ['dt = "? s"    # write it: the file has no times'], ["no column of times"]
         try:
+            table_step(table._replace(stated=Statements()))
+            above = _lines_above(table)  # with the other step
+            lines = [f"skip = {above}    # the step of the times, without the text above the table"] if above else []
+            return lines, [f"times: {error}"]
+        except ValueError:
+            pass
+        try:
             times = row_times(table)
             even = uniform_times(times, None, table.file)
         except ValueError:
             return [], [f"times: {error}"]
         steps = np.diff(times)
-        return [f"resample = {even.step:.6g}"], [
-            f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
-            + (f", {even.gaps.size} gap(s) of up to {even.gaps.max():.4g} s" if even.gaps.size else "")
-        ]
+        text = f"times: uneven, steps of {steps.min():.4g} to {steps.max():.4g} s"
+        if even.gaps.size:
+            text += f", {even.gaps.size} gap(s), the largest of {steps.max():.4g} s after {times[steps.argmax()]:.6g} s"
+        if not even.kept.all():
+            text += f", {(~even.kept).sum()} row(s) of a repeated time, the first at {times[~even.kept][0]:.6g} s"
+        return [f"resample = {even.step:.6g}"], [text]
     column = None if table.time is None else table.columns[table.time]
     start = "" if column is None else f", from {column.values[0]:.10g} in column {column.name!r}"
     if table.clock is not None:

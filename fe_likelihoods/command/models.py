@@ -5,6 +5,7 @@ import importlib.util
 import math
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from ..cache.simulation_cache import SimulationCache
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
+from ..models.sensed import SensedModel, Sensor
 from ..priors.distributions import Distribution, HalfNormal, LogNormal, Uniform
 from ..signals.channels import Channel, Measurements
 from ..signals.records import Record
@@ -50,6 +52,7 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     measured = read_measured(job, sensors, record)
     record, measured = reduce_data(job, record, measured)
     model = _located(job, "model", lambda: _make_model(job, record, measured))
+    model = _located(job, "priors", lambda: _with_sensors(job, model))
     workers = job.budget.get("workers")
     if workers is not None and job.kind not in USER_MODELS:
         raise ValueError(
@@ -156,6 +159,20 @@ def _make_model(job: Job, record: Record | None, measured: Measurements) -> Mode
     if job.kind in USER_MODELS:
         return _user_model(job, record)
     return _built_in(job, record, tuple(channel.name for channel in measured.channels), measured)
+
+
+def _with_sensors(job: Job, model: Model) -> Model:
+    """The model with sensors whose gain or lag has a prior, such as ``gain_top`` or ``lag_support_0``."""
+    names, sensors = [channel.name for channel in model.channels], defaultdict[str, dict[str, Distribution]](dict)
+    for name, text in job.priors.items():
+        kind, _, place = name.partition("_")
+        known = place in names or re.fullmatch(r"support_\d+", place)
+        if kind in ("gain", "lag") and known and name not in model.parameter_names:
+            sensors[place][kind] = parse_prior(text, "time" if kind == "lag" else None)
+    made = {place: Sensor(**priors) for place, priors in sensors.items()}
+    outputs = {place: sensor for place, sensor in made.items() if place in names}
+    inputs = {int(place.partition("_")[2]): sensor for place, sensor in made.items() if place not in names}
+    return SensedModel(model, outputs, inputs) if made else model
 
 
 def _built_in(job: Job, record: Record, names: tuple[str, ...] | None, measured: Measurements | None = None) -> Model:

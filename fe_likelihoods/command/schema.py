@@ -217,7 +217,13 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key("channels", "texts", "Channels to use; by default all"),
         *_TABLE,
         Key("zero", _ZERO, "Time in the file at which the base motion begins"),
-        Key("missing", "numbers", "Numbers that stand for missing samples"),
+        Key(
+            "missing",
+            "numbers and times",
+            "Numbers that stand for missing samples, and times [first, last] that are left out, with the name of a "
+            "channel before them for this one alone [s after zero]",
+        ),
+        Key("baseline", "points by name", "Channel = points [time, value] of an offset or a drift that is subtracted"),
     ),
     "modes": (
         Key(
@@ -343,6 +349,21 @@ def _are_probabilities(value: Any) -> bool:
     return numbers and all(0.0 < number < 1.0 for number in value) and len(set(value)) == len(value)
 
 
+def _is_time(value: Any) -> bool:
+    """Whether a value is a pair of times in order, or a name and such a pair."""
+    times = value[1:] if isinstance(value, list) and value and _is_text(value[0]) else value
+    return isinstance(times, list) and len(times) == 2 and all(map(_is_number, times)) and times[0] <= times[1]
+
+
+def _is_point(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and _is_number(value[0])
+        and (_is_number(value[1]) or _is_text(value[1]))
+    )
+
+
 _KINDS = {
     "text": (_is_text, 'a text in quotes, such as "abc"'),
     "number": (_is_number, "a number"),
@@ -353,6 +374,14 @@ _KINDS = {
     "yes or no": (lambda value: isinstance(value, bool), "true or false"),
     "texts": (_all(_is_text, list), 'a list of texts, such as ["a", "b"]'),
     "numbers": (_all(_is_number, list), "a list of numbers, such as [1.0, 2.0]"),
+    "numbers and times": (
+        _all(lambda value: _is_number(value) or _is_time(value), list),
+        'a list of numbers, and of times [first, last] in seconds, such as [-9999, [12.3, 12.8], ["top", 3.0, 3.2]]',
+    ),
+    "points by name": (
+        _all(lambda value: _all(_is_point, list)(value) and 1 <= len({each[0] for each in value}) == len(value), dict),
+        'points of time and value by name, such as {top = [[0.0, "0.01 g"], [40.0, "0.03 g"]]}',
+    ),
     "text or numbers": (
         lambda value: _is_text(value) or _all(_is_number, list)(value),
         "a text in quotes, or a list of numbers, such as [1.0, 5.0]",

@@ -69,7 +69,7 @@ class DataSets:
 
     `measured` are the values (n_channels, n_samples) [SI], `statistic` is that of the residuals, and `with_gaps` says
     whether samples are missing or have times of their own. ValueError for statistics that are not quadratic in the
-    residuals, a noise whose level depends on the response, or time shifts.
+    residuals, or a noise whose level depends on the response.
     """
 
     def __init__(self, likelihood: Any) -> None:
@@ -161,11 +161,6 @@ class DataSets:
 def _statistic_of(likelihood: Any) -> Callable[[np.ndarray], np.ndarray]:
     """Statistic of residuals that are zero where a sample is missing; ValueError if it cannot be emulated."""
     measured, statistic = likelihood.measured, getattr(likelihood.noise, "statistic", None) or sums_of_squares
-    if isinstance(measured, Comparison) and measured.lags is not None:
-        raise ValueError(
-            "a guide cannot emulate time shifts of channels: sample without a guide, or estimate the lags with align "
-            "and correct the measurements with Measurements.shift"
-        )
     if needs_response(statistic):
         raise ValueError(
             f"the level of {noise_title(likelihood.noise)} depends on the response, so the posterior cannot be "

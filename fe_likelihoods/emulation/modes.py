@@ -6,7 +6,7 @@ and their misfit is smoother, because errors in a period have had less time to a
 centred on each start, so that starts keep their differences in parameters without effect on the early part.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Container, Generator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -358,16 +358,22 @@ def _modes_of(parts: list[_Part], standing_for: list[int], spent: float, finishe
     modes = sorted((laplace(part.target, end, (k,)) for k, end in part.ends.items()), key=lambda m: -m.log_evidence)
     modes = [mode for mode in modes if mode.log_evidence > modes[0].log_evidence - _NEGLIGIBLE]
     number_of = {mode.starts[0]: number for number, mode in enumerate(modes)}
-
-    def end_of(k: int) -> int:
-        while k >= 0 and standing_for[k] != k:
-            k = standing_for[k]
-        return number_of.get(k, -1)
-
-    ends = tuple(end_of(k) for k in range(len(standing_for)))
+    ends = tuple(number_of.get(_end_of(k, standing_for, part.ends), -1) for k in range(len(standing_for)))
     led = [tuple(k for k, end in enumerate(ends) if end == number) for number in range(len(modes))]
     modes = [mode._replace(starts=starts) for mode, starts in zip(modes, led, strict=True)]
     return ModeSearch(tuple(modes), ends, spent, finished, len(parts) > 1)
+
+
+def _end_of(k: int, standing_for: Sequence[int], ends: Container[int]) -> int:
+    """The start at whose end on the whole record a start has arrived; -1 for none.
+
+    Two starts may stand for each other, one on the whole record and the other, in a later round, on a first part.
+    """
+    for _ in standing_for:
+        if k < 0 or k in ends:
+            break
+        k = standing_for[k]
+    return k
 
 
 def _further(first: int) -> int:

@@ -109,7 +109,7 @@ def block_log_likelihood(
     """Terms (n, n_blocks) of the log-likelihood of n samples, for blocks that end at the ascending times `stops` [s].
 
     Values (n_channels, n_samples) [SI], NaN where there is none, residuals (n, n_channels, n_samples) [SI] and
-    parameters (n, n_noise) belong to a noise that was not integrated out and has no unknown time shifts.
+    parameters (n, n_noise) belong to a noise that was not integrated out.
     """
     if hasattr(noise, "log_densities"):
         return _blocks_of_samples(noise, measurements, values, residuals, parameters, stops)

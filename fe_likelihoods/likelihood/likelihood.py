@@ -17,9 +17,8 @@ import numpy as np
 from ..cache.simulation_cache import SimulationCache
 from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import MarginalNoise
-from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_time_shifts, noise_under
+from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sample_counts import count_samples
-from ..noise.time_shifts import with_time_shifts
 from ..priors.distributions import Distribution, RandomState, uniform_numbers
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points, complete_repr
@@ -77,11 +76,6 @@ class FELikelihood(SumOfParts):
         Largest share of failed simulations, in [0, 1]. If more have failed, of 20 or more, the next request for a
         simulation raises `TooManyFailures`; with a pool also a request whose simulations still run, if more have failed
         even when all of these succeed.
-    time_shifts : mapping of str to float, optional
-        Largest unknown time shift in both directions [s], by the names of channels whose clock may differ from the
-        clock of the excitation. Each has a parameter ``time_shift_<channel>`` [s] after the noise parameters; the prior
-        must be within the largest shift. With a positive shift, the measurement is later than the response. For white
-        noise in SI units (`fe_likelihoods.noise.time_shifts`).
 
     Attributes
     ----------
@@ -123,14 +117,12 @@ class FELikelihood(SumOfParts):
         memory_bytes: int = 2**28,
         cache: SimulationCache | str | os.PathLike | None = None,
         max_failure_share: float = 1.0,
-        time_shifts: Mapping[str, float] | None = None,
     ) -> None:
         check_model(model)
         measurements = match_measurements(model, join_measurements(model, measurements))
         noise = GaussianNoise(model.channels) if noise is None else noise
         check_noise(model, noise)
-        noise = noise_of_part(noise_under(noise, model), measurements)
-        self.noise = with_time_shifts(noise, time_shifts, model.dt)
+        self.noise = noise_of_part(noise_under(noise, model), measurements)
         structural, others = tuple(model.parameter_names), tuple(self.noise.parameter_names)
         self.parameter_names = structural + others
         if len(set(self.parameter_names)) != len(self.parameter_names):
@@ -140,7 +132,6 @@ class FELikelihood(SumOfParts):
             model,
             measurements,
             noise_statistic(self.noise),
-            noise_time_shifts(self.noise),
             pool=pool,
             cache=cache,
             memory_rows=memory_rows,
@@ -220,8 +211,7 @@ class FELikelihood(SumOfParts):
         Parameters
         ----------
         theta : (n_structural,) or (ndim,) float
-            Structural parameters; the noise parameters may follow. They must for a noise with unknown time shifts,
-            whose channels are compared at the shifts of `theta`.
+            Structural parameters; the noise parameters may follow.
 
         Returns
         -------
@@ -231,7 +221,7 @@ class FELikelihood(SumOfParts):
         Raises
         ------
         ValueError
-            For a wrong number of parameters, or a shift beyond the largest one.
+            For a wrong number of parameters.
         SimulationFailed
             If the simulation fails.
         """
@@ -242,50 +232,28 @@ class FELikelihood(SumOfParts):
                 f"expected one point, of shape ({n_structural},), or ({self.ndim},) with the noise parameters; "
                 f"got shape {theta.shape}"
             )
-        self._shifts_of(theta)
         response, (reason,) = simulate_batch(self.model, theta[None, :n_structural])
         if reason:
             raise SimulationFailed(reason)
-        return self.residuals_of(response[0], theta)
+        return self.residuals_of(response[0])
 
-    def residuals_of(self, response: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    def residuals_of(self, response: np.ndarray) -> np.ndarray:
         """Measured minus simulated response, as `residuals`, from a response that is known: nothing is simulated.
 
         Parameters
         ----------
         response : (n_channels, n_steps) float
             Response of the model [SI], such as one of ``simulate(thetas).response``.
-        theta : (n_structural,) or (ndim,) float
-            Its parameters, as for `residuals`; needed for unknown time shifts only.
 
         Returns
         -------
         (n_channels, n_steps) float
             [SI]; NaN where a sample is missing.
         """
-        response, shifts = np.asarray(response, dtype=float), self._shifts_of(np.asarray(theta, dtype=float))
-        if shifts:
-            times = {name: self.measurements.times(name) - shift for name, shift in shifts.items()}
-            return -self.measured.residuals_at(response, self.model.dt, self.measurements.channels, times)
+        response = np.asarray(response, dtype=float)
         if isinstance(self.measured, Comparison):
             return -self.measured.residuals(response)
         return self.measurements.values - response
-
-    def _shifts_of(self, theta: np.ndarray) -> dict[str, float]:
-        """Time shifts [s] of channels at a point, empty for a noise without such parameters."""
-        largest = noise_time_shifts(self.noise)
-        if not largest:
-            return {}
-        if theta.shape != (self.ndim,):
-            raise ValueError(
-                f"the channels {', '.join(largest)} have unknown time shifts: give the noise parameters too, a point "
-                f"of shape ({self.ndim},)"
-            )
-        values = dict(zip(self.parameter_names, theta.tolist(), strict=True))
-        shifts = {name: values[f"time_shift_{name}"] for name in largest}
-        if beyond := [name for name, shift in shifts.items() if not abs(shift) <= largest[name]]:
-            raise ValueError(f"the time shifts of {', '.join(beyond)} are beyond the largest ones, {dict(largest)} s")
-        return shifts
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
         """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""
@@ -383,7 +351,7 @@ class FELikelihood(SumOfParts):
     def with_noise(self, noise: Noise) -> "FELikelihood":
         """The same likelihood with another noise.
 
-        Model, measurements, time shifts, pool, limits, cache on disk and the responses in memory are kept; counts start
+        Model, measurements, pool, limits, cache on disk and the responses in memory are kept; counts start
         at zero.
         """
         return self._with(self.model, self.measurements, noise)
@@ -399,7 +367,6 @@ class FELikelihood(SumOfParts):
             memory_rows=own.memory_cache.rows,
             memory_bytes=own.response_memory.max_bytes,
             max_failure_share=own.failures.max_share,
-            time_shifts=noise_time_shifts(self.noise) or None,
         )
         other.simulator.share(own)
         return other

@@ -92,8 +92,6 @@ def _of_noise(noise: Noise, default: Sequence[Channel]) -> list[Parameter]:
         if name in channels:
             channel = channels[name]
             described.append(Parameter(name, channel.unit, find_unit(channel.unit, channel.dimension).factor))
-        elif name.startswith("time_shift_"):
-            described.append(Parameter(name, "s"))
         else:
             dimensionless = name.startswith(("rho_", "share_")) or isinstance(sampled, GaussianNoise)
             described.append(Parameter(name, "-" if dimensionless else ""))

@@ -270,8 +270,8 @@ class Posterior:
         Raises
         ------
         ValueError
-            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, the
-            noise uses statistics that are not quadratic in the residuals, or channels have unknown time shifts.
+            If `starts` is not a whole number of at least one, the likelihood caches too few simulations in memory, or
+            the noise uses statistics that are not quadratic in the residuals.
 
         Notes
         -----

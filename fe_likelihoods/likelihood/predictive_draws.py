@@ -12,7 +12,6 @@ import numpy as np
 from ..noise.draws import SampleNoise, sample_noise
 from ..noise.marginal import MarginalNoise
 from ..noise.protocol import noise_title
-from ..noise.time_shifts import ShiftedNoise
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from ..signals.records import Record
@@ -118,7 +117,7 @@ def predictive_draws(
     for prefix, each, columns in _named_parts(likelihood):
         noise, rows = _with_noise_parameters(each, samples[:, columns], rng)
         simulated, values = _responses(each, rows), _compared(each)
-        residuals = _residuals(each, rows, simulated)
+        residuals = _residuals(each, simulated)
         parameters = rows[:, len(each.model.parameter_names) :]
         errors = _errors(each, noise, parameters, simulated, rng)
         if errors is None:
@@ -182,10 +181,9 @@ def _responses(likelihood: FELikelihood, rows: np.ndarray) -> np.ndarray:
     return batch.response
 
 
-def _residuals(likelihood: FELikelihood, rows: np.ndarray, responses: np.ndarray) -> np.ndarray:
+def _residuals(likelihood: FELikelihood, responses: np.ndarray) -> np.ndarray:
     """Simulated minus measured response of each row, (n, n_channels, n_samples) [SI], NaN where a sample is missing."""
-    pairs = zip(responses, rows, strict=True)
-    return -np.stack([likelihood.residuals_of(response, row) for response, row in pairs])
+    return -np.stack([likelihood.residuals_of(response) for response in responses])
 
 
 def _errors(
@@ -238,8 +236,6 @@ def _blocks(
     block: float | None,
     name: str,
 ) -> BlockLogLikelihood:
-    if isinstance(noise, ShiftedNoise):  # the residuals are at the shifts already
-        parameters, noise = parameters[:, : len(noise.noise.parameter_names)], noise.noise
     whole = np.array([np.inf])
     total = block_log_likelihood(noise, likelihood.measurements, values, residuals, parameters, whole)[:, 0]
     starts, stops = choose_blocks(likelihood.measurements, values, residuals[np.argmax(total)], block)

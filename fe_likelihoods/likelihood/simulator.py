@@ -10,7 +10,7 @@ import hashlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, Future
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -100,11 +100,11 @@ class Simulator:
 
     `statistics` and, where responses are needed, `simulate` wait for their simulations. `request`, `receive` and
     `leave` are for those who go on meanwhile, and need a pool that `streams`. Options are those of `FELikelihood`; the
-    statistic is the sums of squares by default, and `time_shifts` are the largest unknown ones [s]. `measured` are
-    values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and
-    `disk_hits` count simulations run by this object in this process, cached rows, and rows from the disk; `failures`
-    include known ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their
-    duration; `when_simulated` is called with the number that have ended, in this process only.
+    statistic is the sums of squares by default. `measured` are values (n_channels, n_steps), or a `Comparison` where
+    samples are missing. `simulations`, `cache_hits` and `disk_hits` count simulations run by this object in this
+    process, cached rows, and rows from the disk; `failures` include known ones from the disk. `chunk_size` simulations
+    are run between two writes to the disk, adapted to their duration; `when_simulated` is called with the number that
+    have ended, in this process only.
     """
 
     def __init__(
@@ -112,7 +112,6 @@ class Simulator:
         model: Model,
         measurements: Measurements,
         statistic: Statistic | None = None,
-        time_shifts: Mapping[str, float] | None = None,
         *,
         pool: Any = None,
         cache: SimulationCache | str | os.PathLike | None = None,
@@ -122,7 +121,7 @@ class Simulator:
     ) -> None:
         self.failures = FailureLog(model.parameter_names, max_failure_share)
         self.model, self.measurements, self.statistic = model, measurements, statistic
-        self.measured = compare_with(measurements, model.dt, model.n_steps, time_shifts)
+        self.measured = compare_with(measurements, model.dt, model.n_steps)
         check_statistic(statistic, self.measured)
         self.n_structural = len(model.parameter_names)
         self.n_numbers = statistic_width(self.measured, statistic)
@@ -201,7 +200,7 @@ class Simulator:
     # requests -----------------------------------------------------------------------------------------------------
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels) [SI unit squared], without time shifts; NaN for failures."""
+        """Sums of squared residuals (n, n_channels) [SI unit squared]; NaN for failures."""
         return self.statistics(thetas)[:, : self.measurements.n_channels]
 
     def statistics(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None) -> np.ndarray:

@@ -103,9 +103,7 @@ class SumOfParts:
         """Hex digest of the samples that are compared: equal for likelihoods of the same data.
 
         The order of the channels and of data sets has no effect. Times count from the start of each event and missing
-        samples do not count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared. A
-        noise with unknown time shifts leaves out samples near the ends of the response, so its digest depends on the
-        largest shift.
+        samples do not count, so that it is the same for EQ2 alone and for EQ2 after an EQ1 that is not compared.
         """
         return combined_digest([digest for part, _ in self.parts() for digest in part.data_digests()])
 

@@ -98,17 +98,12 @@ class LinearStructure(ExternalModel):
         ``"displacement@roof"``, ``"velocity@roof"`` and ``"relative_acceleration@roof"`` are relative to the support,
         or to the quasi-static motion R g of several supports; ``"displacement@roof:floor 2"`` is relative to another
         channel, the drift of the storeys between them. Default: the absolute accelerations of all channels of `parts`.
-    lags : sequence of int
-        Supports, counted from 0, whose recorder has a clock with an unknown lag. Each has a parameter, such as
-        ``lag_2`` [s]: positive where its record is later than the other records and the measured response. Lags belong
-        to the recorders of these records: under other records, give samples with the lags that these have.
 
     Raises
     ------
     ValueError
-        If an output is unknown or repeated, a lag is of no support, all supports have one, there are no supports, their
-        steps or lengths differ, `parts` has another number of supports, or fewer than two samples are between `lead`
-        and `until`.
+        If an output is unknown or repeated, there are no supports, their steps or lengths differ, `parts` has another
+        number of supports, or fewer than two samples are between `lead` and `until`.
 
     Examples
     --------
@@ -127,7 +122,6 @@ class LinearStructure(ExternalModel):
         unit: str = "g",
         lead: float = 0.0,
         until: float | None = None,
-        lags: Sequence[int] = (),
         outputs: Sequence[str] | None = None,
     ) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
@@ -146,13 +140,6 @@ class LinearStructure(ExternalModel):
                 f"LinearStructure: expected one record for each of the {parts.n_supports} supports of "
                 f"{type(parts).__name__}; got {len(supports)}"
             )
-        lags = tuple(lags)
-        if len(set(lags)) < len(lags) or not set(lags) < {*range(len(supports))}:
-            raise ValueError(
-                f"LinearStructure: lags must be numbers of supports, from 0 to {len(supports) - 1} and not all of "
-                "them, because a lag of all clocks is a lag of the sensors (time_shifts of FELikelihood); got "
-                f"{lags!r}"
-            )
         names = tuple(parts.channel_names)
         self.outputs = None if outputs is None or tuple(outputs) == names else tuple(outputs)
         self.sensors = _sensors(parts, names if outputs is None else outputs)
@@ -161,16 +148,14 @@ class LinearStructure(ExternalModel):
             Channel(each.name, each.quantity, units.get(each.quantity.split()[-1], unit)) for each in self.sensors
         )
         self._window = sample_window("the supports", first.n_steps, first.dt, lead, until)
-        parameters = (*parts.parameter_names, *(f"lag_{k}" for k in lags))
-        super().__init__(parameters, channels, first.dt, self._window.stop - self._window.start)
+        super().__init__(tuple(parts.parameter_names), channels, first.dt, self._window.stop - self._window.start)
         self.parts = parts
         self.supports = supports
         self.unit = unit
         self.lead = float(lead)
-        self.lags = lags
         self._acceleration = np.stack([support.acceleration for support in supports])
         self.fingerprint = self._digest(
-            repr(parts), self._window.start, [s.fingerprint for s in supports], *lags, *(self.outputs or ())
+            repr(parts), self._window.start, [s.fingerprint for s in supports], *(self.outputs or ())
         )
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
@@ -178,7 +163,7 @@ class LinearStructure(ExternalModel):
 
         The lead is kept, `until` is not.
         """
-        return type(self)(self.parts, record, self.unit, self.lead, None, self.lags, self.outputs)
+        return type(self)(self.parts, record, self.unit, self.lead, None, self.outputs)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
@@ -221,8 +206,8 @@ class LinearStructure(ExternalModel):
         """
         last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
         until = last * self.dt
-        if self.lags or isinstance(self.parts, EquivalentLinear):  # later motion counts: a late one, or its level
-            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.lags, self.outputs)
+        if isinstance(self.parts, EquivalentLinear):  # later motion counts: its level
+            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.outputs)
         return self.with_record([support.trim(0.0, until) for support in self.supports])
 
     def modes(self, theta: ArrayLike, n: int | None = None) -> Modes:
@@ -234,13 +219,12 @@ class LinearStructure(ExternalModel):
         if isinstance(self.parts, EquivalentLinear):
             raise ValueError("an EquivalentLinear structure has no modes of its own: take the modes of its parts")
         values = check_theta(theta, self.parameter_names)
-        system = self.parts.assemble(values[: len(values) - len(self.lags)])
+        system = self.parts.assemble(values)
         modes = undamped_modes(system.stiffness, system.mass, n)
         return modes._replace(shapes=modes.shapes @ system.shape.T)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        n = len(theta) - len(self.lags)
-        theta, motion = theta[:n], self._under_clocks(theta[n:])
+        motion = self._acceleration
         if isinstance(self.parts, EquivalentLinear):
             system = self.parts.settle(theta, motion, self.dt).system
         else:
@@ -260,12 +244,3 @@ class LinearStructure(ExternalModel):
         out = np.einsum("cs,st->ct", direct, motion)
         superpose(modes, shapes, motion, self.dt, out)
         return out[:, self._window]
-
-    def _under_clocks(self, lags: np.ndarray) -> np.ndarray:
-        """Accelerations of the supports by one clock, linear between the samples of a record."""
-        if not self.lags:
-            return self._acceleration
-        motion, time = self._acceleration.copy(), self.dt * np.arange(self._acceleration.shape[1])
-        for k, lag in zip(self.lags, lags, strict=True):
-            motion[k] = np.interp(time + lag, time, self._acceleration[k], left=0.0, right=0.0)
-        return motion

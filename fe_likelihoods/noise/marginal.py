@@ -52,7 +52,7 @@ class MarginalNoise:
         if not isinstance(noise, GaussianNoise) or not noise.white or noise.sensor is not None:
             raise ValueError(
                 "marginal() integrates out the standard deviations of white noise in SI units, GaussianNoise(channels) "
-                'or GaussianNoise(channels, groups="all"), without sensor noise and time shifts; got '
+                'or GaussianNoise(channels, groups="all"), without sensor noise; got '
                 f"{noise_title(noise)}: keep the parameters of this noise"
             )
         object.__setattr__(self, "noise", noise)

@@ -1,6 +1,6 @@
 """The members that likelihoods and predictions need of a noise: required, and optional with defaults."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +14,6 @@ __all__ = [
     "noise_channels",
     "noise_of_part",
     "noise_statistic",
-    "noise_time_shifts",
     "noise_title",
     "noise_under",
 ]
@@ -77,11 +76,6 @@ def noise_channels(noise: Noise, default: Sequence[Channel]) -> tuple[Channel, .
 def noise_statistic(noise: Noise) -> Callable[..., np.ndarray] | None:
     """Statistic of the residuals that a noise needs, None for the sums of squares."""
     return getattr(noise, "statistic", None)
-
-
-def noise_time_shifts(noise: Noise | None) -> Mapping[str, float]:
-    """Largest unknown time shifts [s] by channel name; empty for a noise without unknown time shifts."""
-    return getattr(noise, "time_shifts", None) or {}
 
 
 def noise_title(noise: Noise) -> str:

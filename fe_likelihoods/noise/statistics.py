@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 
 from ..signals.comparison import Comparison
-from ..signals.interpolation import POINTS
 
 __all__ = ["Statistic", "apply_statistic", "needs_response", "reduce_response", "statistic_width", "sums_of_squares"]
 
@@ -30,8 +29,6 @@ def apply_statistic(statistic: Statistic, residuals: np.ndarray, response: np.nd
 
 def statistic_width(measured: np.ndarray | Comparison, statistic: Statistic | None = None) -> int:
     """How many numbers a statistic returns; by default for the sums of squares."""
-    if isinstance(measured, Comparison) and measured.lags is not None:
-        return len(measured.values) * (1 + POINTS * (2 * measured.lags.count + 1))
     values = measured.values if isinstance(measured, Comparison) else measured
     return len(apply_statistic(sums_of_squares if statistic is None else statistic, values, values))
 
@@ -47,9 +44,6 @@ def reduce_response(response: np.ndarray, measured: np.ndarray | Comparison, red
         if isinstance(measured, Comparison):
             if not np.isfinite(response).all():  # also where no sample is affected
                 return np.full(statistic_width(measured, reduce), np.nan)
-            if measured.lags is not None:
-                sums = sums_of_squares(measured.known_residuals(response))
-                return np.concatenate([sums, measured.lags.sums(response, measured.values).ravel()])
             if reduce is sums_of_squares:
                 return reduce(measured.known_residuals(response))
             residuals = measured.residuals(response)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,6 @@ def plot_bands(
     prediction: Prediction,
     measurements: Measurements | None = None,
     channels: Sequence[str] | None = None,
-    time_shifts: Mapping[str, float] | None = None,
 ) -> Figure:
     """Plot the mean of predicted histories, the band between the outermost quantiles, and measurements.
 
@@ -36,9 +35,6 @@ def plot_bands(
         Measurements, drawn at their own times. Channels that were not measured are drawn without measurements.
     channels : sequence of str, optional
         Names of the channels to draw. Default: all channels of the prediction.
-    time_shifts : mapping of str to float, optional
-        Times [s] by which mean and band of some channels are drawn later, where they are compared with the
-        measurements. The legend of the channel names its time. Needed for measured channels of ``prediction.shifted``.
 
     Returns
     -------
@@ -48,7 +44,7 @@ def plot_bands(
     Raises
     ------
     ValueError
-        If the prediction has no histories, a channel does not exist, or a shift of ``prediction.shifted`` is missing.
+        If the prediction has no histories, or a channel does not exist.
 
     Examples
     --------
@@ -60,28 +56,24 @@ def plot_bands(
     measured = set()
     if measurements is not None:
         measured = {channel.name for channel in measurements.channels}
-    shifts = prediction.known_shifts([name for name in wanted if name in measured], time_shifts)
     low, high = (min(prediction.probabilities), max(prediction.probabilities)) if prediction.probabilities else (0, 0)
 
     figure, rows = stack_axes(len(wanted))
     for axes, name in zip(rows, wanted, strict=True):
         k = names.index(name)
-        channel, shift = prediction.channels[k], shifts.get(name, 0.0)
+        channel = prediction.channels[k]
         if low < high:
             band = [from_si(prediction.quantile(p)[k], channel.unit) for p in (low, high)]
             label = f"{100 * low:g}-{100 * high:g} %" + (" with noise" if prediction.noise else "")
-            axes.fill_between(time + shift, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
+            axes.fill_between(time, *band, color=BLUE, alpha=0.3, linewidth=0.0, label=label)
         if name in measured:
             values = from_si(measurements.channel(name), channel.unit)
             drawn = {"color": ORANGE, "linewidth": 2.2, "alpha": 0.6, "label": "measured"}
             axes.plot(measurements.times(name), values, marker=marker_of(values), markersize=3.0, **drawn)
-        label = f"mean, shifted by {shift:.4g} s" if shift else "mean"
-        axes.plot(time + shift, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label=label)
+        axes.plot(time, from_si(prediction.mean[k], channel.unit), color=BLUE, linewidth=0.8, label="mean")
         axes.set_ylabel(channel_label(channel))
         axes.grid(alpha=0.25)
-    for axes, name in zip(rows, wanted, strict=True):
-        if axes is rows[0] or shifts.get(name):
-            add_legend_row(axes, 3)
+    add_legend_row(rows[0], 3)
     set_time_axis(rows, time[-1])
     return figure
 

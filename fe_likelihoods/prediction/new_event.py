@@ -27,7 +27,6 @@ from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
 from ..events.spread import EventSpread
 from ..likelihood.likelihood import FELikelihood
-from ..noise.protocol import noise_time_shifts
 from ..priors.between_events import BETWEEN_EVENTS
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -270,10 +269,8 @@ def _event(likelihood: FELikelihood, at: Mapping[str, float], quantity: Any, spr
     )
     if not ((measured > 0.0) & (values[0] > 0.0)).all():
         raise ValueError(f"ratios of events need positive values; measured {measured}, predicted {values[0]}")
-    residuals = None
-    if not noise_time_shifts(likelihood.noise):
-        residuals = likelihood.residuals_of(responses[0], rows[0])
-        residuals = residuals if residuals.shape == responses[0].shape else None
+    residuals = likelihood.residuals_of(responses[0])
+    residuals = residuals if residuals.shape == responses[0].shape else None
     floor = PRIOR_SD if len(rows) == 1 or residuals is None else REMAINDER
     remainder = remainder_variance(evaluate, responses, residuals, floor)
     return measured / values[0], values[0], log_variance(values), remainder

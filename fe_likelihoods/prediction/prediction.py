@@ -11,7 +11,7 @@ from ..checks.finding import Finding, labelled, warn
 from ..checks.transfer import check_interval_samples
 from ..events.spread import EventSpread
 from ..signals.channels import Channel, Measurements
-from ..signals.comparison import Comparison, compare_shifted, compare_with
+from ..signals.comparison import Comparison, compare_with
 from ..signals.error_measures import rrmse
 from ..text_tables import number, text_table
 from ..units import find_unit
@@ -19,7 +19,7 @@ from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    pass
 
 
 __all__ = ["Prediction"]
@@ -74,9 +74,6 @@ class Prediction:
     from_state : str
         State of the structure at the beginning: "virgin", before any excitation, or "end", after the excitation with
         which the model was made.
-    shifted : tuple of str
-        Channels of the measurements with unknown time shifts (``time_shifts=`` of `fe_likelihoods.FELikelihood`). The
-        histories are responses without a shift.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
     spread : EventSpread or None
@@ -104,7 +101,6 @@ class Prediction:
     dt: float | None = None
     noise: bool = False
     from_state: str = "virgin"
-    shifted: tuple[str, ...] = ()
     quantity: object = None
     spread: EventSpread | None = None
     findings: tuple[Finding, ...] = ()
@@ -145,7 +141,6 @@ class Prediction:
         self,
         measurements: Measurements,
         part: slice = slice(None),
-        time_shifts: "Mapping[str, float] | None" = None,
     ) -> np.ndarray:
         """Compute the relative root mean square error of the mean.
 
@@ -156,9 +151,6 @@ class Prediction:
             has times of its own, the histories are interpolated there.
         part : slice
             The samples of the history to compare. Default: all.
-        time_shifts : mapping of str to float, optional
-            Time [s] by which the measurements of a channel are later than the response, needed for the channels of
-            `shifted`: for instance the posterior means of their shifts. Samples beyond the histories are left out.
 
         Returns
         -------
@@ -168,10 +160,10 @@ class Prediction:
         Raises
         ------
         ValueError
-            If the prediction has no histories, a shift of `shifted` is not given, the measurements lack a channel or
-            have samples outside the histories, or a measured channel is zero, or has no sample, in the part.
+            If the prediction has no histories, the measurements lack a channel or have samples outside the histories,
+            or a measured channel is zero, or has no sample, in the part.
         """
-        compared = self._compared(measurements, time_shifts)
+        compared = self._compared(measurements)
         measured, mean = _values_of(compared), _at_samples(compared, self.mean)
         return rrmse(mean[:, part], measured[:, part], [channel.name for channel in self.channels])
 
@@ -181,7 +173,6 @@ class Prediction:
         lower: float = 0.05,
         upper: float = 0.95,
         part: slice = slice(None),
-        time_shifts: "Mapping[str, float] | None" = None,
     ) -> np.ndarray:
         """Compute the fraction of the measured samples between two quantiles.
 
@@ -194,8 +185,6 @@ class Prediction:
             Probabilities of the two quantiles.
         part : slice
             The samples of the history to compare. Default: all.
-        time_shifts : mapping of str to float, optional
-            As for `rrmse`.
 
         Returns
         -------
@@ -214,7 +203,7 @@ class Prediction:
         """
         if not lower < upper:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
-        compared = self._compared(measurements, time_shifts)
+        compared = self._compared(measurements)
         measured = _values_of(compared)[:, part]
         below, above = _band_at_samples(compared, self.quantile(lower), self.quantile(upper))[..., part]
         samples = np.isfinite(measured).sum(axis=1)
@@ -228,7 +217,6 @@ class Prediction:
         measured: Measurements | ArrayLike,
         level: float = 0.9,
         part: slice = slice(None),
-        time_shifts: "Mapping[str, float] | None" = None,
     ) -> HistoryScores | QuantityScores:
         """Compute proper scores, coverage and sharpness; ``print(prediction.score(measurements))`` is a table.
 
@@ -243,8 +231,6 @@ class Prediction:
             with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
         part : slice
             The samples of the histories to score. Default: all.
-        time_shifts : mapping of str to float, optional
-            As for `rrmse`.
 
         Returns
         -------
@@ -277,7 +263,7 @@ class Prediction:
             return self._score_values(measured, level)
         if not isinstance(measured, Measurements):
             raise ValueError(f"score: a prediction of histories needs Measurements; got {type(measured).__name__}")
-        compared = self._compared(measured, time_shifts)
+        compared = self._compared(measured)
         values = _values_of(compared)
         mean, sd, around = (_at_samples(compared, each) for each in [self.mean, self.sd, envelope(self.mean)])
         ends = (self._near_quantile(0.5 - 0.5 * level), self._near_quantile(0.5 + 0.5 * level))
@@ -365,21 +351,7 @@ class Prediction:
         if self.dt is None:
             raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
 
-    def known_shifts(self, measured: "Sequence[str]", time_shifts: "Mapping[str, float] | None") -> dict[str, float]:
-        """Return the given time shifts; raise ValueError if one of a measured channel is missing, or is unknown."""
-        shifts, names = dict(time_shifts or {}), [channel.name for channel in self.channels]
-        if missing := [name for name in names if name in self.shifted and name in measured and name not in shifts]:
-            raise ValueError(
-                f"the channels {', '.join(missing)} have unknown time shifts: give time_shifts={{name: seconds}}, for "
-                "instance the posterior means of their parameters time_shift_<channel>"
-            )
-        if unknown := sorted(set(shifts) - set(names)):
-            raise ValueError(f"time_shifts has {', '.join(unknown)}, the prediction has {', '.join(names)}")
-        return shifts
-
-    def _compared(
-        self, measurements: Measurements, time_shifts: "Mapping[str, float] | None"
-    ) -> np.ndarray | Comparison:
+    def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
         """Return what the histories are compared with, in the order of `channels`."""
         self._need_histories()
         chosen = measurements.select([channel.name for channel in self.channels])
@@ -389,9 +361,7 @@ class Prediction:
                     f"channel {predicted.name!r} is {predicted.quantity!r} in the prediction, {measured.quantity!r} in "
                     "the measurements"
                 )
-        shifts = self.known_shifts([channel.name for channel in self.channels], time_shifts)
-        compared = compare_with(chosen, self.dt, self.mean.shape[1])
-        return compare_shifted(chosen, compared, self.dt, self.mean.shape[1], shifts) if shifts else compared
+        return compare_with(chosen, self.dt, self.mean.shape[1])
 
 
 def _check_number(n_samples: int, least: int, level: float) -> None:

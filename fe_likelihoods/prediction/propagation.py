@@ -34,8 +34,7 @@ from ..cache.stored_responses import StoredResponses
 from ..checks.finding import warn
 from ..checks.screening import check_gaps
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks, check_same_response
-from ..noise.protocol import noise_time_shifts, noise_under
-from ..priors.points import as_points
+from ..noise.protocol import noise_under
 from ..signals.channels import Channel, Measurements
 from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
@@ -287,10 +286,9 @@ def propagate(
             if other:
                 peaks.add(responses, reasons, accumulator.members[start : start + batch])
             bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
-    shifted = tuple(noise_time_shifts(source.noise) or ()) if record is None else ()
     predictions = {
         name: replace(
-            _prediction(each, n, effective, evaluators[name].channels, model.dt, state, shifted), quantity=wanted[name]
+            _prediction(each, n, effective, evaluators[name].channels, model.dt, state), quantity=wanted[name]
         )
         for name, each in accumulators.items()
     }
@@ -324,8 +322,7 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     posterior : Posterior, FELikelihood or JointLikelihood
         The likelihood with the measurements.
     samples : (n, ndim) array_like, or named values of shape (n,)
-        All parameters, or the structural parameters alone. All for a noise with unknown time shifts, whose channels
-        are compared at the shifts of the samples.
+        All parameters, or the structural parameters alone.
     part : str, optional
         As for `propagate`.
 
@@ -339,27 +336,15 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     ValueError
         As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
     """
-    complete = samples
-    joint = posterior
-    posterior, samples = part_of(joint, complete, part, False)
+    posterior, samples = part_of(posterior, samples, part, False)
     source = read_source(posterior)
-    if noise_time_shifts(source.noise):
-        posterior, samples = part_of(joint, complete, part, True)
     if source.likelihood is None:
         raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
     likelihood = source.likelihood
     compared = getattr(likelihood.measured, "values", likelihood.measured)
     power = sum_of_squares(compared, [channel.name for channel in likelihood.measurements.channels])
     thetas, _ = split_samples(source, samples, False)
-    if not (shifted := noise_time_shifts(likelihood.noise)):
-        return likelihood.misfit(thetas) / power
-    if not (isinstance(samples, Mapping) or np.shape(samples)[-1:] == (likelihood.ndim,)):
-        raise ValueError(
-            f"the channels {', '.join(shifted)} have unknown time shifts: give samples of all "
-            f"{likelihood.ndim} parameters"
-        )
-    noise = as_points(samples, likelihood.parameter_names)[:, thetas.shape[1] :]
-    return likelihood.noise.misfit(likelihood.simulator.statistics(thetas), noise) / power
+    return likelihood.misfit(thetas) / power
 
 
 def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:
@@ -386,7 +371,6 @@ def _prediction(
     channels: tuple[Channel, ...],
     dt: float,
     from_state: str,
-    shifted: tuple[str, ...],
 ) -> Prediction:
     failed, collapsed = (
         np.sort(np.concatenate([np.zeros(0, dtype=int), *samples]))
@@ -439,7 +423,6 @@ def _prediction(
         dt=dt if histories else None,
         noise=noise,
         from_state=from_state,
-        shifted=shifted,
     )
 
 

@@ -5,20 +5,17 @@ interpolated there without a filter, even for channels sampled more coarsely: a 
 sensor has measured, and the noise of thinned white samples stays white.
 """
 
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import Channel, Measurements
-from .interpolation import POINTS, Interpolation, interpolate, make_interpolation
+from .channels import Measurements
+from .interpolation import Interpolation, interpolate, make_interpolation
 from .sampling import same_sampling, same_step
 
-__all__ = ["Comparison", "Lags", "compare_shifted", "compare_with", "measured_values"]
+__all__ = ["Comparison", "compare_with", "measured_values"]
 
 _LATEST = 1e-6  # in steps: how far a sample may be after the end of the response, for round-off
 
@@ -29,7 +26,6 @@ class Comparison:
 
     values: NDArray[np.float64]  # (n_channels, n_samples) [SI], NaN where there is none
     places: tuple[Interpolation | None, ...]  # per channel; None if it has the times of the response
-    lags: "Lags | None" = None  # lags of the residuals, for unknown time shifts
 
     @property
     def interpolated(self) -> bool:
@@ -38,12 +34,8 @@ class Comparison:
 
     @property
     def description(self) -> str:
-        """Interpolation and lags of the residuals, for fingerprints."""
-        text = " interpolated by six points" if self.interpolated else ""
-        if self.lags is not None:
-            shifted = [k for k, place in enumerate(self.lags.places) if place is not None]
-            text += f" lags to {self.lags.count} of channels {shifted}"
-        return text
+        """Interpolation, for fingerprints."""
+        return " interpolated by six points" if self.interpolated else ""
 
     @cached_property
     def missing(self) -> NDArray[np.bool_]:
@@ -66,22 +58,6 @@ class Comparison:
         """Return response minus measurement, shape (n_channels, n_samples) [SI], NaN where a sample is missing."""
         return np.ascontiguousarray(self.at_samples(response) - self.values)  # as for a complete response
 
-    def residuals_at(
-        self,
-        response: NDArray[np.float64],
-        dt: float,
-        channels: Sequence[Channel],
-        times: Mapping[str, NDArray[np.float64]],
-    ) -> NDArray[np.float64]:
-        """Return `residuals` with the response, of step `dt` [s], at other times (n_samples,) [s] for some channels."""
-        residuals = self.residuals(response)
-        for row, channel in enumerate(channels):
-            if channel.name in times:
-                there = ~self.missing[row]
-                place = make_interpolation(dt, response.shape[1], times[channel.name][there])
-                residuals[row, there] = interpolate(response[row], place) - self.values[row, there]
-        return residuals
-
     def known_residuals(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `residuals` with zero where a sample is missing."""
         residuals = self.residuals(response)
@@ -89,39 +65,11 @@ class Comparison:
         return residuals
 
 
-class Lags(NamedTuple):
-    """Lags of -count ... count steps of the response, for channels whose time shift is unknown."""
-
-    count: int
-    places: tuple[Interpolation | None, ...]  # per channel at (sample, lag), lag by lag; None without a shift
-    samples: tuple[NDArray[np.intp] | None, ...]  # per channel, the samples that are compared
-
-    def sums(self, response: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return sums over products of residuals at neighbouring lags, shape ((2 count + 1) * POINTS, n_channels).
-
-        The number of row ``POINTS * k + j`` is the sum over the samples of e_k e_(k + j), where e_k is the residual at
-        lag k; zero for channels without a shift, and where k + j is no lag.
-        """
-        n = 2 * self.count + 1
-        sums = np.zeros((n, POINTS, len(values)))
-        for c, (place, samples) in enumerate(zip(self.places, self.samples, strict=True)):
-            if place is None:
-                continue
-            residuals = interpolate(response[c], place).reshape(n, -1) - values[c, samples]
-            products = residuals @ residuals.T
-            for j in range(min(POINTS, n)):
-                sums[: n - j, j, c] = np.diagonal(products, j)
-        return sums.reshape(n * POINTS, len(values))
-
-
-def compare_with(
-    measurements: Measurements, dt: float, n_steps: int, time_shifts: Mapping[str, float] | None = None
-) -> NDArray[np.float64] | Comparison:
+def compare_with(measurements: Measurements, dt: float, n_steps: int) -> NDArray[np.float64] | Comparison:
     """Return the measured values (n_channels, n_steps) if every response sample has one, else a `Comparison`.
 
     Measurements with the step of the response [s] need as many samples, some of them NaN; with other steps or starts
-    they must end within one step before the end of the response, so that a wrong step raises ValueError. Within a
-    channel's largest time shift [s], plus three steps, from either end of the response, its samples are left out.
+    they must end within one step before the end of the response, so that a wrong step raises ValueError.
     """
     end = (n_steps - 1) * dt
     _check_end(measurements, dt, n_steps)
@@ -141,65 +89,9 @@ def compare_with(
             )
         # a missing sample may be outside the response: any place within serves
         places.append(make_interpolation(dt, n_steps, np.where(there, times, known[0])))
-    if time_shifts:
-        return _with_lags(measurements, dt, n_steps, time_shifts, places)
     if all(place is None for place in places) and not np.isnan(measurements.values).any():
         return measurements.values
     return Comparison(measurements.values, tuple(places))
-
-
-def compare_shifted(
-    measurements: Measurements,
-    compared: NDArray[np.float64] | Comparison,
-    dt: float,
-    n_steps: int,
-    shifts: Mapping[str, float],
-) -> Comparison:
-    """Return the comparison of `compare_with` (`compared`) with channels that are later than the response by known
-    `shifts` [s]; samples beyond the response are left out.
-    """
-    places = list(compared.places) if isinstance(compared, Comparison) else [None] * measurements.n_channels
-    values, end = np.array(measurements.values), (n_steps - 1) * dt
-    for row, channel in enumerate(measurements.channels):
-        if channel.name in shifts:
-            times = measurements.times(channel.name) - shifts[channel.name]
-            values[row, (times < -_LATEST * dt) | (times > end + _LATEST * dt)] = np.nan
-            places[row] = make_interpolation(dt, n_steps, np.clip(times, 0.0, end))
-    return Comparison(values, tuple(places))
-
-
-def _with_lags(
-    measurements: Measurements,
-    dt: float,
-    n_steps: int,
-    time_shifts: Mapping[str, float],
-    places: Sequence[Interpolation | None],
-) -> Comparison:
-    largest = max(time_shifts.values())
-    count = math.ceil(largest / dt - _LATEST) + POINTS // 2
-    values = np.array(measurements.values)
-    lag_places: list[Interpolation | None] = []
-    lag_samples: list[NDArray[np.intp] | None] = []
-    for row, channel in enumerate(measurements.channels):
-        if channel.name not in time_shifts:
-            lag_places.append(None)
-            lag_samples.append(None)
-            continue
-        times = measurements.times(channel.name)
-        first, last = (count - _LATEST) * dt, (n_steps - 1 - count + _LATEST) * dt
-        values[row, (times < first) | (times > last)] = np.nan
-        samples = np.flatnonzero(np.isfinite(values[row]))
-        if not samples.size:
-            raise ValueError(
-                f"no sample of channel {channel.name!r} is farther than {count * dt:g} s from both ends of the "
-                f"response, which lasts {(n_steps - 1) * dt:g} s, so its time shift of up to "
-                f"{time_shifts[channel.name]:g} s is beyond the record; give a smaller one"
-            )
-        lags = dt * np.arange(-count, count + 1)
-        shifted = (times[samples] - lags[:, None]).ravel()
-        lag_places.append(make_interpolation(dt, n_steps, shifted))
-        lag_samples.append(samples)
-    return Comparison(values, tuple(places), Lags(count, tuple(lag_places), tuple(lag_samples)))
 
 
 def _check_end(measurements: Measurements, dt: float, n_steps: int) -> None:

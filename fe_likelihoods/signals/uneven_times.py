@@ -12,6 +12,7 @@ __all__ = ["UniformTimes", "uniform_times"]
 
 _GAP = 1.5  # usual steps between two samples, from which on samples are missing
 _NEAR = 0.1  # usual steps from a sample, within which a time beside a gap has its value
+_MOST_REPEATED = 0.05  # share of rows that repeat a time; more are the times of packets
 _LARGEST_DIFFERENCE = 0.05  # relative, of the new step from the usual one
 
 
@@ -24,9 +25,11 @@ class UniformTimes(NamedTuple):
     usual: float  # mean step without gaps [s]
     gaps: NDArray[np.float64]  # (n_gaps,) lengths [s]
     note: str  # what is done, for the description of the data
+    kept: NDArray[np.bool_]  # (n_rows,) samples that are used: of those with equal times the first
 
     def interpolate(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Values (n_steps,) at the uniform times, linear between known samples, NaN in gaps and beyond the last."""
+        values = values[self.kept]
         known = np.flatnonzero(~np.isnan(values))
         if known.size == 0:
             return np.full(self.uniform.size, np.nan)
@@ -49,17 +52,23 @@ class UniformTimes(NamedTuple):
                 UserWarning,
                 stacklevel=stacklevel + 1,
             )
-        return np.interp(self.uniform, self.times, values)
+        return np.interp(self.uniform, self.times, values[self.kept])
 
 
 def uniform_times(times: NDArray[np.float64], step: float | None, where: str) -> UniformTimes:
     """Return times with the uniform `step` [s] from the first to the last of the given times (n_samples,) [s].
 
     The default step is a whole number of samples per second within 5 % of the usual step, else the usual step. Raises
-    ValueError if times do not increase, more than half of the samples are missing, or the step differs from the usual
-    one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`).
+    ValueError if times decrease or many repeat, more than half of the samples are missing, or the step differs from the
+    usual one by more than 5 %: that would need a filter (`Record.resample`, `Measurements.decimate`). Of samples with
+    equal times the first one is used.
     """
     step = None if step is None else check_step(step, f"resample of {where}")
+    kept = np.concatenate([[True], np.diff(times) != 0.0])
+    if 0 < (repeated := np.count_nonzero(~kept)) <= _MOST_REPEATED * times.size:
+        first_repeated, times = float(times[~kept][0]), times[kept]
+    else:
+        repeated, kept = 0, np.ones(times.size, dtype=bool)
     increments = np.diff(times)
     if times.size < 2 or not np.all(increments > 0.0):
         place = int(np.argmax(~(increments > 0.0))) if times.size > 1 else 0
@@ -79,10 +88,12 @@ def uniform_times(times: NDArray[np.float64], step: float | None, where: str) ->
     gaps, others = (increments[chosen] for chosen in (increments > _GAP * usual, increments <= _GAP * usual))
     note = f"interpolated linearly to a step of {step:g} s from steps of {others.min():.4g} to {others.max():.4g} s"
     note += f", with {gaps.size} gap(s) of up to {gaps.max():.4g} s" if gaps.size else ""
+    note += f", without {repeated} row(s) of a repeated time, the first at {first_repeated:g} s" if repeated else ""
     duration = times[-1] - times[0]
     if duration > 2 * times.size * step:
         raise ValueError(
             f"{where}: expected samples at most times, got {times.size} in {duration:.4g} s with a gap of "
             f"{gaps.max():.4g} s; cut the file at its long gaps"
         )
-    return UniformTimes(times, step, times[0] + step * np.arange(int(duration / step + 1e-6) + 1), usual, gaps, note)
+    uniform = times[0] + step * np.arange(int(duration / step + 1e-6) + 1)
+    return UniformTimes(times, step, uniform, usual, gaps, note, kept)

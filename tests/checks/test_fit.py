@@ -17,6 +17,8 @@ from fe_likelihoods import (
     Measurements,
     Posterior,
     Record,
+    SensedModel,
+    Sensor,
     TruncatedNormal,
     Uniform,
     check_fit,
@@ -155,14 +157,13 @@ def _prior():
 def test_the_lag_of_a_recorder_is_found_as_a_parameter():
     """The ends are 0.1 s late; with their lags as parameters the fit is right, and nothing speaks against it."""
     model, measured = deck(late=5)
-    model = LinearStructure(model.parts, model.supports, lags=(1, 2))
-    prior = DECK | {
-        "lag_1": TruncatedNormal(0.0, 0.1, lower=-np.inf),
-        "lag_2": TruncatedNormal(0.0, 0.1, lower=-np.inf),
-    }
-    posterior, samples = sampled(model, measured, prior)
+    late = Sensor(lag=TruncatedNormal(0.0, 0.1, lower=-np.inf))
+    model = SensedModel(model, inputs={1: late, 2: late})
+    posterior, samples = sampled(model, measured, DECK | model.priors)
     mean, sd = samples.mean(axis=0), samples.std(axis=0)
     found = dict(zip(posterior.parameter_names, mean, strict=True))
-    assert found["lag_1"] == pytest.approx(0.1, abs=0.005) and found["lag_2"] == pytest.approx(0.1, abs=0.005)
+    assert found["lag_support_1"] == pytest.approx(0.1, abs=0.005) and found["lag_support_2"] == pytest.approx(
+        0.1, abs=0.005
+    )
     assert (np.abs(mean[:3] - [4.0, 0.08, 0.6]) < 4.0 * sd[:3] + 0.01).all()
     assert not [each for each in check_fit(posterior, samples) if each.severity == "wrong"]

@@ -7,8 +7,10 @@ from fe_likelihoods import Channel, Events, Measurements, Record, check_data
 from fe_likelihoods.checks.screening import check_noise_prior, check_steps_of_mass
 
 TOP, DECK = Channel("top", "displacement", "mm"), Channel("deck", "acceleration", "g")
-VALUES = np.random.default_rng(1).standard_normal((2, 100)) * [[0.02], [3.0]]
-MOTION = Record("EQ", 0.02, 2.0 * np.random.default_rng(2).standard_normal(100))
+TIMES = 0.02 * np.arange(500)
+WAVES = np.sin(np.multiply.outer([9.0, 31.0], TIMES)) * TIMES * np.exp(-0.5 * TIMES)
+VALUES = (WAVES + 0.01 * np.random.default_rng(1).standard_normal((2, 500))) * [[0.02], [3.0]]
+MOTION = Record("EQ", 0.02, 2.0 * np.random.default_rng(2).standard_normal(500))
 
 
 def kinds(values=VALUES, record=MOTION, description=""):

@@ -466,10 +466,28 @@ def test_files_and_folders_that_cannot_be_used_are_told(folder):
     assert "(Measurements.select, or channels in a TOML file)" in call("check", "oscillator.toml", code=1)
 
 
+def test_priors_of_gains_and_lags_make_sensors(folder):
+    more = 'gain_displacement = "log-normal(1, 0.05)"\nlag_acceleration = "normal(0, 20 ms, -0.1 s, 0.1 s)"\n'
+    more += 'gain_support_0 = "uniform(0.5, 2)"\n'
+    (folder / "oscillator.toml").write_text(OSCILLATOR.replace("[sampler]", more + "[sampler]"))
+    posterior = make_problem(read_job(folder / "oscillator.toml")).posterior
+    names = ("stiffness", "damping", "gain_displacement", "lag_acceleration", "gain_support_0")
+    assert tuple(posterior.parameter_names[:5]) == names
+    assert posterior.prior.distributions["lag_acceleration"].sd == 0.02
+    plain = posterior.likelihood.model.model.simulate([1.0, 1.0])
+    shown = posterior.likelihood.model.simulate([1.0, 1.0, 0.5, 0.0, 1.0])
+    np.testing.assert_allclose(shown, plain * [[1.0], [0.5]], rtol=1e-12)
+    (folder / "oscillator.toml").write_text(OSCILLATOR.replace("[sampler]", 'gain_roof = "uniform(0, 2)"\n[sampler]'))
+    assert "[priors] gain_roof: the model has no such parameter" in call("check", "oscillator.toml", code=1)
+
+
 def test_check_warns_of_what_is_likely_wrong(folder):
     text = OSCILLATOR.replace("half-normal(5 mm)", "half-normal(10)").replace("guide = true", "")
     lines = (folder / "top.csv").read_text().splitlines()
     lines[5:15] = [line.rpartition(",")[0] + ",nan" for line in lines[5:15]]
+    lines[100:120] = [
+        ",".join([one.split(",")[0], lines[100].split(",")[1], one.split(",")[2]]) for one in lines[100:120]
+    ]
     (folder / "top.csv").write_text("\n".join(lines))
     (folder / "oscillator.toml").write_text(text.replace("[prediction]", "[budget]\nmax_simulations = 5\n[prediction]"))
     output = call("check", "oscillator.toml")
@@ -478,6 +496,9 @@ def test_check_warns_of_what_is_likely_wrong(folder):
         "larger than every measured value of displacement" in output and output.count("The prior expects a noise") == 1
     )
     assert "will probably end before beta = 1" in output
+    times = [float(lines[k].split(",")[0]) for k in (100, 119)]
+    assert "CAUTION: A sensor was stuck: acceleration stands still at" in output
+    assert f'missing = [["acceleration", {times[0]:.3f}, {times[1]:.3f}]]' in output
 
 
 @pytest.mark.slow

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
+from fe_likelihoods import Channel, Measurements, Record, check_data, read_columns, read_record
+from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.main import main
+from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.signals.datasets import write_dataset
 from tests.signals.logger_styles import READ
 from tests.signals.network_files import esm, geonet, smc
@@ -56,7 +58,7 @@ def test_what_a_file_does_not_state_must_be_written(tmp_path):
         "time_s,base,top,top [1]\n" + "".join(f"{t},{k},3,{k - 9999 * (k == 0)}\n" for k, t in enumerate(times))
     )
     output, lines = listed(path)
-    assert "times: uneven, steps of 0.01 to 0.02 s, 1 gap(s) of up to 0.02 s" in output
+    assert "times: uneven, steps of 0.01 to 0.02 s, 1 gap(s), the largest of 0.02 s after 0.01 s" in output
     assert "which usually stands for a missing sample" in output
     assert lines["record"]["units"] == "?" and lines["record"]["resample"] == lines["measurements"]["resample"] == 0.01
     assert lines["measurements"]["units"] == {"base": "?", "top": "?"}
@@ -154,3 +156,61 @@ def test_channels_that_cannot_be_read(tmp_path, given, message):
     with pytest.raises(ValueError, match=message):
         read_columns(path, **options)
     assert read_columns(path, [TOP], ["3"], zero=0.1).start == -0.1
+
+
+def test_the_lines_for_faults_of_sensors_work(tmp_path):
+    times, rng = 0.01 * np.arange(2000), np.random.default_rng(1)
+    motion = 2.0 * np.sin(13.0 * times) * times * np.exp(-0.3 * times) + 0.01 * rng.standard_normal(2000)
+    right = [np.sin(19.0 * times) * times * np.exp(-0.3 * times) + 0.01 * rng.standard_normal(2000) for _ in range(2)]
+    stuck, drifting = right[0].copy(), right[1] + 0.1 + 0.03 * times
+    stuck[400:450], stuck[700] = stuck[400], 3.0
+    rows = zip(times, motion, stuck, drifting, strict=True)
+    path, job = tmp_path / "log.csv", tmp_path / "job.toml"
+    path.write_text(
+        "time_s,base_m_s2,top_g,top_mm\n" + "".join(f"{t:.2f},{b:.5f},{a:.5f},{u:.5f}\n" for t, b, a, u in rows)
+    )
+    output, lines = listed(path)
+    assert "CAUTION: A sensor was stuck: top_g stands still at 4.000 to 4.490 s" in output
+    assert "CAUTION: A channel has spikes: top_g has spikes of one to three samples at 7.000 s" in output
+    assert "CAUTION: A channel drifts: top_mm" in output and output.count("CAUTION") == 3
+    head = (
+        f'[model]\nkind = "oscillator"\nperiod = "0.4 s"\n[record]\nfile = "{path}"\ncolumn = "base_m_s2"\n[priors]\n'
+    )
+    head += 'stiffness = "normal(1, 0.3)"\ndamping = "normal(1, 0.3)"\n[measurements]\n'
+    named = (
+        output.partition("[measurements]\n")[2]
+        .replace("top_g =", "acceleration =")
+        .replace("top_mm =", "displacement =")
+    )
+    named = named.replace('["top_g"', '["acceleration"').replace('base_m_s2 = "base_m_s2", ', "")
+    job.write_text(head + named)
+    measured = make_problem(read_job(job)).posterior.likelihood.measurements
+    assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [*range(400, 450), 700]
+    np.testing.assert_allclose(measured.values[1], 1e-3 * right[1], atol=4e-5)
+    assert check_data(measured) == ()
+    for old, new, message in (
+        ('[["acceleration"', '[["top"', "missing: unknown channel 'top'"),
+        ("[0.000, ", "[", "baseline: expected points of time and value by name"),
+    ):
+        job.write_text(head + named.replace(old, new))
+        with pytest.raises(ValueError, match=message):
+            make_problem(read_job(job))
+    job.write_text(head + named.replace("missing = [[", "missing = [[2.0, 3.0], ["))
+    assert np.isnan(make_problem(read_job(job)).posterior.likelihood.measurements.values[:, 200:301]).all()
+
+
+def test_times_that_repeat_or_contradict_the_header_have_a_line(tmp_path):
+    path = tmp_path / "a.csv"
+    times = np.round(0.02 * np.arange(60), 2)
+    path.write_text("dt = 0.01 s\ntime_s,acc_g\n" + "".join(f"{t:.2f},{np.sin(t):.5f}\n" for t in times))
+    output, lines = listed(path)
+    assert "the step is 0.02 s by the time column but 0.01 s by 'dt = 0.01 s'" in output
+    channel = [Channel("top", "acceleration", "g")]
+    assert read_columns(path, channel, ["acc_g"], skip=lines["measurements"]["skip"]).dt == 0.02
+    times[30] = times[29]
+    path.write_text("time_s,acc_g\n" + "".join(f"{t:.2f},{np.sin(t):.5f}\n" for t in times))
+    output, lines = listed(path)
+    assert "1 row(s) of a repeated time, the first at 0.58 s" in output
+    measured = read_columns(path, channel, ["acc_g"], resample=lines["measurements"]["resample"])
+    assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [30]
+    assert "without 1 row(s) of a repeated time, the first at 0.58 s" in measured.description

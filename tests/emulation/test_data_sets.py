@@ -259,15 +259,6 @@ def test_a_limit_that_ends_the_search_repeats_no_simulation(monkeypatch):
     assert whole.simulations < sampler.simulations < whole.simulations + 50
 
 
-def test_data_sets_that_cannot_be_emulated():
-    first, second = likelihoods().values()
-    prior = {name: TruncatedNormal(1.0, 0.3) for name in ("stiffness", "damping")} | {"sigma_top": HalfNormal(0.01)}
-    shifted = FELikelihood(second.model, second.measurements, time_shifts={"top": 0.05})
-    prior |= {shifted.parameter_names[-1]: Uniform(-0.05, 0.05)}
-    with pytest.raises(ValueError, match=r"cannot emulate time shifts of channels.*Measurements\.shift"):
-        Posterior(JointLikelihood({"first": first, "second": shifted}), prior).guide()
-
-
 @pytest.mark.slow
 def test_ranks_of_the_truth_are_uniform(seed):
     """Simulation-based calibration: the truth is a draw of the prior, and so is the noise of each event."""

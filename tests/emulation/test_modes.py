@@ -23,6 +23,7 @@ from fe_likelihoods.emulation.levenberg_marquardt import _DIP, Ascent, Jacobians
 from fe_likelihoods.emulation.modes import (
     Mode,
     ModeSearch,
+    _end_of,
     ended,
     find_modes,
     unseen_share,
@@ -336,3 +337,9 @@ def test_channels_of_very_different_sizes():
     prior["sigma_base"] = Uniform(1e3, 1e6)
     mode = find_modes(Posterior(FELikelihood(model, measured), prior), starts=2, seed=1).modes[0]
     assert mode.converged and mode.parameters[:2] == pytest.approx([1.2, 0.9], rel=0.01)
+
+
+def test_starts_that_stand_for_each_other_have_an_end():
+    """The second start has taken the first one's place on the whole record, and lost its own on a first part."""
+    assert [_end_of(k, [1, 0, 1, -1, 4], {1}) for k in range(5)] == [1, 1, 1, -1, 4]
+    assert [_end_of(k, [1, 0], {}) for k in range(2)] == [0, 1]

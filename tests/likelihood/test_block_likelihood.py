@@ -138,13 +138,6 @@ def test_levels_per_event_and_joint_likelihoods(rng):
     assert [each.name for each in posterior.measured_data().channels] == list(draws.replicates)
 
 
-def test_time_shifts_are_those_of_the_samples(rng):
-    likelihood = FELikelihood(model(), measure(rng), time_shifts={"top": 0.3})
-    rows = np.hstack([STRUCTURAL, TWO, [[0.0], [0.13], [-0.2]]])
-    blocks = posterior_of(likelihood).block_log_likelihood(rows, 2.0)
-    assert np.allclose(blocks.values.sum(axis=1), likelihood.log_likelihood(rows), rtol=1e-6)
-
-
 def test_replicates_have_the_noise_of_the_sample(rng):
     posterior = posterior_of(FELikelihood(model(), measure(rng, missing=True)))
     rows = np.repeat([[1.0, 1.0, 0.5, 0.1]], 400, axis=0)

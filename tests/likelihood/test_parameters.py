@@ -13,7 +13,6 @@ from fe_likelihoods import (
     Measurements,
     problems,
 )
-from fe_likelihoods.noise.time_shifts import with_time_shifts
 
 CHANNELS = (Channel("top", "displacement", "mm"), Channel("base", "acceleration", "g"))
 
@@ -63,11 +62,6 @@ def test_only_multiples_have_a_nominal_value():
 )
 def test_units_of_noise_parameters(noise, units):
     assert [each.unit for each in likelihood(noise).parameters[3:]] == units
-
-
-def test_time_shifts_are_in_seconds():
-    noise = with_time_shifts(likelihood().noise, {"top": 0.02}, 0.01)
-    assert likelihood(noise).parameters[-1].label == "time_shift_top [s]"
 
 
 def test_noise_that_is_integrated_out_has_no_parameters():

@@ -287,25 +287,3 @@ def test_fingerprint_depends_on_parts_and_supports(three):
 def test_wrong_arguments_are_rejected(three, make, words):
     with pytest.raises(ValueError, match=words):
         make(three)
-
-
-def test_lags_of_recorders_shift_their_records_alone():
-    rng = np.random.default_rng(3)
-    motions = [np.concatenate([np.zeros(20), rng.standard_normal(200), np.zeros(20)]) for _ in range(3)]
-    right = [Record(f"s{k}", 0.01, each) for k, each in enumerate(motions)]
-    late = [*right[:2], Record("s2", 0.01, np.roll(motions[2], 7))]
-    theta = [3.0, 0.05, 0.7]
-    model = LinearStructure(BridgeDeck("deck"), late, lags=[2])
-    assert model.parameter_names[-1] == "lag_2" and model.fingerprint != LinearStructure(model.parts, late).fingerprint
-    expected = LinearStructure(BridgeDeck("deck"), right).simulate(theta)
-    np.testing.assert_allclose(model.simulate([*theta, 0.07]), expected, atol=1e-10)
-    np.testing.assert_array_equal(
-        model.with_record(right).simulate([*theta, 0.0]), LinearStructure(model.parts, right).simulate(theta)
-    )
-    part = model.first(1.0)
-    np.testing.assert_allclose(
-        part.simulate([*theta, 0.02]), model.simulate([*theta, 0.02])[:, : part.n_steps], atol=1e-10
-    )
-    for wrong in ([0, 1, 2], [3], [1, 1]):
-        with pytest.raises(ValueError, match="lags must be numbers of supports, from 0 to 2 and not all"):
-            LinearStructure(BridgeDeck("deck"), right, lags=wrong)

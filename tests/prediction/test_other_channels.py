@@ -170,18 +170,6 @@ def test_refusals_come_before_any_simulation(rng):
     assert not runs
 
 
-def test_a_measured_channel_keeps_its_unknown_time_shift(rng):
-    likelihood = FELikelihood(wave(MEASURED), measured(MEASURED), time_shifts={"low": 0.05, "drift": 0.05})
-    samples = np.hstack([drawn(FELikelihood(wave(MEASURED), measured(MEASURED)), rng), np.full((30, 2), 0.01)])
-    plain = FELikelihood(wave(MEASURED), measured(MEASURED))
-    for channels, shifted in ((ALL, ("low", "drift")), ((MIDDLE, TOP), ())):
-        ours = quiet(likelihood, samples, model=wave(channels), noise=True)
-        assert ours.shifted == shifted
-        np.testing.assert_array_equal(
-            ours.quantiles, quiet(plain, samples[:, :5], model=wave(channels), noise=True).quantiles
-        )
-
-
 def test_levels_per_event_are_means_of_the_channels_measured_in_the_event(rng):
     records = [Record(name, 0.02, rng.normal(size=n)) for name, n in (("EQ1", 61), ("EQ2", 51))]
     events = Events(records, rest=0.98)

@@ -1,0 +1,208 @@
+"""Faults that the samples of one sensor show by themselves: clipped, stuck, spikes, offset, drift, noise.
+
+All sizes are relative to the channel: its peak, its usual step from sample to sample, its neighbouring samples. So
+units, sampling rates and kinds of structures do not matter. The limits were set on the channels of five structures,
+without and with faults (``python -m benchmarks screening``); beside each limit is what right channels reach.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["SensorFault", "find_sensor_faults"]
+
+FEWEST = 50  # samples that are judged
+MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
+STILL = 5  # steps for which an extremum may stand still, and steps beside it; right channels: between small steps only
+ACTIVE, DIGITS = 0.02, 3.0  # the steps beside, in usual and in smallest steps; right: 0.02 (8 smallest), 0.11 (4)
+CLIPPED = 3  # equal samples at the largest or smallest value; right channels: 2
+LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
+SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
+LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, in peaks; right channels: 0.012
+SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
+STEADY = 0.5  # rate of a drift in the first and last third, as a share of the whole; after yielding: 0
+WHITE = 0.25  # largest autocorrelation at lags of one to six samples; right channels: 0.37; noise is 3/4 of the power
+WIDEST, AROUND, MOST_SPIKES = 3, 10, 200  # samples of a spike, samples around it that are looked at, and their number
+
+
+class SensorFault(NamedTuple):
+    """A fault of one channel."""
+
+    kind: str  # "clipped", "stuck", "spikes", "offset", "drift" or "noise"
+    spans: tuple[tuple[int, int], ...]  # first and last samples, both included
+    size: float  # of the peak, as the kind needs it [-]
+    level: tuple[float, ...] = ()  # offset, or drift at evenly spaced samples, the first and the last included
+
+
+def find_sensor_faults(values: np.ndarray, dimension: str = "") -> tuple[SensorFault, ...]:
+    """Faults of the samples (n,) of a channel, NaN where missing; each without the samples of faults found before it.
+
+    An acceleration returns to zero, and a displacement begins there; forces and strains of dead loads do not.
+    """
+    x, found = np.array(values, dtype=float), list[SensorFault]()
+    for kind, look in (("spikes", _spikes), ("clipped", _clipped), ("stuck", _stuck)):
+        if not _is_judged(x):
+            return tuple(found)
+        if spans := look(x):
+            found.append(SensorFault(kind, spans, sum(last - first + 1 for first, last in spans) / len(x)))
+            x = _without(x, spans)
+    if not _is_judged(x):
+        return tuple(found)
+    whole = ((0, len(x) - 1),)
+    peak, level = _peak(x), _baseline(x, dimension)
+    if level:
+        found.append(SensorFault("offset" if len(level) == 1 else "drift", whole, np.ptp((0.0, *level)) / peak, level))
+    correlation = _correlation(x)
+    if correlation < WHITE:
+        found.append(SensorFault("noise", whole, correlation))
+    return tuple(found)
+
+
+def _is_judged(x: np.ndarray) -> bool:
+    """Whether enough neighbouring samples are there, and not all equal."""
+    return bool(np.isfinite(np.diff(x)).sum() >= FEWEST and np.nanmax(x) > np.nanmin(x))
+
+
+def _peak(x: np.ndarray) -> float:
+    return float(np.nanmax(np.abs(x - np.nanmedian(x))))
+
+
+def _round_off(x: np.ndarray) -> float:
+    return 8.0 * float(np.spacing(np.nanmax(np.abs(x))))
+
+
+def _without(x: np.ndarray, spans: tuple[tuple[int, int], ...]) -> np.ndarray:
+    x = x.copy()
+    for first, last in spans:
+        x[first : last + 1] = np.nan
+    return x
+
+
+def _runs(true: np.ndarray) -> list[tuple[int, int]]:
+    """First index and index after the last of each run of true values."""
+    edges = np.diff(np.concatenate([[0], true.astype(int), [0]]))
+    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
+
+
+def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
+    """First and last samples of parts of equal samples between steep ones.
+
+    The top of a smooth wave is flat as well, but the steps beside it are small.
+    """
+    steps, equal = np.abs(np.diff(x)), _round_off(x)
+    known = steps[np.isfinite(steps)]
+    least = max(ACTIVE * float(np.sqrt(np.square(known).mean())), DIGITS * known[known > equal].min(initial=np.inf))
+    found = []
+    if np.count_nonzero(known > equal) < FEWEST:  # steps are what it consists of
+        return []
+    for first, last in _runs(steps <= equal):
+        sides = (steps[max(first - STILL, 0) : first], steps[last : last + STILL])
+        beside = [np.square(side[np.isfinite(side)]).mean() for side in sides if np.isfinite(side).any()]
+        if beside and min(beside) >= least**2:
+            found.append((first, last))
+    return found
+
+
+def _clipped(x: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Samples at the largest or smallest value, if several in a row have it between steep parts."""
+    equal, found = _round_off(x), list[tuple[int, int]]()
+    flat = _flat_parts(x)
+    for top in (np.nanmax(x), np.nanmin(x)):
+        at = np.abs(x - top) <= equal
+        if sum(last - first + 1 for first, last in flat if at[first]) >= CLIPPED:
+            found += [(first, stop - 1) for first, stop in _runs(at)]
+    return tuple(sorted(found))
+
+
+def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Samples at which the sensor stood still, or had only electronic noise for longer than a period of the motion."""
+    still, level = np.zeros(len(x), dtype=bool), float(np.nanstd(x))
+    for first, last in _flat_parts(x):
+        still[first : last + 1] |= last - first > STILL
+    period = 2.0 * np.pi * level / np.sqrt(np.nanmean(np.square(np.diff(x))))
+    length, beside = max(int(LONG * period), STILL + 1), max(int(0.5 * period), 3)
+    if len(x) > 2 * (length + beside):
+        quiet, sides = _moving_deviation(x, length), _moving_deviation(x, beside)
+        for least in MATTERS * 2.0 ** np.arange(4):
+            for start, stop in _runs(quiet <= least * level / VANISHED):
+                first, after = start, stop - 1 + length
+                if first >= beside and after + beside <= len(x):
+                    found = np.minimum(sides[first - beside], sides[after])
+                    still[first:after] |= bool(
+                        np.isfinite(found) and found >= least * level and not still[start:stop].any()
+                    )
+    return tuple((first, stop - 1) for first, stop in _runs(still))
+
+
+def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:
+    """Standard deviations (n - length + 1,) of the parts of this length, inf where a sample is missing."""
+    y, window = np.where(np.isfinite(x), x - np.nanmean(x), 0.0), np.ones(length) / length
+    mean, square, there = (np.convolve(each, window, "valid") for each in (y, np.square(y), np.isfinite(x)))
+    return np.where(there > 1.0 - 0.5 / length, np.sqrt(np.maximum(square - np.square(mean), 0.0)), np.inf)
+
+
+def _spikes(x: np.ndarray) -> tuple[tuple[int, int], ...]:
+    """Up to three neighbouring samples that are off by the same amount, far more than the samples around them.
+
+    Errors are those of cubic interpolation from the neighbours. A spike has a known pattern of errors, whose size is
+    fitted; what remains around it is what the signal itself does there.
+    """
+    cubic = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0  # a sample less the cubic through its four neighbours
+    x, found = x.copy(), list[tuple[int, int]]()
+    for _ in range(MOST_SPIKES):
+        peak, best = _peak(x), (SPIKE, 0, 0)
+        errors = np.convolve(x, cubic, "same")
+        errors[:2] = errors[-2:] = np.nan
+        there = np.isfinite(errors)
+        errors = np.where(there, errors, 0.0)
+        for width in range(1, WIDEST + 1):
+            pattern = np.convolve(np.ones(width), cubic)
+            pattern = np.pad(pattern, AROUND - 2)
+            size, window = np.correlate(errors, pattern, "same") / (pattern @ pattern), np.ones(len(pattern))
+            left = np.convolve(np.square(errors), window, "same") - np.square(size) * (pattern @ pattern)
+            count = np.convolve(there, window, "same")
+            noise = np.sqrt(np.maximum(left, 0.0) / np.maximum(count - 1.0, 1.0)) + 1e-4 * peak
+            ratio = np.where((np.abs(size) > MATTERS * peak) & (count > AROUND), np.abs(size) / noise, 0.0)
+            k = int(np.argmax(ratio))
+            best = max(best, (float(ratio[k]), k - width // 2, width))
+        _, first, width = best
+        if not width:
+            break
+        found.append((max(first, 0), min(first + width, len(x)) - 1))
+        x = _without(x, (found[-1],))
+        if np.nanmax(x) == np.nanmin(x):  # a pulse is all there is
+            return ()
+    return tuple(sorted(found))
+
+
+def _baseline(x: np.ndarray, dimension: str) -> tuple[float, ...]:
+    """Offset, or values at the ends (and in the middle) of a drift; empty if there is neither.
+
+    A part of a right channel has a mean near zero. A structure that keeps a residual displacement starts from zero, and
+    does not move at the end.
+    """
+    parts = np.array([np.nan if np.isnan(part).all() else np.nanmean(part) for part in np.array_split(x, 10)])
+    places, parts = np.linspace(-0.9, 0.9, 10)[np.isfinite(parts)], parts[np.isfinite(parts)]
+    peak, spread = _peak(x), np.square(parts - parts.mean()).sum()
+    returns, first = dimension in ("acceleration", "velocity"), float(np.mean(x[np.isfinite(x)][:STILL]))
+    third = len(parts) // 3
+    for degree in (1, 2) if len(parts) > 4 else ():
+        line = np.polynomial.Polynomial.fit(places, parts, degree, domain=[-1, 1])
+        ends = line(np.linspace(-1.0, 1.0, degree + 1))
+        smooth = np.square(parts - line(places)).sum() < (1.0 - SMOOTH) * spread
+        # a structure that yields moves in the strong part of the motion alone
+        rates = [np.polyfit(places[part], parts[part], 1)[0] for part in (slice(third + 1), slice(-third - 1, None))]
+        steady = degree == 1 and min(2.0 * rate / (ends[1] - ends[0]) for rate in rates) > STEADY
+        if np.ptp(line(places)) > LEVEL * peak and smooth and (returns or steady):
+            return tuple(ends.tolist())
+    level = parts if returns else np.append(parts, first)
+    large = np.abs(level).min() > LEVEL * peak and (np.sign(level) == np.sign(level[0])).all()
+    if large and (returns or dimension in ("displacement", "rotation")):
+        return (float(np.median(parts)) if returns else first,)
+    return ()
+
+
+def _correlation(x: np.ndarray) -> float:
+    """Largest autocorrelation at the first lags, without sign."""
+    x = np.where(np.isfinite(x), x - np.nanmean(x), 0.0)
+    return max(abs(float(x[k:] @ x[:-k])) for k in range(1, 7)) / float(x @ x)
