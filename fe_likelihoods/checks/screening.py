@@ -99,8 +99,10 @@ class Screened(NamedTuple):
 
 
 def screen(measurements: Measurements) -> list[Screened]:
-    """Faults of every channel of measurements that has any."""
-    found = []
+    """Faults of every channel of measurements that has any; none of data without time, such as modes."""
+    found = list[Screened]()
+    if not measurements.is_history:
+        return found
     rows = zip(measurements.channels, measurements.steps, measurements.starts, measurements.values, strict=True)
     for channel, step, start, values in rows:
         shown = from_si(values, channel.unit)

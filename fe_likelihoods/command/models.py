@@ -112,6 +112,7 @@ def _truth(job: Job, posterior: Posterior, record: Record | None) -> dict[str, f
     if "bundled" not in job.measurements or job.kind not in ("column", "bridge"):
         return None
     model = posterior.likelihood.model
+    model = model.model if isinstance(model, SensedModel) else model
     usual = type(model).lhpost(record) if job.kind == "column" else type(model)(record)
     truth = read_bundled(job, "measurements").attributes["truth"]
     changed = {name for name, value in usual.nominal.items() if not math.isclose(model.nominal[name], value)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, Events, Measurements, Record, check_data
-from fe_likelihoods.checks.screening import check_noise_prior, check_steps_of_mass
+from fe_likelihoods.checks.screening import check_noise_prior, check_steps_of_mass, screen
 
 TOP, DECK = Channel("top", "displacement", "mm"), Channel("deck", "acceleration", "g")
 TIMES = 0.02 * np.arange(500)
@@ -23,6 +23,13 @@ def test_plausible_data_are_left_alone():
     gappy = VALUES.copy()
     gappy[0, 10:20] = np.nan
     assert kinds(gappy) == []
+
+
+def test_data_without_time_are_not_screened_for_faults_of_sensors():
+    values = np.full((2, 500), np.nan)
+    values[0], values[1] = VALUES[0] + 10.0, VALUES[1]
+    assert len(screen(Measurements([TOP, DECK], 0.02, values))) == 1
+    assert screen(Measurements([TOP, DECK], 0.02, values, axis="position")) == []
 
 
 @pytest.mark.parametrize(
