@@ -109,10 +109,10 @@ def check_run(
 
 
 def _of_one_event(run: FinishedRun) -> tuple[str, ...]:
-    """The structural parameters of a run with the data of one event; none for several, or without data."""
+    """The structural parameters of a run with the history of one event; none for several, or for other data."""
     parts = [] if run.likelihood is None else [likelihood for likelihood, _ in run.likelihood.parts()]
     events = [find_events(likelihood.model) for likelihood in parts]
-    is_one = len(parts) == 1 and (events[0] is None or len(events[0].names) == 1)
+    is_one = len(parts) == 1 and has_steps(run.likelihood) and (events[0] is None or len(events[0].names) == 1)
     return tuple(parts[0].model.parameter_names) if is_one else ()
 
 
