@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from . import bridge, column, cost, executors, few_simulations, growth, job, samplers, screening, startup, truth
+from . import badge, bridge, column, cost, executors, few_simulations, growth, job, samplers, screening, startup, truth
 from .comparison import compare
 from .rows import as_table, machine, write_json
 
 BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
+    "badge": badge.badge,
     "simulation": column.simulation,
     "batch": column.batch,
     "sensors": column.sensors,
@@ -34,6 +35,7 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "few_simulations_coverage": few_simulations.coverage,
 }
 QUICK: dict[str, dict[str, Any]] = {
+    "badge": {"structures": ("Meloland",)},
     "job": {"limit": 20.0},
     "truth": {"families": ("sharp", "two"), "ratios": (1.0,), "walkers": (200,)},
     "samplers": {"targets": ("T3",)},

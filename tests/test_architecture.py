@@ -271,16 +271,11 @@ def test_defaults_of_settings_are_written_once():
 
 
 CHECKS = ("samplers/judgement/", "fe_likelihoods/checks/")
-# limits of effort, of a search, and of what is printed: they end work, and judge nothing
-EFFORT = {"FEWEST_DRAWS", "KEPT_APART", "LARGEST_TEST", "LATE_SHARE", "LONGEST_LAG", "LONGEST_SHARE", "MOST_DRAWS"} | {
-    "MOST_FAULTS",
-    "MOST_PLACES",
-    "MOST_SEARCHED",
-    "MOST_SPIKES",
-    "MOST_STORED",
-    "MOST_VALUES",
-    "SECONDS",
-    "TEST_SECONDS",
+# limits of effort, settings of a search, of an estimate, and of what is printed: they judge nothing
+EFFORT = {"EQUALLY_NEAR", "FEWEST", "FEWEST_DRAWS", "FINE", "FLOOR", "KEPT_APART", "LARGEST_TEST", "LATE_SHARE"} | {
+    *("LONGEST_LAG", "LONGEST_SHARE", "MOST_DRAWS", "MOST_FAULTS", "MOST_SEARCHED"),
+    *("MOST_PLACES", "MOST_SPIKES", "MOST_STORED", "MOST_VALUES"),
+    *("NEAR_ENOUGH", "SAME_UNITS", "SECONDS", "SMOOTH", "TAPER", "TEST_SECONDS"),
 }
 MAKERS = {"Finding", "warnings.warn", "logger.warning"}
 

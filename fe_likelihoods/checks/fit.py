@@ -1,44 +1,55 @@
 """Findings about a fit: does the model follow the measurements at all, and what would explain it if not?"""
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Container, Iterable, Sequence
 from math import comb
 from typing import Any
 
 import numpy as np
 
+from ..likelihood.parameters import Parameter
 from ..likelihood.posterior import Posterior
-from ..noise.residuals import ResidualChecks
+from ..noise.residuals import ResidualChecks, residual_checks
 from ..priors.between_events import spread_of
 from ..priors.points import as_points
 from ..signals.error_measures import relative_errors
+from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
 from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal_faults import check_modes
+from .slow_motion import find_slow_faults, slow_motions
+from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
 
 __all__ = [
     "SAME_AS_PRIOR",
+    "check_damping",
     "check_fit",
     "check_other_events",
     "check_parameters",
     "check_residuals",
     "check_responses",
+    "check_supports",
     "describe_residuals",
+    "limits_of_model",
     "residual_sentence",
 ]
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
-# RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of a response that is clearly worse
-# than zero
-LARGE_ERROR, USELESS_ERROR = 0.5, 1.2
+# RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of one that is not (half of it)
+LARGE_ERROR, USELESS_ERROR = 0.5, 0.5**0.5
+LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
+LARGE_RATIO = 5.0  # of root mean squares; up to 2.5 between supports of two bridges, and 9.8 between m/s² and g
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
 # Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
 OFFSET = 0.5
+REVERSED = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
+CLOCKS = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
 
 
 def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
@@ -62,17 +73,21 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
     >>> for finding in check_fit(posterior, sampler.get_chain(flat=True)):
     ...     print(finding.severity, finding)
     """
-    points, rows = draws_to_compare(posterior), []
+    points, found = draws_to_compare(posterior), []
     if samples is not None:
         samples = as_points(samples, posterior.prior.names)
         points = np.concatenate([samples.mean(axis=0)[None], points])
         none = np.full(posterior.ndim, np.nan)
         rows = rows_of(posterior.parameters, posterior.prior, Moments.of_samples(samples, none, none), none)
+        limits = limits_of_model(posterior.likelihood, posterior.parameters, rows, points[0])
+        found += check_parameters(rows, limits)
     compared: list[Compared] = []
     for key, likelihood, columns in data_sets_of(posterior):
         own = None if samples is None else samples[:, columns]
         compared += compare(likelihood, points[:, columns], samples is not None, key, own)
-    return (*check_responses(compared), *check_parameters(rows))
+        found += check_supports(likelihood.model)
+        found += [] if samples is None else check_damping(likelihood.model, points[0, columns], compared)
+    return (*check_responses(compared), *found)
 
 
 def check_responses(compared: Iterable[Compared]) -> list[Finding]:
@@ -84,42 +99,65 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
         faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
-        found += [_of_a_fault(each, fault, WRONG) for fault in faults]
+        slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each)}
+        if any(fault.kind == "input lag" for fault in faults):  # of which the outputs' lags are a consequence
+            slow = {key: fault for key, fault in slow.items() if key[0] != "lag"}
+        for fault in faults:
+            own = [slow.pop((fault.kind, name))[0].value for name in fault.names if (fault.kind, name) in slow]
+            found.append(_of_a_fault(each, fault._replace(value=float(np.median(own))) if own else fault, WRONG))
+        found += [_of_a_fault(each, fault, WRONG, band) for fault, band in slow.values()]
         if each.fitted:
             parts = {name: values[each.draws] for name, values in each.parts.items()}
             before = find_faults(each.measurements, each.responses[each.draws], parts)
-            known = {fault.kind for fault in faults}
+            known = {fault.kind for fault in (*faults, *(fault for fault, _ in slow.values()))}
             found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
-    far = not found
+    unexplained = all(each.severity != WRONG for each in found)
     for each in compared:
         found += _check_offset(each) if each.fitted and each.measurements.is_history else []
-    return found + _check_errors(compared, far) + [fault for each in modal for fault in check_modes(each)]
+    return found + _check_errors(compared, unexplained) + [fault for each in modal for fault in check_modes(each)]
+
+
+def check_supports(model: Any) -> list[Finding]:
+    """Motions of the supports of one structure whose sizes differ as units do."""
+    motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
+    levels = np.sqrt([np.square(each.acceleration).mean() for each in motions])
+    moving = [k for k, level in enumerate(levels) if level]
+    middle = float(np.median(levels[moving])) if moving else 0.0
+    far = [k for k in moving if not middle / LARGE_RATIO < levels[k] < middle * LARGE_RATIO]
+    if not far:
+        return []
+    shown = listed([f"{motions[k].name} ({levels[k] / middle:.2g} times)" for k in far])
+    text = f"The motion of a support is far larger or smaller than the motions of most supports: {shown}."
+    action = "Check the unit and the gain of its file."
+    return [Finding("A unit may be wrong", WRONG, text, action, {motions[k].name: levels[k] / middle for k in far})]
 
 
 def _where(names: Sequence[str], compared: Compared | Fit) -> str:
     return f"{listed(list(names))}{f' ({compared.title})' if compared.title else ''}"
 
 
-def _of_a_fault(compared: Compared, fault: Fault, severity: str) -> Finding:
-    """A fault in words; one that limits a fit was seen among draws of the prior alone."""
+def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[float, float] | None = None) -> Finding:
+    """A fault in words, and the band [Hz] in which it was found; one that limits a fit was seen among draws alone."""
     where, numbers = _where(fault.names, compared), {"before": fault.before, "after": fault.after}
     better = f"the error (RRMSE) is {percent(fault.after)} instead of {percent(fault.before)}"
     better += "" if severity == WRONG else " for the best draw of the prior; the fit may make up for it"
+    if band is not None:
+        better += f" between {band[0]:.2g} and {band[1]:.2g} Hz, where parameters hardly change the response"
     which = "measurements" if len(fault.names) > 1 else "measurement"
     late = f"{abs(fault.value):.3g} s {'later' if fault.value > 0.0 else 'earlier'}"
     if fault.kind == "factor":
         dimensions = sorted({each.dimension for each in compared.measurements.channels if each.name in fault.names})
         units = " or ".join(filter(None, dict.fromkeys(describe_unit(fault.value, each) for each in dimensions)))
-        kind = "A unit may be wrong"
+        kind = "A unit may be wrong" if units else "A gain may be wrong"
         text = (
             f"Responses times {fault.value:.3g} fit the {which} of {where} much better: {better}. The {which} and the "
             f"model differ by this factor{f', about the ratio of {units}' if units else ''}."
         )
-        action = "Check the unit of the file, of the model (it returns SI units) and of the base motion."
+        action = "Check the gain of the sensor, and the units of file, model (it returns SI units) and base motion."
     elif fault.kind == "sign":
         kind = "A sign may be wrong"
         text = f"Response and measurements have opposite signs: {where}; with the other sign, {better}."
-        action = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
+        action = REVERSED
     elif fault.kind == "swap":
         kind = "Channels may be swapped"
         text = f"The channels {where} may be exchanged: the other way round, {better}."
@@ -139,7 +177,7 @@ def _of_a_fault(compared: Compared, fault: Fault, severity: str) -> Finding:
         verb = "are" if len(fault.names) > 1 else "is"
         text = f"The {which} of {where} {verb} {late} than the response: with this lag, {better}."
         text += " The clock of a support's recorder may be the wrong one as well." if compared.parts else ""
-        action = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
+        action = CLOCKS
     return Finding(kind, severity, text, action, numbers | {fault.kind: fault.value})
 
 
@@ -164,15 +202,14 @@ def _check_offset(compared: Compared) -> list[Finding]:
     return [Finding("A measurement may have an offset or a drift", CARE, text, action, large)]
 
 
-def _check_errors(compared: Sequence[Compared], far_matters: bool) -> list[Finding]:
-    """Channels that the fit, or the best of several draws of the prior, does not reproduce."""
+def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Finding]:
+    """Channels that the fit, or the best draw of the prior, does not reproduce, where no fault explains it."""
     found: list[Finding] = []
     useless, poor, far = {}, {}, {}
     for each in compared:
         errors = np.nan_to_num(relative_errors(each.measurements.values - each.responses, each.measurements.values))
         levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
         closest = int(np.argmin(levels))
-        best = errors[0 if each.fitted else closest]
         if each.fitted and levels[closest] < BETTER_THAN_A_FIT * levels[0] and (errors[0] > LARGE_ERROR).any():
             text = (
                 f"Another response that was simulated fits much better{f' ({each.title})' if each.title else ''}: its "
@@ -181,27 +218,26 @@ def _check_errors(compared: Sequence[Compared], far_matters: bool) -> list[Findi
             )
             action = "The sampler or the search may have missed the best fit, or the noise prefers another one."
             found.append(Finding("The fit is not the best one known", CARE, text, action))
-        for channel, error in zip(each.measurements.channels, best.tolist(), strict=True):
-            place = _where([channel.name], each)
+        for row, channel in enumerate(each.measurements.channels):
+            place, error = _where([channel.name], each), float(errors[0 if each.fitted else closest, row])
             if not each.fitted:
                 far |= {place: error} if error > EXPLAINED else {}
             elif error > LARGE_ERROR:
-                (useless if error > USELESS_ERROR else poor)[place] = error
+                noise = _is_noise(each.measurements.values[[row]] - each.responses[0, [row]])
+                useless |= {place: error} if error > USELESS_ERROR and not noise else {}
+                poor |= {place: error} if (error > USELESS_ERROR) == noise else {}
 
     def shown(errors: dict[str, float]) -> str:
         return listed([f"{place} ({percent(error)})" for place, error in errors.items()])
 
-    action = (
-        "If the signal is not small against its noise, check units, signs, time offsets and the channel's place in "
-        "the model before you interpret the parameters."
-    )
-    if useless:
-        text = f"After the update, the error (RRMSE) is larger than that of a response of zero: {shown(useless)}."
+    action = "Check units, signs, clocks and the place of the sensor in the model; or the model lacks what moves it."
+    if useless and unexplained:
+        text = f"After the update, the model explains less than half of the power of {shown(useless)} (error, RRMSE)."
         found.append(Finding("The model does not follow the measurements", WRONG, text, action, useless))
-    if poor:
+    if poor and unexplained:
         text = f"After the update, the relative error (RRMSE) is still large: {shown(poor)}."
         found.append(Finding("A channel is hardly reproduced", CARE, text, action, poor))
-    if far and far_matters:
+    if far and unexplained:
         text = f"No draw of the prior comes near the measurements; the best one has an error (RRMSE) of {shown(far)}."
         action = (
             "Check the model and the priors. A model of your own must return SI units (m, m/s², N, Pa, rad), whatever "
@@ -211,20 +247,80 @@ def _check_errors(compared: Sequence[Compared], far_matters: bool) -> list[Findi
     return found
 
 
-def check_parameters(rows: Sequence[ParameterRow]) -> list[Finding]:
-    """Parameters at bounds, far from their prior or not informed, and missed true values."""
-    found, edges = [], []
-    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
-    for row in (row for row in rows if row not in flat):  # where the data say little, the prior is at its own edge
+def _is_noise(residuals: np.ndarray) -> bool:
+    """Whether the residuals (1, n_samples) of a channel are white and normal, so that no model explains more."""
+    try:
+        checks = residual_checks(residuals)
+    except ValueError:  # hardly any sample
+        return True
+    return abs(checks.lag_one[0]) < WEAK and checks.normal[0] > SMALL_PROBABILITY
+
+
+def edges(rows: Sequence[ParameterRow]) -> dict[str, tuple[str, float, float]]:
+    """Parameters that the data push to a bound of their prior: label, bound, and a value beyond it, by name."""
+    found = {}
+    for row in (row for row in rows if row.sd <= SAME_AS_PRIOR * row.prior_sd):  # else the prior is at its own edge
         near = NEAR_BOUND * np.nanmin([row.high - row.low, row.prior_sd])
-        edges += [f"{row.label} at {row.lower:.4g}"] if row.low - row.lower < near else []
-        edges += [f"{row.label} at {row.upper:.4g}"] if row.upper - row.high < near else []
-    if edges:
-        text = f"The posterior reaches the edge of its prior: {listed(edges)}. The bound, not the data, ends it there."
-        action = (
-            "If the bound is physical, nothing is wrong. Otherwise widen the prior, and ask what the parameter makes "
-            "up for in the model."
-        )
+        for bound, distance, side in ((row.lower, row.low - row.lower, -1.0), (row.upper, row.upper - row.high, 1.0)):
+            if distance < near:
+                found[row.name] = (row.label, bound, bound + side * NEAR_BOUND * row.prior_sd)
+    return found
+
+
+def limits_of_model(
+    likelihood: Any, parameters: Sequence[Parameter], rows: Sequence[ParameterRow], point: np.ndarray
+) -> set[str]:
+    """Names of `edges` beyond which the model, or the noise, is not defined: it fails at `point` (ndim,) with them."""
+    found, names = set(), [row.name for row in rows]
+    for name, (_, _, beyond) in edges(rows).items():
+        i, moved = names.index(name), np.array(point)
+        moved[i] = beyond * parameters[i].factor
+        for part, columns in likelihood.parts():
+            n = len(part.model.parameter_names)
+            if i in columns[:n]:  # not by the likelihood, which would count a failure
+                found |= {name} if simulate_batch(part.model, moved[None, columns[:n]]).reasons[0] else set()
+            elif i in columns:
+                found |= set() if part.possible(moved[None, columns])[0] else {name}
+    return found
+
+
+def check_damping(model: Any, theta: np.ndarray, compared: Iterable[Compared]) -> list[Finding]:
+    """Damping ratios at the structural parameters (n_parameters,) that no structure has by itself.
+
+    Where gain and clock of every channel are known to be right, the ratio makes up for neither, and limits nothing.
+    """
+    large = {}
+    for name, value in zip(model.parameter_names, theta.tolist(), strict=False):
+        own = 1.0 if hasattr(model, "supports") else getattr(model, "damping_ratio", None)
+        ratio = value * getattr(model, "nominal", {}).get(name, np.nan if own is None else own)
+        if re.fullmatch(r"damping(_\d+)?", name) and ratio > LARGE_DAMPING:
+            large[name] = ratio
+    if not large:
+        return []
+    compared = [each for each in compared if not each.modal]
+    known = all(
+        len(slow_motions(each)) == each.measurements.n_channels and not find_slow_faults(each) for each in compared
+    )
+    text = f"The damping ratio of the fit is {listed([f'{ratio:.2g} ({name})' for name, ratio in large.items()])}."
+    if known:
+        text += " It does not make up for gains or clocks, which are right where parameters hardly change the response."
+        action = "Ask where the energy goes: soil and abutments radiate it, and other modes look like damping."
+        return [Finding("The damping is large", NOTE, text, action, large)]
+    action = "Damping makes up for a gain, a clock or a sensor that was stuck. Look at the data and at the model."
+    return [Finding("The damping is not plausible", WRONG, text, action, large)]
+
+
+def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) -> list[Finding]:
+    """Parameters at bounds, far from their prior or not informed, and missed true values.
+
+    The bounds of the names in `limits` are limits of the model as well, and end a posterior rightly.
+    """
+    found = []
+    flat = [row for row in rows if row.sd > SAME_AS_PRIOR * row.prior_sd]
+    at = [f"{label} at {bound:.4g}" for name, (label, bound, _) in edges(rows).items() if name not in limits]
+    if at:
+        text = f"The posterior reaches the edge of its prior: {listed(at)}. The bound, not the data, ends it there."
+        action = "Widen the prior, and ask what the parameter makes up for in the model."
         found.append(Finding("At the edge of the prior", CARE, text, action))
     if flat:
         names = listed([row.label for row in flat])
@@ -279,7 +375,7 @@ def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
 
 
 def check_residuals(fits: Fits) -> list[Finding]:
-    """How much successive errors depend on each other, which widens standard deviations, and whether they are normal.
+    """How much successive errors depend on each other, which widens standard deviations.
 
     Residuals of real measurements are always correlated, so that this alone limits no result.
     """
@@ -289,26 +385,19 @@ def check_residuals(fits: Fits) -> list[Finding]:
     assumed = sum(each.assumed for _, each in checked)
     independent = [min(each.checks.n_effective[0], each.assumed) for _, each in checked if _is_coloured(each)]
     worth = sum(independent) + sum(each.assumed for _, each in checked if not _is_coloured(each))
-    found = []
     factor = float(np.sqrt(assumed / worth)) if coloured else 1.0
-    if round(factor, 1) > 1.0:
-        text = (
-            f"The errors of {listed(coloured)} are correlated: where the noise takes {assumed:.0f} samples for "
-            f"independent, they are worth {worth:.0f}, so that standard deviations from the data are too small by a "
-            f"factor of about {factor:.2g}."
-        )
-        action = (
-            "Use the wider standard deviations. Compare with AutoregressiveNoise (in a TOML file: kind = "
-            '"autoregressive" in [noise]), with GaussianNoise with bands of frequency (groups = [1.0, 5.0]) or with '
-            "effective_samples=, and look at the residuals for an effect that the model lacks."
-        )
-        found.append(Finding(CORRELATED, NOTE, text, action, {"factor": factor}))
-    strange = [_where([each.channel.name], fit) for fit, each in checked if each.checks.normal[0] < SMALL_PROBABILITY]
-    if strange:
-        text = f"The residuals of {listed(strange)} have heavier tails, or are more skew, than a normal distribution."
-        action = "Look for spikes, clipped samples, or parts of the record that the model does not reproduce."
-        found.append(Finding("The errors are not normal", NOTE, text, action))
-    return found
+    if round(factor, 1) <= 1.0:
+        return []
+    text = (
+        f"The errors of {listed(coloured)} are correlated: the noise takes {assumed:.0f} samples for independent that "
+        f"are worth {worth:.0f}. Standard deviations from the data are too small by a factor of about {factor:.2g}."
+    )
+    action = (
+        "Use the wider standard deviations. Compare with AutoregressiveNoise (in a TOML file: kind = "
+        '"autoregressive" in [noise]), with GaussianNoise with bands of frequency (groups = [1.0, 5.0]) or with '
+        "effective_samples=, and look at the residuals for an effect that the model lacks."
+    )
+    return [Finding(CORRELATED, NOTE, text, action, {"factor": factor})]
 
 
 def _is_coloured(each: ChannelFit) -> bool:

@@ -22,7 +22,7 @@ from ..signals.events import Events
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
 from .finding import CARE, WRONG, Finding, by_severity
-from .fit import check_responses, compare, draws_to_compare
+from .fit import check_responses, check_supports, compare, draws_to_compare
 from .screening import check_data, check_gaps
 from .steps import (
     NOTHING,
@@ -127,6 +127,7 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
                 chance = _check_chance(batch.response[0], later)
             # where responses differ by chance, other differences say nothing
             found += chance or _check_motions(stage, likelihood.model, theta, batch.response[0], events or {})
+            found += check_supports(likelihood.model)
             found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
             found += check_gaps(likelihood.noise)
             seconds += stage.seconds

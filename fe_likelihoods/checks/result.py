@@ -13,9 +13,18 @@ from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, fit_data_sets
 from .failed_simulations import Failures, failures
 from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
-from .fit import check_other_events, check_parameters, check_residuals, check_responses
+from .fit import (
+    check_damping,
+    check_other_events,
+    check_parameters,
+    check_residuals,
+    check_responses,
+    check_supports,
+    limits_of_model,
+)
 from .run import FinishedRun, read_run
 from .screening import check_data, check_gaps
+from .slow_motion import slow_motions
 from .steps import (
     StepTest,
     check_stronger_motion,
@@ -97,8 +106,14 @@ def check_run(
     found = _check_sampling(run) + _check_chain(run) + _check_failures(run, failed)
     for text in fits.failures:
         found.append(Finding("A response is missing", CARE, f"{text}.", "Use another point or mend the model."))
-    found += check_responses(fits.compared) + ([] if run.is_inconclusive else check_parameters(rows)) + model.findings
-    for likelihood, _ in [] if run.likelihood is None else run.likelihood.parts():
+    found += check_responses(fits.compared) + model.findings
+    if not run.is_inconclusive:
+        known = run.likelihood is not None
+        limits = limits_of_model(run.likelihood, run.parameters, rows, run.centre) if known else set()
+        found += check_parameters(rows, limits)
+    for likelihood, columns in [] if run.likelihood is None else run.likelihood.parts():
+        found += [] if run.is_inconclusive else check_damping(likelihood.model, run.centre[columns], fits.compared)
+        found += check_supports(likelihood.model)
         found += check_data(likelihood.measurements, motions_to_replace(likelihood.model))
         found += check_gaps(likelihood.noise) + _check_range(likelihood)
     if not run.is_inconclusive and all(each.severity != WRONG for each in found):  # a fault explains the residuals
@@ -121,6 +136,17 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
     responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
+    slow, unknown = [], []
+    for each in (each for each in fits.compared if not each.modal):
+        known = slow_motions(each)
+        for channel in each.measurements.channels:
+            where = f"{channel.name} ({each.title})" if each.title else channel.name
+            if channel.name in known:
+                slow.append(f"{where} ({known[channel.name].lowest:.2g} to {known[channel.name].highest:.2g} Hz)")
+            else:
+                unknown.append(where)
+    gains = [", ".join(slow)] if slow else []
+    gains += [f"not tested: {', '.join(unknown)}, which parameters or noise change everywhere"] if unknown else []
     return [
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
@@ -128,6 +154,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
             "Units, signs, clocks, swapped channels" if has_steps(run.likelihood) else "Units, signs, swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
+        ("Gains and clocks where parameters change nothing", "; ".join(gains) or "not tested: there is no response"),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 

@@ -19,7 +19,7 @@ from ..likelihood.posterior import Posterior
 from ..signals.events import motions_of
 from ..signals.records import Record
 from ..simulation.model import SimulationBatch
-from .finding import CARE, NOTE, WRONG, Finding
+from .finding import CARE, WRONG, Finding
 
 __all__ = [
     "NOTHING",
@@ -56,9 +56,7 @@ class StepTest(NamedTuple):
 
 def not_tested(why: str) -> StepTest:
     """No test of step and mesh, and the reason."""
-    action = "Halve step and mesh in the model at the posterior mean, and compare the responses with the noise."
-    text = f"{why[0].upper()}{why[1:]}."
-    return StepTest([Finding("Step and mesh were not tested", NOTE, text, action)], {STEP: f"not tested: {why}"})
+    return StepTest([], {STEP: f"not tested: {why}"})
 
 
 def has_steps(likelihood: Any) -> bool:
@@ -98,10 +96,6 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
     found = []
     for (_, what), change in changes.items():
         found += _compare(what, change, parts, sd, prior_sd, posterior.parameter_names)
-    if left:
-        text = "; ".join(f"{name.lower()}: {why}" for name, why in left.items())
-        action = "Halve it in the model, and compare the responses with the noise."
-        found.append(Finding("Step and mesh were not tested", NOTE, f"{text[0].upper()}{text[1:]}.", action))
     halved = {name: f"{what} was halved at the fit" for name, what in changes}
     return StepTest(found, halved | {name: f"not tested: {why}" for name, why in left.items()})
 

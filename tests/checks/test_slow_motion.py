@@ -1,0 +1,161 @@
+"""Gains, signs and clocks are known where no parameter changes the response, whatever a fit makes of them."""
+
+import numpy as np
+import pytest
+
+from fe_likelihoods import (
+    BridgeDeck,
+    FELikelihood,
+    HalfNormal,
+    LinearOscillator,
+    LinearStructure,
+    Measurements,
+    Posterior,
+    Record,
+    ShearFrame,
+    Uniform,
+    check_fit,
+)
+from fe_likelihoods.checks.compared import Compared
+from fe_likelihoods.checks.fit import check_damping, check_responses, check_supports
+from fe_likelihoods.checks.slow_motion import compare_slow_motion
+
+STEP, TIME = 0.01, 0.01 * np.arange(2000)
+PRIOR = {"frequency": Uniform(0.5, 10.0), "damping": Uniform(0.005, 0.8), "share": Uniform(0.0, 1.0)}
+
+
+def motions(rng, n=3):
+    """Motions that are alike where they are slow, as those of the supports of a short bridge."""
+    envelope = np.exp(-(((TIME - 8.0) / 4.0) ** 2))
+    kernel = np.hanning(30)
+    common = np.convolve(rng.standard_normal(len(TIME)), kernel, "same")
+    own = [np.convolve(rng.standard_normal(len(TIME)), np.diff(kernel, 2), "same") for _ in range(n)]
+    return [Record(f"support {k}", STEP, envelope * (common + 30.0 * each)) for k, each in enumerate(own)]
+
+
+def deck(rng):
+    return LinearStructure(BridgeDeck("deck"), motions(rng))
+
+
+def draws_of(model, rng, n=40):
+    low, high = np.array([0.5, 0.005, 0.0]), np.array([10.0, 0.8, 1.0])
+    return np.stack([model.simulate(low + (high - low) * rng.random(3))[0] for _ in range(n)])
+
+
+def later(values, steps):
+    return np.concatenate([np.zeros(steps), values[: len(values) - steps]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("gain", "steps"), [(1.0, 0), (0.5, 0), (2.0, 0), (-1.0, 0), (9.80665, 0), (1.0, 5), (0.5, 40)]
+)
+def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps):
+    rng = np.random.default_rng(seed)
+    model = deck(rng)
+    draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
+    noise = np.convolve(rng.standard_normal(len(true)), np.ones(4) / 2.0, "same")
+    measured = gain * later(true, steps) + 0.05 * abs(gain) * true.std() * noise
+    gappy = np.where(np.abs(TIME - 7.3) < 0.3, np.nan, measured)
+    for values in (measured, gappy):
+        found = compare_slow_motion(values, draws, STEP)
+        # draws and truth agree to a tenth
+        assert np.sign(found.gain) == np.sign(gain) and abs(np.log(found.gain / gain)) < 0.1 + 4.0 * found.error
+        assert abs(found.lag - STEP * steps) < 0.01 + 4.0 * found.lag_error
+        assert found.coherence > (0.95 if values is measured else 0.8) and found.highest < 4.5
+
+
+def test_errors_of_gain_and_lag_are_as_stated():
+    rng = np.random.default_rng(1)
+    model = deck(rng)
+    draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
+    clean, scores = compare_slow_motion(true, draws, STEP), []
+    for _ in range(60):
+        noisy = compare_slow_motion(true + 0.5 * true.std() * rng.standard_normal(len(true)), draws, STEP)
+        scores.append([np.log(noisy.gain / clean.gain) / noisy.error, (noisy.lag - clean.lag) / noisy.lag_error])
+    assert (np.mean(np.square(scores), axis=0) < 1.0 + 4.0 * np.sqrt(2.0 / 60)).all()
+
+
+def test_nothing_is_known_where_the_draws_disagree_or_are_few():
+    rng = np.random.default_rng(2)
+    model = LinearOscillator(motions(rng, 1)[0], 0.3)
+    relative = np.stack([model.simulate(theta)[1] for theta in rng.uniform(0.3, 2.0, (40, 2))])
+    assert compare_slow_motion(relative[0], relative[1:], STEP) is None  # a = omega^2 x depends on the stiffness
+    assert compare_slow_motion(TIME, np.zeros((10, len(TIME))), STEP) is None
+    assert compare_slow_motion(TIME, np.ones((4, len(TIME))), STEP) is None
+
+
+def findings(values, fit, draws):
+    model = deck(np.random.default_rng(3))
+    responses = np.stack([fit, *draws])[:, None]
+    measured = Measurements(model.channels, STEP, values[None])
+    return {each.kind: each for each in check_responses([Compared("", measured, responses, True, {}, slice(1, None))])}
+
+
+def test_what_a_fit_makes_up_for_is_wrong_and_a_right_fit_is_left_alone():
+    rng = np.random.default_rng(3)
+    model = deck(rng)
+    draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
+    assert findings(true, model.simulate([4.4, 0.11, 0.7])[0], draws) == {}
+    gain = findings(0.5 * true, model.simulate([9.9, 0.78, 0.6])[0], draws)["A gain may be wrong"]
+    assert gain.severity == "wrong" and gain.numbers["factor"] == pytest.approx(0.5, rel=0.1)
+    late = findings(later(true, 5), model.simulate([3.4, 0.4, 0.9])[0], draws)["Clocks may differ"]
+    assert late.severity == "wrong" and late.numbers["lag"] == pytest.approx(0.05, abs=0.01)
+    other = findings(np.convolve(rng.standard_normal(len(true)), np.ones(9), "same"), true, draws)
+    assert other["The model does not follow the measurements"].severity == "wrong"
+
+
+def test_white_noise_is_no_fault_of_a_fit_but_spikes_are():
+    rng = np.random.default_rng(4)
+    model = deck(rng)
+    draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
+    noise = true.std() * rng.standard_normal(len(true))
+    assert findings(true + 0.8 * noise, true, draws) == {}
+    (most,) = findings(true + 2.0 * noise, true, draws).values()
+    assert (most.kind, most.severity) == ("A channel is hardly reproduced", "care")
+    spikes = np.where(np.arange(len(true)) % 200 == 150, 20.0 * true.std(), 0.0)
+    assert findings(true + spikes, true, draws)["The model does not follow the measurements"].severity == "wrong"
+
+
+def test_a_limit_of_the_model_is_no_edge_of_the_prior():
+    """The share of the ends is 1, and cannot be more; the frequency could be higher than its prior lets it."""
+    rng = np.random.default_rng(5)
+    model = deck(rng)
+    values = model.simulate([4.5, 0.1, 1.0])
+    likelihood = FELikelihood(model, Measurements(model.channels, STEP, values))
+
+    def kinds(frequency):
+        prior = PRIOR | {"frequency": frequency, "sigma_deck": HalfNormal(1.0)}
+        near = np.array([min(frequency.high, 4.5), 0.1, 1.0, 0.02]) - 1e-3 * rng.random((50, 4))
+        return [each.kind for each in check_fit(Posterior(likelihood, prior), near)]
+
+    assert kinds(Uniform(0.5, 10.0)) == []
+    assert "At the edge of the prior" in kinds(Uniform(0.5, 4.5))
+
+
+def test_a_support_in_another_unit_is_named():
+    first, second, third = motions(np.random.default_rng(7))
+    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(2.5), third])) == []
+    (found,) = check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(1.0 / 9.80665), third]))
+    assert found.severity == "wrong" and 0.08 < found.numbers[second.name] < 0.13
+    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(0.0), third])) == []
+    assert check_supports(LinearStructure(ShearFrame({"roof": 1}, [1.0], [900.0]), first)) == []
+    assert check_supports(LinearOscillator(first)) == []
+
+
+def test_a_damping_that_no_structure_has_speaks_against_a_fit_unless_gains_and_clocks_are_known():
+    rng = np.random.default_rng(6)
+    model = deck(rng)
+    draws, true = draws_of(model, rng)[:, None], model.simulate([4.5, 0.35, 0.7])
+    known = Compared("", Measurements(model.channels, STEP, true), draws, False, {})
+    noise = 9.0 * true.std() * rng.standard_normal(true.shape)
+    unknown = Compared("", Measurements(model.channels, STEP, true + noise), draws, False, {})
+    assert check_damping(model, np.array([4.5, 0.25, 0.5]), [unknown]) == []
+    (found,) = check_damping(model, np.array([9.9, 0.6, 0.5]), [known, unknown])
+    assert found.severity == "wrong" and found.numbers == {"damping": 0.6}
+    assert check_damping(model, np.array([9.9, 0.6, 0.5]), [known])[0].severity == "note"
+    halved = known._replace(measurements=Measurements(model.channels, STEP, 0.5 * true))
+    assert check_damping(model, np.array([9.9, 0.6, 0.5]), [halved])[0].severity == "wrong"
+    oscillator = LinearOscillator(motions(rng, 1)[0], 0.3, damping_ratio=0.05)
+    assert check_damping(oscillator, np.array([1.0, 3.0]), [unknown]) == []
+    assert check_damping(oscillator, np.array([1.0, 8.0]), [unknown])[0].numbers == {"damping": pytest.approx(0.4)}
