@@ -137,7 +137,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
     responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
     slow, unknown = [], []
-    for each in (each for each in fits.compared if not each.modal):
+    for each in (each for each in fits.compared if not each.modal and each.measurements.is_history):
         known = slow_motions(each)
         for channel in each.measurements.channels:
             where = f"{channel.name} ({each.title})" if each.title else channel.name
