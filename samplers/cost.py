@@ -19,7 +19,7 @@ import numpy as np
 from .settings import Settings, as_whole_number
 from .smc import SMCSampler
 from .tempered import TemperedSampler
-from .tempering.recycling import DRAWS_PER_TARGET, POINTS_PER_DIMENSION, SEARCH_DRAWS, TARGET_SHARE
+from .tempering.recycling import DRAWS_PER_TARGET, POINTS_PER_DIMENSION, TARGET_SHARE, search_draws
 
 __all__ = ["CostEstimate", "Expected", "as_duration", "estimate_cost", "expected_evaluations", "first_beta"]
 
@@ -215,7 +215,7 @@ def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: flo
     if settings.recycle:
         left = -np.log(beta) / min(1.7, 2.9 * ndim**-0.55)
         per_stage = DRAWS_PER_STAGE * max(TARGET_SHARE * nwalkers, POINTS_PER_DIMENSION * (ndim + 1.0))
-        stages = left * (per_stage + SEARCH_DRAWS * nwalkers / max(left, 1.0))
+        stages = left * (per_stage + search_draws(nwalkers) / max(left, 1.0))
         low, likely, high = ((1.0 + end) * nwalkers for end in AT_THE_END)
         return Expected(0.65 * stages + low, stages + likely, 1.4 * stages + high)
     kept = min(max(settings.target(float(nwalkers), nwalkers) / nwalkers, 0.01), 0.99)

@@ -16,7 +16,7 @@ from emcee.backends import Backend
 
 from .resampling import RESAMPLING
 
-__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "refuse_unused"]
+__all__ = ["MOVES", "Settings", "as_whole_number", "check_arguments", "check_names", "most_moves", "refuse_unused"]
 
 # settings of annealing by moves that every sampler has
 MOVES = ("resampling", "min_moves", "max_moves", "max_correlation", "fast_sweeps", "check_draws", "max_failure_share")
@@ -48,7 +48,8 @@ class Settings:
     resampling : str or callable
         Name of a scheme in `samplers.resampling`, or a function of (weights, random) that returns indices.
     min_moves, max_moves : int
-        Smallest and largest number of ensemble sweeps per stage; equal for a fixed number.
+        Smallest and largest number of ensemble sweeps per stage; equal for a fixed number. The default of `max_moves`
+        belongs to 20 parameters or fewer; samplers add 3 for each further parameter (`most_moves`).
     max_correlation : float
         Between `min_moves` and `max_moves`, moving stops once the correlations of all parameters and the log-likelihood
         with their values after the resampling are below this value, or decrease no further.
@@ -138,6 +139,15 @@ class Settings:
         variation = self.coefficient_of_variation
         ratio = self.ess_ratio if variation is None else 1.0 / (1.0 + variation**2)
         return max(ratio * (n_walkers if self.ess_rule == "constant" else last_target), self.ess_floor)
+
+
+def most_moves(ndim: int) -> int:
+    """Default of `max_moves` for a number of parameters.
+
+    With 40 normal parameters and 500 walkers, 7 sweeps leave a correlation of 0.8 with the resampled points, and the
+    means are off by 0.57 standard deviations; with 60 sweeps by 0.04.
+    """
+    return Settings.max_moves + 3 * max(ndim - 20, 0)
 
 
 def check_names(sampler: str, names: Collection[str], given: Collection[str], arguments: Collection[str]) -> None:

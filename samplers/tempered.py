@@ -41,7 +41,7 @@ from .replay import changes, describe_run, differences, open_record
 from .reporting.progress import ANNEALING, Progress, get_progress_bar, show_sweeps
 from .reports import AnnealingResult, warn
 from .results import RunResults
-from .settings import Settings, as_whole_number, check_arguments, check_names, refuse_unused
+from .settings import Settings, as_whole_number, check_arguments, check_names, most_moves, refuse_unused
 from .tempering.anneal import anneal
 from .tempering.guide import AdaptedGuide, Guide, check_guide
 from .tempering.guided import Guidance, lend
@@ -142,7 +142,8 @@ class TemperedSampler(RunResults, EnsembleSampler):
         settings = self._with_defaults(settings, moves)
         given = Settings(**settings)
         recycle, moves = self._choose(given, settings, moves, nwalkers)
-        self.settings = replace(given, recycle=recycle)
+        sweeps = given.max_moves if "max_moves" in settings else most_moves(ndim)
+        self.settings = replace(given, recycle=recycle, max_moves=sweeps)
         self._given_guide, self._guide = guide, None
         if guide is not None:
             check_guide(guide, target.function, vectorize)

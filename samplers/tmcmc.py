@@ -47,7 +47,8 @@ class TMCMCSampler(TemperedSampler):
         Smallest number of ensemble sweeps per stage. With "leaders", sweeps are made only if the chains have left the
         points correlated with the resampled points.
     max_moves : int, default 7
-        Largest number of these sweeps; equal to `min_moves` for a fixed number.
+        Largest number of these sweeps; equal to `min_moves` for a fixed number. By default 3 more for each parameter
+        beyond 20.
     max_correlation : float, default 0.15
         Between `min_moves` and `max_moves`, moving stops once the correlation with the resampled points is below this
         value.

@@ -101,6 +101,11 @@ class WithFastSweeps(Move):
         if isinstance(self.move, MixtureMove):
             self.move.cover_basins(coords, log_target)
 
+    def follow(self, ancestors: np.ndarray) -> None:
+        """See `samplers.moves.population_moves.MixtureMove.follow`; without effect on other moves."""
+        if isinstance(self.move, MixtureMove):
+            self.move.follow(ancestors)
+
     def expect_independence(self) -> None:
         """See `samplers.moves.population_moves.MixtureMove.expect_independence`; without effect on other moves."""
         if isinstance(self.move, MixtureMove):

@@ -16,12 +16,13 @@ import numpy as np
 from emcee import State
 from emcee.moves import MHMove, Move
 
-from ..proposals.basins import cover_basins
+from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import (
     Mixture,
     draw,
     fit_mixture,
     from_component_space,
+    leave_out,
     location_and_root,
     log_density,
     log_responsibilities,
@@ -43,6 +44,11 @@ __all__ = [
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
 # Probabilities while the independence kernel has a high acceptance: it decorrelates the ensemble fastest.
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
+# Parts of the fitted points, from this number of dimensions on; the points of a part are moved by a fit to the others.
+# Independent draws replace a point that the fit was made to too easily: with 500 walkers in 40 dimensions, the first
+# sweep increased the variance of normal draws by 6.5 %, in 20 dimensions by 2 to 3 %, with 10 parts by less than the
+# error of 0.4 %. In 3 and 5 dimensions with 50 and 100 walkers, 16 runs each, the evidence had no bias without parts.
+PARTS, FEWEST_DIMENSIONS = 10, 6
 # Attempts to replace independent draws outside the support of the prior; what is left then is rejected.
 REDRAWS = 20
 # Share of the difference steps with scale 1, which lead from mode to mode (ter Braak 2006).
@@ -310,6 +316,8 @@ class MixtureMove(_FittedMove):
         self._bounds: SupportBounds | None = None
         self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
         self._log_factors = [0.0, 0.0, 0.0]
+        self._part: np.ndarray | None = None  # of each walker, see `follow`
+        self._mixtures: list[Mixture] = []  # fitted without the points of one part each
         self._current: int | None = None  # kernel index in the latest sweep; None right after a calibration
         self._independence_accepted = False
 
@@ -329,8 +337,9 @@ class MixtureMove(_FittedMove):
 
         The next sweep uses the independence kernel. The bounds of the support are determined at the first call only.
 
-        A mixture that was fitted to the points that it moves makes their tails too light for many sweeps: points in the
-        tails that have widened the mixture are soon replaced, and without such points it hardly proposes any.
+        A mixture that was fitted to the points that it moves gives them a wrong spread for many sweeps: a point that
+        has widened the mixture is replaced too easily. So in 6 dimensions or more, each tenth of the points is moved
+        by a fit to the others, if `follow` says which walker descends from which point.
         """
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
@@ -339,6 +348,13 @@ class MixtureMove(_FittedMove):
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
         self._current, self._independence_accepted, self._halves = None, False, ()
+        self._part, self._mixtures = None, []
+        if mixture is None and coords.shape[1] >= FEWEST_DIMENSIONS:
+            self._mixtures = leave_out(self._mixture, coords, weights, np.arange(len(coords)) % PARTS)
+
+    def follow(self, ancestors: np.ndarray) -> None:
+        """Say from which of the points of the last calibration each walker descends, by indices (nwalkers,)."""
+        self._part = ancestors % PARTS
 
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Add components for parts of the target that the fitted mixture does not cover.
@@ -350,7 +366,9 @@ class MixtureMove(_FittedMove):
         log_target : ndarray, shape (n,)
             Log-target of the stage, scaled so that the target's integral is about 1.
         """
-        self._mixture = cover_basins(self._mixture, coords, log_target)
+        found = find_basins(self._mixture, coords, log_target)
+        self._mixture = with_components(self._mixture, found)
+        self._mixtures = [with_components(mixture, found) for mixture in self._mixtures]
 
     def expect_independence(self) -> None:
         """Prefer the independence kernel, without a first sweep that shows its acceptance.
@@ -379,7 +397,17 @@ class MixtureMove(_FittedMove):
         return super()._draw_all(coords, random)
 
     def _draw(self, coords, random):
-        return self._kernels[self._current](coords, random)
+        kernel, fitted = self._kernels[self._current], self._mixture
+        if not self._mixtures or self._part is None or len(self._part) != len(coords):
+            return kernel(coords, random)
+        proposed, log_ratios = np.empty_like(coords), np.empty(len(coords))
+        for part, mixture in enumerate(self._mixtures):
+            rows = self._part == part
+            if rows.any():
+                self._mixture = mixture
+                proposed[rows], log_ratios[rows] = kernel(coords[rows], random)
+        self._mixture = fitted
+        return proposed, log_ratios
 
     def draw_independence(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
         """Propose independent draws from the mixture for points (n, ndim).

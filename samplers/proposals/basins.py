@@ -107,13 +107,19 @@ def with_components(mixture: Mixture, found: Mixture | None) -> Mixture:
 
 
 def find_basins(
-    mixture: Mixture, coords: np.ndarray, log_target: np.ndarray, most: int = 3, share: float = 0.1
+    mixture: Mixture,
+    coords: np.ndarray,
+    log_target: np.ndarray,
+    most: int = 3,
+    share: float = 0.1,
+    least_mass: float = 0.0,
 ) -> Mixture | None:
     """Components for parts of the target that a mixture, fitted to points (n, ndim), does not cover; None without any.
 
     `log_target` (n,) is scaled so that the integral of the target is about 1; -inf is allowed. There are at most `most`
     components, in the component space of the mixture, each with the weight `share` or more: up to 0.25 for a basin with
-    a larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive.
+    a larger estimated mass. Their total weight, at most 0.5, is the share of draws that they should receive. Components
+    whose estimated mass is below `least_mass` are left out.
     """
     ndim, variance = coords.shape[1], mixture.dof / (mixture.dof - 2.0)
     kept = np.flatnonzero(log_target > log_target.max() - DEPTH * ndim)
@@ -121,6 +127,7 @@ def find_basins(
     if mixture.bounds is not None:
         target = target - log_abs_det_jacobian(mixture.bounds, coords[kept])
     found = _basins_of_points(mixture, to_component_space(mixture, coords[kept]), target, most)
+    found = [(k, basin) for k, basin in found if math.exp(min(basin.log_mass, 0.0)) >= least_mass]
     if not found:
         return None
     found = sorted(found, key=lambda item: -item[1].log_mass)[:most]

@@ -33,6 +33,7 @@ __all__ = [
     "fit_normals",
     "from_component_space",
     "invert_roots",
+    "leave_out",
     "location_and_root",
     "log_components",
     "log_density",
@@ -207,6 +208,28 @@ def fit_normals(coords: np.ndarray, effective: float, max_components: int = 6, s
         white = (coords - mean) @ invert_roots(root[None])[0].T
         return _unwhitened(_maximise(white, weights, effective, responsibilities, math.inf, AGAIN)[0], mean, root)
     return _fit_components((), coords, weights, max_components, math.inf, effective, ACCURATE)[0]
+
+
+def leave_out(mixture: Mixture, coords: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> list[Mixture]:
+    """Mixtures fitted without one part of the points each: one step of the fit, from a fit to all points (n, ndim).
+
+    `weights` (n,) have sum 1; `parts` (n,) are the numbers of the parts, from 0.
+    """
+    points = to_component_space(mixture, coords)
+    responsibilities = np.exp(log_responsibilities(mixture, coords))
+    stretch = np.ones_like(responsibilities)
+    if mixture.dof < math.inf:
+        stretch *= (mixture.dof + points.shape[1]) / (mixture.dof + _distances(mixture, points))
+    mean, root = location_and_root(points, weights)
+    white = (points - mean) @ invert_roots(root[None])[0].T
+    kept, found = weights > NEGLIGIBLE / len(weights), []
+    for part in range(parts.max() + 1):
+        rows = kept & (parts != part)
+        rows = rows if rows.any() else kept
+        own = weights[rows] / weights[rows].sum()
+        fitted = _components(white[rows], own, 1.0 / (own @ own), responsibilities[rows], stretch[rows], mixture.dof)
+        found.append(_unwhitened(fitted, mean, root)._replace(shears=mixture.shears, bounds=mixture.bounds))
+    return found
 
 
 def _fit_with_shears(coords: np.ndarray, weights: np.ndarray, max_components: int, dof: float) -> tuple[Mixture, float]:

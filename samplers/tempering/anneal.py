@@ -25,7 +25,6 @@ from ..estimates.importance import (
     EvidenceCheck,
     draw_inside,
     evidence_from_weights,
-    fits_poorly,
 )
 from ..estimates.pareto import pareto_shape
 from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_size, normalised_weights
@@ -55,9 +54,6 @@ from .smc_moves import anneal_by_moves, move
 __all__ = ["anneal", "check_population"]
 
 logger = logging.getLogger(__name__)
-
-# Share of distinct points after recycling above which the population is as good as independent draws.
-ENOUGH_DISTINCT = 0.9
 
 Steps = Iterator[tuple[Population, Report]]
 
@@ -180,12 +176,11 @@ def _by_recycling(
         yield population, found.check
     for each in compare(found):
         yield population, each
-    if distinct < ENOUGH_DISTINCT * size or fits_poorly(found.check, proposal, size):
-        moved = yield from move(population, population.founders[0], density, random, schedule, settings)
-    else:
-        # the draws are independent already: sweeps would cost evaluations and improve nothing
+    if found.independent:  # sweeps would cost evaluations and improve nothing
         schedule.expect_independence()
         moved = Mutated(population, effective / len(found.coords), 0, 0.0)
+    else:
+        moved = yield from move(population, population.founders[0], density, random, schedule, settings)
     increment, error = found.log_evidence - found.log_evidence_below_one, found.log_evidence_error
     yield moved.population, Stage(1.0, effective, moved.acceptance, moved.moves, distinct, increment, error)
     if moved.stopped:

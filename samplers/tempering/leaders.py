@@ -71,6 +71,7 @@ def grow_chains(
     accepted_steps, steps = 0, 0
     for length in range(-settings.burn_in, int(counts.max())):
         growing = np.flatnonzero(counts > length)
+        schedule.follow(ancestors[first[growing]])
         move = schedule.choose(random)
         state = State(chains.coords[growing], log_prob=chains.log_prob[growing], blobs=chains.blobs[growing])
         try:
@@ -89,5 +90,6 @@ def grow_chains(
     grown = Mutated(population, accepted_steps / steps, settings.burn_in + 1, correlation.values[-1])
     if settings.burn_in == 0 or grown.correlation < settings.max_correlation:
         return grown
+    schedule.follow(ancestors)
     swept = yield from move_together(population, density, random, schedule, settings, visited, correlation)
     return swept._replace(moves=grown.moves + swept.moves)

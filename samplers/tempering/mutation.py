@@ -97,6 +97,12 @@ class MoveSchedule(NamedTuple):
             if isinstance(move, MixtureMove | WithFastSweeps):
                 move.cover_basins(coords, log_target)
 
+    def follow(self, ancestors: np.ndarray) -> None:
+        """Tell mixture moves from which of the points of the last calibration (by indices) each walker descends."""
+        for move in self.moves:
+            if isinstance(move, MixtureMove | WithFastSweeps):
+                move.follow(ancestors)
+
     def expect_independence(self) -> None:
         """Tell mixture moves that the points are already independent draws of the target."""
         for move in self.moves:

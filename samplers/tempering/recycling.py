@@ -32,8 +32,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..estimates.importance import EvidenceCheck, draw_inside, evidence_from_weights, round_shares, tail_variance
-from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight
+from ..estimates.importance import (
+    EvidenceCheck,
+    draw_inside,
+    evidence_from_weights,
+    fits_poorly,
+    round_shares,
+    tail_variance,
+)
+from ..estimates.weights import coarse_weights, effective_sample_size, log_mean_weight, normalised_weights
 from ..judgement.rounds import doubt_recycling
 from ..proposals.basins import find_basins, with_components
 from ..proposals.mixture import Mixture, fit_mixture, log_density
@@ -44,19 +51,21 @@ from .next_beta import next_beta
 from .pending_points import PendingPoints
 from .population import Density, Population
 
-__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "submit_start"]
+__all__ = ["Recycled", "StartingDensity", "most_running", "recycle", "search_draws", "submit_start"]
 
 # Wanted effective sample size at each beta (the target), as a share of the number of starting points. A small target
 # allows large steps of beta; the fresh draws of a round then restore the effective sample size.
 TARGET_SHARE = 0.2
 # Smallest target per dimension (and one more): fewer effective points do not determine the covariances of the mixture.
-POINTS_PER_DIMENSION = 5.0
+# Also per component, once a fit has had several: with fewer, the shares of modes drift from beta to beta.
+POINTS_PER_DIMENSION, POINTS_PER_COMPONENT = 5.0, 8.0
 # Draws of a round, as a multiple of the target.
 DRAWS_PER_TARGET = 3.0
-# Further draws, as a multiple of the number of starting points, spread over the stages below beta = 1. They find narrow
-# modes, which hold few points while beta is small: with modes whose volumes have a ratio of 100, runs with 500 starting
-# points miss a mode in 30 % of the runs without such draws, and in 6 % with them.
-SEARCH_DRAWS = 3.0
+# Further draws, spread over the stages below beta = 1: they find narrow modes, which hold few points at small beta.
+# They are a multiple of the starting points, and from 150 on, where recycling is the default, at least 1500: modes are
+# as narrow for few walkers. In three dimensions, widths 1:5 and 1:8 with 250 walkers, 42 of 104 runs lost a mode with
+# three draws per walker, and 21 with 1500.
+SEARCH_SHARE, SEARCH_DRAWS, FEWEST_TO_SEARCH = 3.0, 1500.0, 150
 # A beta is left once the draws made at it have an effective sample size of this share of the target.
 FRESH_SHARE = 0.75
 # More components than in moves, because there are more points.
@@ -69,8 +78,13 @@ MOST_BASINS, BASIN_SHARE = 3, 0.1
 # Before the check, unexplained parts of the target are explored this many times at most, with this number of draws for
 # each part: a mode may have been met late.
 MOST_BASIN_ROUNDS, DRAWS_PER_BASIN = 4, 30
-# Draws that contradict a fit also improve it, so a failed check is repeated.
+# Smallest estimated share of a part that is explored again. Parts of bent posteriors have 1e-4 and less.
+LEAST_MASS = 0.01
+# Draws that contradict a fit also improve it, so a failed check is repeated, and so is a check after which the draws do
+# not suffice for the walkers: it costs as many draws as there are walkers, and moves up to seven times as many.
 MOST_CHECKS = 4
+# Expected share of distinct points among the walkers above which they are as good as independent draws.
+ENOUGH_DISTINCT = 0.9
 # Factor by which beta is expected to grow from stage to stage, for the spread of draws over the stages.
 EXPECTED_GROWTH = 3.0
 # Largest share of the effective sample size that a stage keeps: else beta would hardly grow.
@@ -94,7 +108,8 @@ class Recycled(NamedTuple):
     its round, which was not fitted to it. Rounds are combined by `samplers.estimates.importance.round_shares`, which
     does not depend on the weights of the same round: otherwise a round with a few large weights in a tail would get a
     small share, and cut the tail. `log_evidence` and its error use all points except the draws of the check, which is
-    None if beta = 1 was not reached. `log_evidence_below_one` belongs to the last beta below 1.
+    None if beta = 1 was not reached. `log_evidence_below_one` belongs to the last beta below 1. `independent` says
+    whether as many points as walkers, resampled from the draws, are as good as independent draws of the posterior.
     """
 
     reason: str
@@ -106,6 +121,7 @@ class Recycled(NamedTuple):
     check: EvidenceCheck | None
     points: "WeightedPoints | None" = None
     log_evidence_below_one: float = 0.0
+    independent: bool = False
 
     @property
     def proposals(self) -> Sequence[tuple[int, Mixture]]:
@@ -136,11 +152,11 @@ def recycle(
     n, ndim = pending.coords.shape
     size = n if size is None else size
     # another starting density was fitted by a separate search
-    search, basin_rounds = _Search(SEARCH_DRAWS * n if start is None else 0.0), 0
+    search, basin_rounds = _Search(search_draws(n) if start is None else 0.0), 0
     start = StartingDensity(n, lambda _, records: records["log_prior"]) if start is None else start
-    target = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
+    target = least = max(TARGET_SHARE * n, POINTS_PER_DIMENSION * (ndim + 1.0))
     points, bounds = WeightedPoints(pending, start), find_support_bounds(density.inside, pending.coords)
-    beta, efficiencies, increments, checks = 0.0, [], [], 0
+    beta, efficiencies, increments, checks, most = 0.0, [], [], 0, 1
     drawn: list[_Drawn] = []  # at the present beta
     if (alive := effective_sample_size(points.log_weights(0.0))) < target:
         density.wait(0)
@@ -170,8 +186,8 @@ def recycle(
             log_weights = points.log_weights(beta)
             effective = effective_sample_size(log_weights)
 
-        # evidence; proposals were chosen by weights with an effective sample size of `target`, whose error remains
-        inherited = 1.0 / target if efficiencies else 0.0
+        # evidence; proposals were chosen by weights with an effective sample size of `least`, whose error remains
+        inherited = 1.0 / least if efficiencies else 0.0
         log_evidence, error = _evidence(log_weights, inherited)
         if last_beta < beta < 1.0:
             increments.append(log_evidence - sum(increments))
@@ -184,10 +200,13 @@ def recycle(
         # fit a proposal
         mixture = fit_mixture(points.coords, coarse_weights(log_weights), MOST_COMPONENTS, bounds)
         mixture = _with_even_share(mixture, EVEN_SHARE)
+        most = max(most, len(mixture.weights))
+        target = max(least, POINTS_PER_COMPONENT * (ndim + 1.0) * most) if most > 1 else least
         finished, basins = beta == 1.0 and effective >= size, None
         if not finished or basin_rounds < MOST_BASIN_ROUNDS:
             log_target = points.log_target(beta) - log_evidence
-            basins = find_basins(mixture, points.coords, log_target, MOST_BASINS, BASIN_SHARE)
+            least_mass = LEAST_MASS if finished and basin_rounds > 0 else 0.0
+            basins = find_basins(mixture, points.coords, log_target, MOST_BASINS, BASIN_SHARE, least_mass)
         if exploring := finished and basins is not None:
             mixture, basin_rounds = _with_even_share(basins, 1.0), basin_rounds + 1
             wanted = DRAWS_PER_BASIN * len(basins.weights)
@@ -222,7 +241,8 @@ def recycle(
             log_evidence, error = _evidence(points.log_weights(beta), inherited)
         reason = doubt_recycling(check, log_evidence, beta, efficiencies)
         # draws that contradict a fit also improve it: check again, as long as that is cheap
-        ends = not reason or checks == MOST_CHECKS if checking else bool(reason)
+        independent = checking and not reason and _suffice(drawn, start, check, mixture, size)
+        ends = independent or checks == MOST_CHECKS if checking else bool(reason)
         if ends:
             if not checking:
                 density.wait(0)
@@ -230,7 +250,7 @@ def recycle(
                 log_evidence, error = _evidence(points.log_weights(beta), inherited)
             points.add(mixture, made, pending)
             result = _result(drawn if beta == 1.0 else [draws], start, beta)
-            return Recycled(reason, *result, log_evidence, error, check, points, sum(increments))
+            return Recycled(reason, *result, log_evidence, error, check, points, sum(increments), independent)
         points.add(mixture, made, pending)
 
 
@@ -319,6 +339,15 @@ def _result(drawn: Sequence[_Drawn], start: StartingDensity, beta: float) -> tup
     return np.concatenate([c for c, _ in parts]), np.concatenate([r for _, r in parts]), np.concatenate(scaled)
 
 
+def _suffice(
+    drawn: Sequence[_Drawn], start: StartingDensity, check: EvidenceCheck, mixture: Mixture, size: int
+) -> bool:
+    """Whether `size` points resampled from the draws at beta = 1 are as good as independent draws of the posterior."""
+    weights = normalised_weights(_result(drawn, start, 1.0)[2])
+    distinct = np.minimum(size * weights, 1.0).sum()
+    return distinct >= ENOUGH_DISTINCT * size and not fits_poorly(check, mixture, size)
+
+
 def _evidence(log_weights: np.ndarray, inherited: float) -> tuple[float, float]:
     """Log-evidence from the weights of all points, and its standard error; `inherited`: variance of earlier choices."""
     n, effective = len(log_weights), effective_sample_size(log_weights)
@@ -337,6 +366,11 @@ def submit_start(coords: np.ndarray, density: Density, whole: bool = False) -> P
         few, records = pending.arrived_part()
         raise stop_at(Population(0.0, few, records, float(len(few))), 0.0, 0.0)
     return pending
+
+
+def search_draws(size: int) -> float:
+    """Number of additional draws that search for narrow modes, for a number of starting points."""
+    return max(SEARCH_SHARE * size, SEARCH_DRAWS if size >= FEWEST_TO_SEARCH else 0.0)
 
 
 def most_running(density: Density, submitted: int) -> int:
@@ -358,7 +392,7 @@ class _Search:
 
     def enlarge(self, draws: float, beta: float) -> float:
         """The draws of a stage, plus additional draws: those left are spread evenly over the stages still expected."""
-        share = self._left / (1.0 - np.log(beta) / np.log(EXPECTED_GROWTH))
+        share = self._left / max(-np.log(beta) / np.log(EXPECTED_GROWTH), 1.0)
         self._left -= share
         self.increase = 1.0 + share / draws
         return draws + share

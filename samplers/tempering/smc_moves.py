@@ -117,6 +117,7 @@ def move(
     visited: VisitedPoints | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
     """Move resampled points at their beta: all points equally often, or in chains from the distinct points."""
+    schedule.follow(ancestors)
     if settings.chains == "leaders":
         return grow_chains(population, ancestors, density, random, schedule, settings, visited)
     return move_together(population, density, random, schedule, settings, visited)
