@@ -147,6 +147,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
                 unknown.append(where)
     gains = [", ".join(slow)] if slow else []
     gains += [f"not tested: {', '.join(unknown)}, which parameters or noise change everywhere"] if unknown else []
+    slow_band = ("Gains and clocks where parameters change nothing", "; ".join(gains) or "not tested: no response")
     return [
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
@@ -154,7 +155,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
             "Units, signs, clocks, swapped channels" if has_steps(run.likelihood) else "Units, signs, swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
-        ("Gains and clocks where parameters change nothing", "; ".join(gains) or "not tested: there is no response"),
+        *([slow_band] if has_steps(run.likelihood) else []),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 
