@@ -1,6 +1,7 @@
 """Settings of Sphinx. `make docs` builds the pages of this folder, the API reference and the tutorials.
 
-The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
+The reference has one page per public name, generated from the docstrings (``api.rst``, ``_templates``); names in code
+font link to it (``building.py``).
 Tutorials 01 to 05 and 10 to 13 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
 fetch, and are shown without output. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
 ``docs/tutorials``.
@@ -22,13 +23,15 @@ release = metadata.version("fe-likelihoods")
 
 extensions = [
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",  # a copy of MathJax in the pages: formulas are shown without a network
     "numpydoc",
     "sphinx.ext.viewcode",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
+templates_path = ["_templates"]
+exclude_patterns = ["_build", "_templates", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
 html_theme = "furo"
 html_title = f"fe-likelihoods {release}"
 html_show_sphinx = html_show_copyright = False
@@ -39,7 +42,8 @@ default_role = "code"
 numpydoc_show_class_members = False  # autodoc shows the members with their docstrings
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings state types with shapes and units
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"show-inheritance": True}
+maximum_signature_line_length = 88  # one argument per line where a signature is longer
 
 
 sphinx_gallery_conf = {
@@ -60,7 +64,7 @@ sphinx_gallery_conf = {
 def setup(app):
     import building
 
-    app.connect("builder-inited", building.write_api_pages)
-    app.connect("env-before-read-docs", building.show_kernels_as_functions)
+    app.connect("builder-inited", building.remove_old_pages, priority=400)  # before the pages are written
+    app.connect("doctree-read", building.link_names)
     app.connect("autodoc-skip-member", building.skip_fields)
     app.connect("autodoc-process-docstring", building.keep_initials)

@@ -107,6 +107,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         2 ndim walkers, no log-prior, or moves of emcee that need several walkers with ``chains="leaders"``.
     TypeError
         For a keyword that is not a setting.
+
+    Examples
+    --------
+    >>> isinstance(sampler, TemperedSampler)
+    True
+    >>> SMCSampler.setting_names[:3]
+    ('resampling', 'min_moves', 'max_moves')
     """
 
     setting_names: tuple[str, ...] = tuple(field.name for field in fields(Settings))
@@ -278,6 +285,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
 
         Nothing is stored for the points that were interrupted.
+
+        Examples
+        --------
+        >>> sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1)
+        >>> state = sampler.run_mcmc(None, 2)
+        >>> state = sampler.run_mcmc(None, 1)  # a step more
+        >>> sampler.iteration
+        3
         """
         state = None
         with interrupts_end_the_run():

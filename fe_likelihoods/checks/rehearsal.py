@@ -102,8 +102,9 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
 
     Examples
     --------
-    >>> for finding in check_model(posterior).findings:
-    ...     print(finding.severity, finding)
+    >>> checked = check_model(posterior)
+    >>> [finding.severity for finding in checked.findings]
+    ['note']
     """
     found: list[Finding] = []
     keys = getattr(posterior.likelihood, "likelihoods", {"": None})

@@ -80,8 +80,10 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     --------
     >>> judgement = check_result(sampler)
     >>> print(judgement)
+    Use.
     >>> for finding in judgement.findings:
-    ...     print(finding)
+    ...     print(finding.severity, finding)
+    note Step and mesh were not tested: ...
     """
     return judge_run(read_run(sampler, posterior, discard=discard)).judgement
 

@@ -107,6 +107,12 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
         If `theta` has another length, or no bar yields or none of the three events is reached up to a drift of 20 %.
     SimulationFailed
         If the analysis does not converge.
+
+    Examples
+    --------
+    >>> print(park_ang_constants(column))
+    Park-Ang index: ultimate displacement 365 mm, yield force 512 kN, beta 0.05 (static analysis at nominal
+    parameters: first yield of a bar, fracture of the hoops; beta assumed)
     """
     from ..models.rc_column_analysis import expect_fracture
 

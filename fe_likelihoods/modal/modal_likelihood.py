@@ -61,10 +61,12 @@ class ModalLikelihood(FELikelihood):
 
     Examples
     --------
-    >>> likelihood = ModalLikelihood(ShearFrame(floors, masses, stiffnesses), data)
-    >>> prior = {name: LogNormal(1.0, 0.2) for name in likelihood.model.parameter_names}
-    >>> errors = {"frequency_error": LogNormal(0.005, 0.5), "shape_error": LogNormal(0.03, 0.5)}
-    >>> posterior = Posterior(likelihood, prior | errors)
+    >>> identified = ModalData([2.9, 7.8], [[0.62, 1.0], [-1.0, 0.62]], ["floor 1", "roof"],
+    ...                        frequency_cv=0.005, shape_error=0.02)
+    >>> modal = ModalLikelihood(frame, identified)
+    >>> calibrated = Posterior(modal, {name: LogNormal(1.0, 0.2) for name in modal.parameter_names})
+    >>> calibrated.parameter_names
+    ['stiffness_1', 'stiffness_2']
     """
 
     def __init__(

@@ -140,10 +140,12 @@ class FunctionModes(FunctionModel):
 
     Examples
     --------
-    >>> def frame(theta):
+    >>> def stiffness_and_mass(theta):
     ...     k1, k2 = theta
     ...     return np.array([[k1 + k2, -k2], [-k2, k2]]), np.eye(2)
-    >>> model = FunctionModes(frame, ("k1", "k2"), {"floor 1": 0, "floor 2": 1}, 2)
+    >>> modes = FunctionModes(stiffness_and_mass, ["k1", "k2"], {"floor 1": 0, "floor 2": 1}, n_modes=2)
+    >>> modes.simulate([900.0, 900.0]).shape
+    (3, 2)
     """
 
     def __init__(

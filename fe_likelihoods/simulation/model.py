@@ -59,6 +59,16 @@ class SimulationFailed(FailedRun):
     `reason` says why, in words. It may end with the duration of the run, as in "crashed after 12.3 s"
     (`split_seconds`). A reason that begins with "collapse" says that the structure has collapsed (`is_collapse`): this
     is a result, which `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
+
+    Examples
+    --------
+    >>> def displacement(theta):
+    ...     if theta[0] < 0.5:
+    ...         raise SimulationFailed("collapse: the stiffness is below a half")
+    ...     return model.simulate([theta[0], 1.0])[1:]
+    >>> function = FunctionModel(displacement, ["stiffness"], model.channels[1:], dt=0.05, n_steps=200)
+    >>> FELikelihood(function, measurements.select(["displacement"])).log_likelihood([0.4, 0.02])
+    -inf
     """
 
     def __init__(self, reason: str) -> None:

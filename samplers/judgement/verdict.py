@@ -115,6 +115,15 @@ class Verdict(_Stored):
     findings : tuple of `samplers.finding.Finding`
         What speaks against the result, each with its severity and what to do; empty for a verdict that version 0.2 has
         stored.
+
+    Examples
+    --------
+    >>> sampler.verdict.status
+    'converged'
+    >>> print(sampler.verdict)  # doctest: +SAMPLED
+    Converged: effective sample size 46 (of 100 walkers) from 5783 simulations.
+    >>> sampler.verdict.reasons
+    ()
     """
 
     _run: RunParts | None = None
