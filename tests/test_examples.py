@@ -46,9 +46,9 @@ class Checker(doctest.OutputChecker):
         """Whether an example printed what it shows."""
         if not optionflags & SAMPLED:
             return super().check_output(want, got, optionflags)
-        want, got = ("".join(text.split()) for text in (want, got))
-        wanted, found = map(float, NUMBER.findall(want)), map(float, NUMBER.findall(got))
-        return NUMBER.sub("#", want) == NUMBER.sub("#", got) and all(
+        wanted, found = (map(float, NUMBER.findall(text)) for text in (want, got))
+        words, seen = ("".join(NUMBER.sub("#", text).split()) for text in (want, got))
+        return words == seen and all(
             abs(a - b) <= 0.3 * max(abs(a), abs(b)) for a, b in zip(wanted, found, strict=True)
         )
 
@@ -66,7 +66,8 @@ def test_examples_run_as_printed(name, given, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     runner = doctest.DocTestRunner(Checker(), verbose=False, optionflags=OPTIONS)
     printed = []
-    for test in doctest.DocTestFinder(recurse=True).find(importlib.import_module(name), globs=given):
+    module = importlib.import_module(name)
+    for test in doctest.DocTestFinder().find(module, globs=vars(module) | given):
         runner.run(test, out=printed.append)
     assert not runner.summarize(verbose=False).failed, "".join(printed)
 

@@ -407,8 +407,9 @@ class Posterior:
         --------
         >>> with posterior.evaluation_queue() as queue:
         ...     tickets = queue.submit(posterior.sample_prior(100))
-        ...     for ticket, log_prob in queue.collect():    # the first that have ended
-        ...         print(ticket, log_prob)
+        ...     ended = queue.collect()  # tickets and log-probabilities of the first that have ended
+        >>> ended[0][0] in tickets
+        True
         """
         return EvaluationQueue(self.likelihood, self.prior, responses)
 

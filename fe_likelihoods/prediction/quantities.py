@@ -222,7 +222,14 @@ def displacement_before_failure(force: str, displacement: str | ArrayLike, loss:
 
     Examples
     --------
-    >>> propagate(column, draws, quantity=displacement_before_failure("force", column.loading.displacement))
+    >>> from fe_likelihoods.prediction.quantities import displacement_before_failure
+    >>> cycles = 0.3 * np.sin(np.linspace(0.0, 12.0 * np.pi, 400)) * np.linspace(0.0, 1.0, 400)  # m
+    >>> tested = RCColumn.lhpost(DisplacementHistory("cycles", cycles), parameters=["Ec"], fatigue=LowCycleFatigue())
+    >>> failure = displacement_before_failure("force", cycles)
+    >>> print(propagate(tested, np.ones((1, 1)), quantity=failure))
+    Prediction: 1 samples, without measurement noise; effective sample size 1
+    value                                 unit  mean  MC error  sd  5 %  50 %  95 %
+    displacement before failure of force    mm   287         0   0  287   287   287
     """
     if not 0.0 < loss < 1.0:
         raise ValueError(f"displacement_before_failure: loss must be between 0 and 1; got {loss!r}")
