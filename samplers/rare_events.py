@@ -92,6 +92,8 @@ class RareEvent(NamedTuple):
             f"to {self.upper:.2g}), from {self.simulations} simulations{failed} in {len(self.levels)} levels."
         )
 
+    __repr__ = __str__
+
 
 class _Level:
     """The density of the parameters, restricted to values of the quantity of at least `bound`, as moves evaluate it."""

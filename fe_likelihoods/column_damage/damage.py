@@ -170,6 +170,8 @@ class Damage(NamedTuple):
     def __str__(self) -> str:
         return self.table()
 
+    __repr__ = __str__
+
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
 

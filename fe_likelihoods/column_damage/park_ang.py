@@ -64,6 +64,8 @@ class ParkAng(NamedTuple):
             f"{number(1e-3 * self.yield_force)} kN, beta {number(self.beta)}{said}"
         )
 
+    __repr__ = __str__
+
     def check(self) -> None:
         """Raise ValueError if a constant is no positive and finite number; `beta` may be zero."""
         for name, value in (("ultimate_displacement", self[0]), ("yield_force", self[1])):

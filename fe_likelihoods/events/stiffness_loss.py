@@ -104,6 +104,8 @@ class StiffnessLoss(NamedTuple):
         ]
         return "\n".join([*lines, *labelled(self.findings)])
 
+    __repr__ = __str__
+
 
 def stiffness_loss(
     before: StoredPosterior,

@@ -157,6 +157,8 @@ class Identifiability(NamedTuple):
     def __str__(self) -> str:
         return " ".join(self.sentences)
 
+    __repr__ = __str__
+
 
 def _percent(share: float) -> str:
     return f"{100.0 * min(share, 1.0):.2g}" if share < 0.995 else "100"

@@ -77,6 +77,8 @@ class Sensitivity(NamedTuple):
             lines.append("The emulator is rough: the indices need more simulations.")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def sensitivity(
     model: Model,

@@ -136,6 +136,8 @@ class SensorRanking(NamedTuple):
         ]
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def _with_error(value: float, error: float) -> str:
     return number(value) if np.isnan(error) else f"{number(value)} ± {number(error, 2)}"

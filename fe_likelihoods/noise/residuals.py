@@ -76,6 +76,8 @@ class ResidualChecks(NamedTuple):
             lines.append(f"{name:<{width}} {unit:>11} {sizes} {counts} {self.white[i]:>11.2g} {self.normal[i]:>11.2g}")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
     """Statistics of an AR(1) error of residuals (n_channels, n_steps) [SI]: J, D and E of `AutoregressiveNoise`.

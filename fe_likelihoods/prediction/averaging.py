@@ -75,6 +75,8 @@ class AveragedPrediction(NamedTuple):
         first = f"Average of the models {shares}; {what}; sd within and between models"
         return "\n".join([first, text_table(rows), *labelled(self.findings)])
 
+    __repr__ = __str__
+
     @property
     def sd(self) -> np.ndarray:
         """Standard deviation, shape (...)."""

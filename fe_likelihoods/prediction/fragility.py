@@ -112,6 +112,8 @@ class Fragility(NamedTuple):
         ]
         return "\n".join([*lines, *([f"The probabilities contain {self.uncertainty}."] if self.uncertainty else [])])
 
+    __repr__ = __str__
+
     def band(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
         """Band that contains the probabilities under all records together.
 

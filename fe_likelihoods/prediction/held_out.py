@@ -62,6 +62,8 @@ class HeldOutScores(NamedResults):
             lines.append(f"{name}: {shares} (intervals of 95 % for the share in further events)")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 class LeftOutTests(NamedResults):
     """The population without each test, `LeftOut` by name; ``print`` gives a table."""

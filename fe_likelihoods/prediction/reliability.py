@@ -104,6 +104,8 @@ class Exceedance(NamedTuple):
         said = f"\nThe probability contains {self.uncertainty}." if self.uncertainty else ""
         return text_table(rows) + said
 
+    __repr__ = __str__
+
 
 def exceedance(
     prediction_or_values: Prediction | ArrayLike,

@@ -212,6 +212,8 @@ class Share(NamedTuple):
         low, high = (100.0 * each for each in self.interval)
         return f"{self.inside} of {self.n}: {low:.0f} to {high:.0f} %"
 
+    __repr__ = __str__
+
 
 def share_within(pit: ArrayLike, level: float) -> Share:
     """Share of measured values within their central predicted intervals, from their PIT.

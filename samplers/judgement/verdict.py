@@ -233,6 +233,8 @@ class Verdict(_Stored):
             more = [f"At least about {needed}."]
         return " ".join([first, *(f"{reason[0].upper()}{reason[1:]}." for reason in self.reasons), *more])
 
+    __repr__ = __str__
+
 
 def judge(
     result: AnnealingResult,

@@ -84,7 +84,7 @@ class ModelComparison(NamedTuple):
         rows += [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join(rows)
 
-    __str__ = table
+    __str__ = __repr__ = table
 
 
 def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:

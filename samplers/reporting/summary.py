@@ -104,6 +104,8 @@ class Summary(NamedTuple):
             rows.append((name, *("-" if cell == "nan" else cell for cell in cells)))
         return "\n".join(aligned(rows))
 
+    __repr__ = __str__
+
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
     """The given names, or theta_0, theta_1, ...; ValueError if there is not one per parameter."""
@@ -258,6 +260,8 @@ class SamplerComparison(NamedTuple):
             evidence = "-" if value is None else f"{value:.3f} +- {error:.3f}"
             rows.append((name, str(n), time, f"{ess:.0f}", f"{ess / n:.2e}", evidence))
         return "\n".join(aligned(rows))
+
+    __repr__ = __str__
 
 
 def comparison_table(
