@@ -17,6 +17,11 @@ os.environ["FAST"] = "1"  # quick settings of the tutorials
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent / "tutorials")]  # `building`, and the modules that tutorials share
 
+import building  # noqa: E402
+from numpydoc.xref import DEFAULT_LINKS  # noqa: E402
+
+DEFAULT_LINKS.clear()  # to the sites of Python and NumPy, which a build without a network cannot look up
+
 project = "fe-likelihoods"
 author = "fe-likelihoods maintainers"
 release = metadata.version("fe-likelihoods")
@@ -40,9 +45,11 @@ html_css_files = ["wide.css"]
 default_role = "code"
 
 numpydoc_show_class_members = False  # autodoc shows the members with their docstrings
+numpydoc_xref_param_type = True  # types of arguments and results that are public names are links
+numpydoc_xref_aliases = building.entries()
+numpydoc_xref_ignore = "all"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings state types with shapes and units
-autodoc_default_options = {"show-inheritance": True}
 maximum_signature_line_length = 88  # one argument per line where a signature is longer
 
 
@@ -62,8 +69,6 @@ sphinx_gallery_conf = {
 
 
 def setup(app):
-    import building
-
     app.connect("builder-inited", building.remove_old_pages, priority=400)  # before the pages are written
     app.connect("doctree-read", building.link_names)
     app.connect("autodoc-skip-member", building.skip_fields)
