@@ -11,6 +11,7 @@ from sphinx import addnodes
 
 DOCS = Path(__file__).resolve().parent
 ENTRY = re.compile(r"^   ~?((?:fe_likelihoods|samplers)[\w.]+)$", re.MULTILINE)
+AMBIGUOUS = ("report", "summary")  # alone, also a command and functions of others
 # what the guide calls objects of these classes
 INSTANCES = {
     "hierarchy": "fe_likelihoods.Hierarchy",
@@ -48,6 +49,8 @@ def target_of(text: str) -> str | None:
     if not found:
         return None
     *owner, name = found[1].split(".")
+    if not owner and name in AMBIGUOUS and found[2] in (None, "()"):
+        return None
     if name in entries() and (not owner or owner[0] in ("fe_likelihoods", "samplers")):
         return entries()[name]
     owner = owner[-1] if owner else ""
@@ -65,7 +68,6 @@ def link_names(app, doctree) -> None:
             if isinstance(above, nodes.reference | addnodes.pending_xref | nodes.title):
                 target = None
             if isinstance(above, addnodes.desc):
-                arguments |= {re.match(r"\**(\w*)", each.astext())[1] for each in above[0].findall(nodes.paragraph)}
                 arguments |= {each.astext().split("=")[0] for each in above[0].findall(addnodes.desc_parameter)}
             above = above.parent
         if target and literal.astext() not in arguments:

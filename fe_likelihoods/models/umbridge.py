@@ -59,7 +59,7 @@ class UMBridgeModel(ExternalModel):
 
     Examples
     --------
-    A server at this address must run; :doc:`own_model` starts one.
+    A server at this address must run; ``docs/own_model.rst`` starts one.
 
     >>> remote = UMBridgeModel(
     ...     "http://localhost:4242", "forward", ["stiffness"], [Channel("top", "displacement", "mm")], dt=0.01

@@ -63,7 +63,7 @@ class DaskExecutor(PoolExecutor):
 
     Examples
     --------
-    The number of workers and cores is chosen on the cluster: see :doc:`clusters`.
+    The number of workers and cores is chosen on the cluster: see ``docs/clusters.rst``.
 
     >>> from distributed import Client
     >>> with Client(processes=False, n_workers=1, dashboard_address=":0") as client:
