@@ -80,10 +80,9 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     --------
     >>> judgement = check_result(sampler)
     >>> print(judgement)
-    Use.
-    >>> for finding in judgement.findings:
-    ...     print(finding.severity, finding)
-    note Step and mesh were not tested: ...
+    Use...
+    >>> print(judgement.findings[-1])  # the least severe
+    Step and mesh were not tested: ...
     """
     return judge_run(read_run(sampler, posterior, discard=discard)).judgement
 

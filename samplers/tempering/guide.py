@@ -113,8 +113,8 @@ class Guide(Protocol):
     ...         pass
     >>> guided = SMCSampler(50, posterior.ndim, posterior, vectorize=True, guide=Normal(), seed=1)
     >>> state = guided.run_mcmc(None, 1)
-    >>> guided.verdict.status
-    'converged'
+    >>> bool(guided.simulations < 1000 and abs(guided.log_evidence - sampler.log_evidence) < 1.0)
+    True
     """
 
     def draw(self, n: int, random: np.random.RandomState, /) -> np.ndarray:
