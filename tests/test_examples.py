@@ -60,6 +60,7 @@ def given() -> dict:
     return runpy.run_path(str(ROOT / "docs/examples.py")) | public
 
 
+@pytest.mark.filterwarnings("error::UserWarning")  # an example shows how it is done right
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_run_as_printed(name, given, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -102,7 +102,7 @@ class Guide(Protocol):
     A normal density near the posterior, which is not refined:
 
     >>> class Normal:
-    ...     concerns = ()  # there are no other modes
+    ...     findings = ()  # there are no other modes
     ...     mean, sd = samples.mean(axis=0), 1.5 * samples.std(axis=0)
     ...     def draw(self, n, random):
     ...         return random.normal(self.mean, self.sd, size=(n, len(self.mean)))
