@@ -67,6 +67,13 @@ class LimitState(NamedTuple):
         Limit [SI], or one limit for each sample of the prediction, such as fy/Es.
     source : str
         Where the limit comes from.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.column_damage.damage import LimitState
+    >>> wide = LimitState("wide cracks", "bar tension", 0.015, source="own tests")
+    >>> wide._replace(limit=0.02).limit
+    0.02
     """
 
     name: str

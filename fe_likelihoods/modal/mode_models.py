@@ -25,7 +25,14 @@ _STEP = 1e-4  # for central differences of matrices, as a share of a parameter
 
 
 def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
-    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor."""
+    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.modal.mode_models import modal_channels
+    >>> [channel.name for channel in modal_channels(["floor 1", "roof"])]
+    ['frequency', 'floor 1', 'roof']
+    """
     return Channel("frequency", "frequency", "Hz"), *(Channel(name, "dimensionless", "1") for name in sensors)
 
 
@@ -45,6 +52,14 @@ def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) ->
     ------
     SimulationFailed
         If a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies differ.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.modal.mode_models import modal_response
+    >>> modal_response([2.9, 7.8], [[0.62, 1.0], [-1.0, 0.62]])  # frequencies, then a row for each sensor
+    array([[ 2.9 ,  7.8 ],
+           [ 0.62, -1.  ],
+           [ 1.  ,  0.62]])
     """
     frequencies, shapes = np.asarray(frequencies, dtype=float), np.asarray(shapes)
     if frequencies.ndim != 1 or shapes.ndim != 2 or len(shapes) != len(frequencies):

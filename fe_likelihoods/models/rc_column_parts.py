@@ -300,6 +300,12 @@ class Patches:
         Number of wedges.
     core_rings, cover_rings : int
         Number of rings in the core and in the cover.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.models.rc_column_parts import Patches
+    >>> RCColumn.lhpost(record, mesh=Patches(wedges=20, core_rings=10)).mesh
+    Patches(wedges=20, core_rings=10, cover_rings=2)
     """
 
     wedges: int = 20

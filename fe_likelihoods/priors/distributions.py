@@ -55,6 +55,22 @@ class Distribution(ABC):
     logarithmic : bool
         Whether the parameter varies by factors rather than by differences: an emulator of the response is then a
         function of its logarithm. The parameter must be positive. False by default.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from fe_likelihoods.priors.distributions import Distribution
+    >>> @dataclass(frozen=True)
+    ... class Exponential(Distribution):
+    ...     mean: float
+    ...     bounds = (0.0, np.inf)
+    ...     moments = property(lambda self: (self.mean, self.mean))
+    ...     def _log_density(self, x):
+    ...         return -x / self.mean - np.log(self.mean)
+    ...     def _quantile(self, u):
+    ...         return -self.mean * np.log1p(-u)
+    >>> round(float(Exponential(2.0).ppf(0.5)), 3)
+    1.386
     """
 
     logarithmic: ClassVar[bool] = False

@@ -39,6 +39,12 @@ class Dataset(NamedTuple):
         The response.
     attributes : dict
         Free attributes, such as the true parameters of synthetic data.
+
+    Examples
+    --------
+    >>> data = problems.bridge_column_data("short")
+    >>> data.record.dt, data.measurements.values.shape
+    (0.015625, (2, 640))
     """
 
     record: Record

@@ -127,6 +127,17 @@ class Model(Protocol):
     Tables and figures use ``nominal``, the nominal values [SI] by parameter name, where parameters are multiples of
     nominal values; ``nominal_units`` with their units; and ``parameter_units`` with the units of other parameters, in
     words (`fe_likelihoods.likelihood.parameters.describe_parameters`).
+
+    Examples
+    --------
+    >>> class Pulse:
+    ...     parameter_names, channels, dt, n_steps = ("amplitude",), model.channels[1:], 0.05, 200
+    ...     fingerprint = "pulse, version 1"
+    ...     def simulate(self, theta):
+    ...         return theta[0] * np.exp(-time)[np.newaxis]
+    >>> own = FELikelihood(Pulse(), measurements.select(["displacement"]))
+    >>> own.parameter_names
+    ('amplitude', 'sigma_displacement')
     """
 
     @property
