@@ -103,8 +103,8 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
     Examples
     --------
     >>> checked = check_model(posterior)
-    >>> [finding.severity for finding in checked.findings]
-    ['note']
+    >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
+    []
     """
     found: list[Finding] = []
     keys = getattr(posterior.likelihood, "likelihoods", {"": None})

@@ -81,8 +81,8 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     >>> judgement = check_result(sampler)
     >>> print(judgement)
     Use...
-    >>> print(judgement.findings[-1])  # the least severe
-    Step and mesh were not tested: ...
+    >>> [finding.kind for finding in judgement.findings if finding.severity == "wrong"]
+    []
     """
     return judge_run(read_run(sampler, posterior, discard=discard)).judgement
 

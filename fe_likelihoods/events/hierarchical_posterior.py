@@ -62,7 +62,9 @@ class Varying:
 
     Examples
     --------
-    >>> Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))
+    >>> stiffness = Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))  # median, standard deviation of the logarithm
+    >>> stiffness.scale
+    'log'
     """
 
     location: Distribution

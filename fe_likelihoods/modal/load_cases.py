@@ -143,7 +143,8 @@ def read_load_test(
 
     Examples
     --------
-    >>> test = read_load_test("truck.csv", [Channel("midspan", "displacement", "mm")], errors={"midspan": 1e-4})
+    >>> from fe_likelihoods.modal.load_cases import read_load_test
+    >>> test = read_load_test("truck.csv", [Channel("midspan", "displacement", "mm")], errors={"midspan": 1e-4})  # doctest: +SKIP
     """
     table = read_table(path)
     names, values = [column.name for column in table.columns], []

@@ -124,7 +124,11 @@ class ModalLikelihood(FELikelihood):
 
         Examples
         --------
-        >>> print(likelihood.predict_modes(sampler.get_chain(flat=True), held_out))
+        >>> shapes, sensors = [[0.62, 1.0], [-1.0, 0.62]], ["floor 1", "roof"]
+        >>> modal = ModalLikelihood(frame, ModalData([2.9, 7.8], shapes, sensors, frequency_cv=0.005, shape_error=0.02))
+        >>> draws = np.random.default_rng(1).lognormal(0.0, 0.2, size=(100, 2))
+        >>> print(modal.predict_modes(draws))
+        mode  measured [Hz]  computed [Hz] ...
         """
         paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
         names = paired.parameter_names

@@ -167,10 +167,10 @@ def predict_new_event(
     >>> new = predict_new_event(hierarchy, posteriors, stronger, quantity=peak("displacement"))
     >>> print(new)  # doctest: +SAMPLED
     Prediction: 500 samples, of measured values, by the ratios of 3 events; effective sample size 500
-    the ratio of a new event has no mean: use the quantiles; 28% of their squared width is due to the prior of the
+    the ratio of a new event has no mean: use the quantiles; 50% of their squared width is due to the prior of the
     scatter between events
     value         unit  mean  MC error  sd   5 %  50 %  95 %
-    displacement    cm     -         -   -  12.7  18.1  26.5
+    displacement    cm     -         -   -  10.9    18  29.9
     """
     if not isinstance(posteriors, Mapping) or not posteriors:
         raise ValueError(

@@ -148,6 +148,7 @@ def arias_intensity(channel: str, part: slice = slice(None)) -> ChannelQuantity:
 
     Examples
     --------
+    >>> from fe_likelihoods.prediction.quantities import arias_intensity
     >>> print(propagate(posterior, samples, quantity=arias_intensity("acceleration")))  # doctest: +SAMPLED
     Prediction: 300 samples, without measurement noise; effective sample size 300
     value                            unit  mean  MC error     sd   5 %  50 %  95 %
@@ -185,6 +186,7 @@ def dissipated_energy(force: str, displacement: str | ArrayLike, part: slice = s
 
     Examples
     --------
+    >>> from fe_likelihoods.prediction.quantities import dissipated_energy
     >>> loops = RCColumn.lhpost(record, outputs=("base_shear", "displacement"))
     >>> print(propagate(loops, np.ones((1, 5)), quantity=dissipated_energy("base_shear", "displacement")))
     Prediction: 1 samples, without measurement noise; effective sample size 1
