@@ -144,7 +144,8 @@ def read_load_test(
     Examples
     --------
     >>> from fe_likelihoods.modal.load_cases import read_load_test
-    >>> test = read_load_test("truck.csv", [Channel("midspan", "displacement", "mm")], errors={"midspan": 1e-4})  # doctest: +SKIP
+    >>> sensors = [Channel("midspan", "displacement", "mm")]
+    >>> test = read_load_test("truck.csv", sensors, errors={"midspan": 1e-4})  # doctest: +SKIP
     """
     table = read_table(path)
     names, values = [column.name for column in table.columns], []
