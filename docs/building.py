@@ -1,13 +1,28 @@
-"""Parts of the documentation that are made when it is built: the API pages and the arguments of the tutorials."""
+"""Parts of the documentation that are made when it is built: links to the reference, and arguments of the tutorials."""
 
 import importlib
-import pkgutil
 import re
 import types
+from functools import cache
 from pathlib import Path
 
+from docutils import nodes
+from sphinx import addnodes
+
 DOCS = Path(__file__).resolve().parent
-PACKAGES = ("fe_likelihoods", "samplers")
+ENTRY = re.compile(r"^   ~?((?:fe_likelihoods|samplers)[\w.]+)$", re.MULTILINE)
+AMBIGUOUS = ("report", "summary")  # alone, also a command and functions of others
+# what the guide calls objects of these classes
+INSTANCES = {
+    "hierarchy": "fe_likelihoods.Hierarchy",
+    "likelihood": "fe_likelihoods.FELikelihood",
+    "measurements": "fe_likelihoods.Measurements",
+    "posterior": "fe_likelihoods.Posterior",
+    "prediction": "fe_likelihoods.prediction.prediction.Prediction",
+    "prior": "fe_likelihoods.Prior",
+    "record": "fe_likelihoods.Record",
+    "sampler": "samplers.SMCSampler",
+}
 
 
 def tutorial_arguments(gallery_conf: dict, script_vars: dict) -> list[str]:
@@ -15,54 +30,57 @@ def tutorial_arguments(gallery_conf: dict, script_vars: dict) -> list[str]:
     return ["--out", f"../docs/_build/tutorials/{Path(script_vars['src_file']).stem}"]
 
 
-def api_page(name: str, modules: list[str]) -> str:
-    """Page of a package or folder: its own docstring, then each of its modules under a heading."""
-    lines = [name, "=" * len(name), "", f".. automodule:: {name}", "   :no-members:", ""]
-    for module in modules:
-        title = module.removeprefix(f"{name}.")
-        lines += [title, "-" * len(title), "", f".. automodule:: {module}", ""]
-    return "\n".join(lines)
+@cache
+def entries() -> dict[str, str]:
+    """Path of every object that has a page in the reference (``api.rst``), by its name."""
+    paths = ENTRY.findall((DOCS / "api.rst").read_text())
+    return {path.rpartition(".")[2]: path for path in paths}
 
 
-def api_pages() -> dict[str, str]:
-    """Pages of the API reference, one per folder of the packages: name and text."""
-    pages = {}
-    for package in PACKAGES:
-        folder = importlib.import_module(package).__path__
-        inner = [
-            m for m in pkgutil.walk_packages(folder, f"{package}.") if not m.name.rpartition(".")[2].startswith("_")
-        ]
-        for name in [package, *(m.name for m in inner if m.ispkg)]:
-            modules = [m.name for m in inner if not m.ispkg and m.name.rpartition(".")[0] == name]
-            pages[name] = api_page(name, modules)
-    return pages
+def load(path: str):
+    """The object with an import path, such as ``fe_likelihoods.Record``."""
+    module, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(module), name)
 
 
-def write_api_pages(app) -> None:
-    """Write the pages into ``docs/api``, unless they are up to date there."""
-    folder = DOCS / "api"
-    folder.mkdir(exist_ok=True)
-    pages = {folder / f"{name}.rst": text for name, text in api_pages().items()}
-    for path in folder.glob("*.rst"):
-        if path not in pages:
-            path.unlink()
-    for path, text in pages.items():
-        if not path.exists() or path.read_text() != text:
-            path.write_text(text)
+def target_of(text: str) -> str | None:
+    """Path of the object that code in a text names: ``Record``, ``Record.trim``, ``propagate(...)``; else None."""
+    found = re.fullmatch(r"([A-Za-z_][\w.]*)(\(.*\))?", text, re.DOTALL)
+    if not found:
+        return None
+    *owner, name = found[1].split(".")
+    if not owner and name in AMBIGUOUS and found[2] in (None, "()"):
+        return None
+    if name in entries() and (not owner or owner[0] in ("fe_likelihoods", "samplers")):
+        return entries()[name]
+    owner = owner[-1] if owner else ""
+    path = entries().get(owner) or INSTANCES.get(owner)
+    if path is None or not hasattr(load(path), name) or getattr(load(path), name).__doc__ is None:
+        return None
+    return f"{path}.{name}"
 
 
-def show_kernels_as_functions(app, env, docnames) -> None:
-    """Replace compiled kernels by the Python functions that they are written as, which autodoc can read.
+def link_names(app, doctree) -> None:
+    """Make a link of each public name in code font, but not of arguments of the object that a docstring describes."""
+    for literal in list(doctree.findall(nodes.literal)):
+        target, above, arguments = target_of(literal.astext()), literal.parent, set()
+        while above is not None and target:
+            if isinstance(above, nodes.reference | addnodes.pending_xref | nodes.title):
+                target = None
+            if isinstance(above, addnodes.desc):
+                arguments |= {each.astext().split("=")[0] for each in above[0].findall(addnodes.desc_parameter)}
+            above = above.parent
+        if target and literal.astext() not in arguments:
+            link = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=target, refwarn=False)
+            literal.replace_self(link)
+            link += literal
 
-    The tutorials have been executed before this event.
-    """
-    from numba.core.dispatcher import Dispatcher
 
-    for package in PACKAGES:
-        path = importlib.import_module(package).__path__
-        for module in pkgutil.walk_packages(path, f"{package}."):
-            namespace = vars(importlib.import_module(module.name))
-            namespace.update({name: f.py_func for name, f in namespace.items() if isinstance(f, Dispatcher)})
+def remove_old_pages(app) -> None:
+    """Remove pages of an earlier build whose object is no longer in the reference: Sphinx would build them."""
+    for page in (DOCS / "api").glob("*.rst"):
+        if page.stem not in entries().values():
+            page.unlink()
 
 
 def keep_initials(app, what, name, obj, options, lines) -> None:

@@ -1,6 +1,7 @@
 """Settings of Sphinx. `make docs` builds the pages of this folder, the API reference and the tutorials.
 
-The API reference has one page per folder of the two packages, generated from the docstrings (``building.py``).
+The reference has one page per public name, generated from the docstrings (``api.rst``, ``_templates``); names in code
+font link to it (``building.py``).
 Tutorials 01 to 05 and 10 to 13 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
 fetch, and are shown without output. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
 ``docs/tutorials``.
@@ -16,19 +17,26 @@ os.environ["FAST"] = "1"  # quick settings of the tutorials
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent / "tutorials")]  # `building`, and the modules that tutorials share
 
+import building  # noqa: E402
+from numpydoc.xref import DEFAULT_LINKS  # noqa: E402
+
+DEFAULT_LINKS.clear()  # to the sites of Python and NumPy, which a build without a network cannot look up
+
 project = "fe-likelihoods"
 author = "fe-likelihoods maintainers"
 release = metadata.version("fe-likelihoods")
 
 extensions = [
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",  # a copy of MathJax in the pages: formulas are shown without a network
     "numpydoc",
     "sphinx.ext.viewcode",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
+templates_path = ["_templates"]
+exclude_patterns = ["_build", "_templates", "tutorials/*.ipynb", "tutorials/*.json", "tutorials/*.py"]
 html_theme = "furo"
 html_title = f"fe-likelihoods {release}"
 html_show_sphinx = html_show_copyright = False
@@ -37,9 +45,12 @@ html_css_files = ["wide.css"]
 default_role = "code"
 
 numpydoc_show_class_members = False  # autodoc shows the members with their docstrings
+numpydoc_xref_param_type = True  # types of arguments and results that are public names are links
+numpydoc_xref_aliases = building.entries()
+numpydoc_xref_ignore = "all"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings state types with shapes and units
-autodoc_default_options = {"members": True, "show-inheritance": True}
+maximum_signature_line_length = 88  # one argument per line where a signature is longer
 
 
 sphinx_gallery_conf = {
@@ -58,9 +69,7 @@ sphinx_gallery_conf = {
 
 
 def setup(app):
-    import building
-
-    app.connect("builder-inited", building.write_api_pages)
-    app.connect("env-before-read-docs", building.show_kernels_as_functions)
+    app.connect("builder-inited", building.remove_old_pages, priority=400)  # before the pages are written
+    app.connect("doctree-read", building.link_names)
     app.connect("autodoc-skip-member", building.skip_fields)
     app.connect("autodoc-process-docstring", building.keep_initials)

@@ -16,6 +16,12 @@ M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd (2022), Baye
 updating of a full-scale bridge-column using sequential Monte Carlo.
 P. Tsopelas, S. Okamoto, M. C. Constantinou, D. Ozaki, S. Fujii (1994), NCEER-TAISEI Corporation Research Program on
 Sliding Seismic Isolation Systems for Bridges, Report NCEER 94-0002, State University of New York, Buffalo.
+
+Examples
+--------
+>>> posterior = problems.bridge_column(data="short")
+>>> posterior.parameter_names
+['Ec', 'Es', 'a0', 'a1', 'ft', 'sigma_acceleration', 'sigma_displacement']
 """
 
 # The models are imported inside the functions that make them, because numba takes longer to import than all the rest.
@@ -109,6 +115,12 @@ def bridge_column_data(data: str = "eq1") -> Dataset:
     ------
     ValueError
         If there is no such set.
+
+    Examples
+    --------
+    >>> data = problems.bridge_column_data("short")
+    >>> data.record.duration
+    9.984375
     """
     if data not in _COLUMN_FILES:
         raise ValueError(f"expected data={', '.join(map(repr, _COLUMN_FILES))}; got {data!r}")
@@ -151,6 +163,11 @@ def bridge_column_measurements(
     -------
     Measurements
         The channels "acceleration" and "displacement", or those of the outputs.
+
+    Examples
+    --------
+    >>> problems.bridge_column_measurements(record, n_strips=40, substeps=1).values.shape
+    (2, 200)
     """
     from .models.rc_column import RCColumn
 
@@ -247,6 +264,12 @@ def bridge_column(
     ValueError
         If measurements are given without a record or do not match it, there is no such bundled set, or the noise is
         unknown.
+
+    Examples
+    --------
+    >>> posterior = problems.bridge_column(data="short")
+    >>> posterior.parameter_names
+    ['Ec', 'Es', 'a0', 'a1', 'ft', 'sigma_acceleration', 'sigma_displacement']
     """
     from .models.rc_column import RCColumn
 
@@ -481,6 +504,11 @@ def isolated_bridge(
     ------
     ValueError
         If a name is unknown, or measurements are given without a record or do not match it.
+
+    Examples
+    --------
+    >>> problems.isolated_bridge().ndim
+    11
     """
     from .models.isolated_bridge import IsolatedBridge
 

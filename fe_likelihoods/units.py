@@ -142,6 +142,13 @@ def to_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArray
     ------
     ValueError
         If the unit is unknown or has another dimension.
+
+    Examples
+    --------
+    >>> to_si([1.0, 2.0], "kN")
+    array([1000., 2000.])
+    >>> float(to_si(0.5, "g"))  # m/s²
+    4.903325
     """
     return np.asarray(values, dtype=np.float64) * find_unit(unit, dimension).factor
 
@@ -169,6 +176,13 @@ def from_si(values: ArrayLike, unit: str, dimension: str | None = None) -> NDArr
     ------
     ValueError
         If the unit is unknown or has another dimension.
+
+    Examples
+    --------
+    >>> float(from_si(9.80665, "g"))
+    1.0
+    >>> from_si([0.001, 0.0254], "mm")
+    array([ 1. , 25.4])
     """
     return np.asarray(values, dtype=np.float64) / find_unit(unit, dimension).factor
 

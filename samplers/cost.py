@@ -145,7 +145,9 @@ def estimate_cost(
 
     Examples
     --------
-    >>> print(estimate_cost(posterior, workers=64, seed=1))
+    >>> cost = estimate_cost(posterior, workers=4, seed=1)
+    >>> bool(0 < cost.evaluations.low < cost.evaluations.likely < cost.evaluations.high)
+    True
     """
     runs = as_whole_number("runs", runs)
     if runs < 2:

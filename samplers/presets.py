@@ -16,6 +16,12 @@ covariance 0.04 times the weighted covariance (Ching & Chen 2007, doi:10.1061/(A
 collapse on sharp posteriors; the default of `TMCMCSampler` does not.
 
 None of these settings makes sweeps over fast parameters, which are not in the papers.
+
+Examples
+--------
+>>> published = SMCSampler(100, posterior.ndim, posterior, vectorize=True, **presets.RAMANCHA_2022_LITERAL)
+>>> published.settings.min_moves, published.settings.resampling
+(10, 'multinomial')
 """
 
 from collections.abc import Mapping

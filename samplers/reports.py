@@ -33,7 +33,16 @@ OUR_PACKAGES = ("samplers", "emcee")
 
 
 class SamplingWarning(UserWarning):
-    """The result of a run may be wrong; the message says why and what to do."""
+    """The result of a run may be wrong; the message says why and what to do.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", SamplingWarning)  # a doubtful result ends the script
+    ...     sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1)
+    ...     state = sampler.run_mcmc(None, 1)
+    """
 
 
 def warn(message: str) -> None:
@@ -68,6 +77,12 @@ class Stage(NamedTuple):
         Sweeps over fast parameters count, so this can exceed the number of simulations. Entered by the sampler.
     seconds : float
         Wall time of the stage [s]. Entered by the sampler.
+
+    Examples
+    --------
+    >>> last = sampler.ladder[-1]
+    >>> last.beta
+    1.0
     """
 
     beta: float

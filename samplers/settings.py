@@ -75,6 +75,11 @@ class Settings:
         many workers. Recycling, or a guide, then proposes the next points while the last ones run. The choice of the
         proposals, and thus the result, depends on the order of arrival; every estimate is made from complete batches.
         Moves wait for all points.
+
+    Examples
+    --------
+    >>> SMCSampler(100, posterior.ndim, posterior, vectorize=True, min_moves=5).settings.min_moves
+    5
     """
 
     ess_ratio: float = 0.5

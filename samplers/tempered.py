@@ -107,6 +107,13 @@ class TemperedSampler(RunResults, EnsembleSampler):
         2 ndim walkers, no log-prior, or moves of emcee that need several walkers with ``chains="leaders"``.
     TypeError
         For a keyword that is not a setting.
+
+    Examples
+    --------
+    >>> isinstance(sampler, TemperedSampler)
+    True
+    >>> SMCSampler.setting_names[:3]
+    ('resampling', 'min_moves', 'max_moves')
     """
 
     setting_names: tuple[str, ...] = tuple(field.name for field in fields(Settings))
@@ -279,6 +286,14 @@ class TemperedSampler(RunResults, EnsembleSampler):
             If the function calls ``sys.exit`` in this process. In a worker process this is a failed evaluation.
 
         Nothing is stored for the points that were interrupted.
+
+        Examples
+        --------
+        >>> sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1)
+        >>> state = sampler.run_mcmc(None, 2)
+        >>> state = sampler.run_mcmc(None, 1)  # a step more
+        >>> sampler.iteration
+        3
         """
         state = None
         with interrupts_end_the_run():
@@ -323,7 +338,7 @@ class TemperedSampler(RunResults, EnsembleSampler):
         self._evaluator.pool = self.pool
         arguments = {"tune": tune, "thin_by": thin_by, "thin": thin, "store": store, "iterations": iterations}
         bar = {"progress": progress, "progress_kwargs": progress_kwargs}
-        start, provisional = time.perf_counter(), self._output.provisional
+        start, provisional, evaluations = time.perf_counter(), self._output.provisional, self.evaluations
         random_state = get_random(self).get_state()
         try:
             self._output.keep_in_memory()
@@ -367,18 +382,15 @@ class TemperedSampler(RunResults, EnsembleSampler):
             self._judge(missing, stored.coords)
             if ended:
                 yield from self._end_early(advanced, stored, new, missing, store)
-        except Exception:
+        except Exception as error:
             self._undo(random_state)
+            if self.evaluations > evaluations:  # not for an argument that was refused
+                error.add_note(f"{self._kept} When the cause is removed, call run_mcmc again to go on.")
             raise
         except (KeyboardInterrupt, SystemExit):
             with deferred_interrupts():
                 self._undo(random_state)
-            logger.warning(
-                "interrupted: %d evaluations and %d steps are kept in %s. Call run_mcmc again to go on",
-                self.evaluations,
-                self.iteration,
-                "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}",
-            )
+            logger.warning("interrupted: %s Call run_mcmc again to go on.", self._kept)
             raise
         finally:
             self._output.write_behind()
@@ -387,6 +399,12 @@ class TemperedSampler(RunResults, EnsembleSampler):
                 f"{self.failure_count - failures} evaluations failed and count as impossible "
                 f"({most_common_reasons(self._record.failed)}); see failures"
             )
+
+    @property
+    def _kept(self) -> str:
+        """What remains of a run that ends by an exception or an interrupt, and where."""
+        where = "this process" if self._record.path is None else f"{self._record.path} and {self.backend.filename}"
+        return f"{self.evaluations} evaluations and {self.iteration} steps are kept in {where}."
 
     def _undo(self, random_state: tuple) -> None:
         """Remove incomplete results: a part of a step, and the draws of a run that has not begun."""

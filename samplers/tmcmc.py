@@ -64,8 +64,10 @@ class TMCMCSampler(TemperedSampler):
 
     Examples
     --------
-    >>> sampler = TMCMCSampler(1000, posterior.ndim, posterior, vectorize=True)
-    >>> sampler.run_mcmc(None, 10)
+    >>> sampler = TMCMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=1)
+    >>> state = sampler.run_mcmc(None, 3)
+    >>> sampler.get_chain().shape  # steps, walkers, parameters
+    (3, 100, 4)
     """
 
     setting_names = (*MOVES, "coefficient_of_variation", "chains", "burn_in")

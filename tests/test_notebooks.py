@@ -15,7 +15,7 @@ from fe_likelihoods import (
     Posterior,
     TruncatedNormal,
 )
-from samplers import SMCSampler
+from samplers import SMCSampler, summary
 
 CHANNELS = (Channel("top <1>", "displacement", "mm"),)
 TIME = 0.01 * np.arange(50)
@@ -43,6 +43,8 @@ def test_a_sampler_shows_its_summary(posterior):
     sampler = SMCSampler(60, 3, posterior, vectorize=True, seed=1)
     assert "Not run yet" in text()
     sampler.run_mcmc(None, 2)
+    for table in (summary(sampler.get_chain(flat=True)), sampler.verdict):
+        assert repr(table) == str(table) and "array(" not in repr(table)
     assert f"Log-evidence {sampler.log_evidence:.2f}" in text() and str(sampler.verdict) in text()
     chain, (first, _, last) = sampler.get_chain(flat=True), text().splitlines()[-3:]
     assert last.startswith("sigma_top <1> [mm]")

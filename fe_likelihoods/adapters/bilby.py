@@ -60,8 +60,10 @@ def to_bilby(posterior: Posterior) -> BilbyProblem:
 
     Examples
     --------
+    >>> from fe_likelihoods.adapters import to_bilby
     >>> likelihood, priors = to_bilby(posterior)
-    >>> result = bilby.run_sampler(likelihood, priors, sampler="dynesty", nlive=500)
+    >>> list(priors)
+    ['stiffness', 'damping', 'sigma_acceleration', 'sigma_displacement']
     """
     import bilby
 

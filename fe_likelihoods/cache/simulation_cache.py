@@ -155,8 +155,10 @@ class SimulationCache:
 
     Examples
     --------
-    >>> likelihood = FELikelihood(model, measurements, cache="column.sqlite")
-    >>> likelihood.simulator.cache.info().simulations
+    >>> cached = FELikelihood(model, measurements, cache=SimulationCache("oscillator.sqlite"))
+    >>> value = cached.log_likelihood([1.1, 0.9, 0.1, 0.005])
+    >>> cached.simulator.cache.info().simulations
+    1
     """
 
     def __init__(

@@ -40,6 +40,8 @@ class Judgement(NamedTuple):
         text = f"{self.status[0].upper()}{self.status[1:]}"
         return f"{text}: {'; '.join(f'{kind[0].lower()}{kind[1:]}' for kind in reasons)}." if reasons else f"{text}."
 
+    __repr__ = __str__
+
     @property
     def width_factor(self) -> float:
         """Factor of standard deviations from the data, for the effective number of samples; 1 for white errors."""

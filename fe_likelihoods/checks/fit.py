@@ -70,8 +70,10 @@ def check_fit(posterior: Posterior, samples: Any = None) -> tuple[Finding, ...]:
 
     Examples
     --------
-    >>> for finding in check_fit(posterior, sampler.get_chain(flat=True)):
+    >>> wrong_sign = Measurements(measurements.channels, record.dt, -measurements.values)
+    >>> for finding in check_fit(Posterior(FELikelihood(model, wrong_sign), prior)):
     ...     print(finding.severity, finding)
+    wrong A sign may be wrong: Response and measurements have opposite signs...
     """
     points, found = draws_to_compare(posterior), []
     if samples is not None:

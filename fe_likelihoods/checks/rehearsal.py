@@ -102,8 +102,9 @@ def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *
 
     Examples
     --------
-    >>> for finding in check_model(posterior).findings:
-    ...     print(finding.severity, finding)
+    >>> checked = check_model(posterior)
+    >>> [finding.kind for finding in checked.findings if finding.severity == "wrong"]
+    []
     """
     found: list[Finding] = []
     keys = getattr(posterior.likelihood, "likelihoods", {"": None})

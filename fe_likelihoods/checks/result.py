@@ -80,8 +80,9 @@ def check_result(sampler: Any, posterior: Any = None, *, discard: int = 0) -> Ju
     --------
     >>> judgement = check_result(sampler)
     >>> print(judgement)
-    >>> for finding in judgement.findings:
-    ...     print(finding)
+    Use...
+    >>> [finding.kind for finding in judgement.findings if finding.severity == "wrong"]
+    []
     """
     return judge_run(read_run(sampler, posterior, discard=discard)).judgement
 

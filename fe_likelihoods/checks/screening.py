@@ -55,8 +55,10 @@ def check_data(measurements: Measurements, record: Record | Sequence[Record] | N
 
     Examples
     --------
-    >>> for finding in check_data(measurements, record):
+    >>> in_mm = measurements.values * [[1.0], [1000.0]]  # displacements in mm, given as m
+    >>> for finding in check_data(Measurements(measurements.channels, record.dt, in_mm), record):
     ...     print(finding.severity, finding)
+    care A size is not plausible: The peak of channel displacement is ...
     """
     motions = record if isinstance(record, list | tuple) else [] if record is None else [record]
     peaks = [(f"motion {each.name}", "motion", float(np.abs(each.acceleration).max())) for each in motions]

@@ -67,6 +67,13 @@ class LimitState(NamedTuple):
         Limit [SI], or one limit for each sample of the prediction, such as fy/Es.
     source : str
         Where the limit comes from.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.column_damage.damage import LimitState
+    >>> wide = LimitState("wide cracks", "bar tension", 0.015, source="own tests")
+    >>> wide._replace(limit=0.02).limit
+    0.02
     """
 
     name: str
@@ -170,6 +177,8 @@ class Damage(NamedTuple):
     def __str__(self) -> str:
         return self.table()
 
+    __repr__ = __str__
+
     def table(self) -> str:
         """Return the probabilities of the limit states and the quantiles of the measures after each event as text.
 
@@ -209,6 +218,20 @@ def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
     tuple of LimitState
         For a column: yield of a bar at the nominal fy/Es, and limits from the literature, which are **assumed**. Use
         ``limit._replace(limit=...)`` to change one.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> complete = replace(column, outputs=damage_outputs(column))
+    >>> for limit in limit_states(damage_measures(complete)):
+    ...     print(limit.name, limit.measure, limit.limit)
+    bar yield bar tension 0.002647887323943662
+    cover spalling cover compression 0.004
+    wide cracks bar tension 0.015
+    bar fracture bar tension 0.06
+    large residual drift residual drift 0.01
+    beyond repair Park-Ang index 0.4
+    collapse Park-Ang index 1.0
     """
     names = _names(measures)
     states = _ASSUMED
@@ -270,6 +293,20 @@ def damage(
     -----
     With ``from_state="end"`` the prediction, and therefore the damage, covers the new record only. For the damage that
     accumulates over several events, propagate a model whose loading is `Events`.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> quiet = record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0)
+    >>> complete = RCColumn.lhpost(quiet)
+    >>> complete = replace(complete, outputs=damage_outputs(complete))
+    >>> predicted = propagate(complete, np.ones((3, 5)), quantity=damage_measures(complete))
+    >>> print(damage(predicted, noise=False))
+    probability of                          shaking, rest
+    bar yield                                 1 (> 0.292)
+    ...
+    peak drift                       0.0091 0.0091 0.0091
+    ...
     """
     measures = prediction.quantity
     if not isinstance(measures, DamageMeasures):

@@ -200,7 +200,10 @@ def damage_outputs(column: Any) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> column = replace(column, outputs=damage_outputs(column))  # dataclasses.replace
+    >>> from dataclasses import replace
+    >>> complete = replace(column, outputs=damage_outputs(column))
+    >>> len(complete.channels)
+    23
     """
     sensors = _column_sensors(column)
     names = (sensors.displacement, sensors.acceleration, sensors.force)
@@ -252,6 +255,13 @@ def damage_measures(
     ValueError
         If a measure is unknown or needs a channel that the model lacks, the column is not under a `Record`, `events` is
         not the excitation of the model, or a setting is out of range.
+
+    Examples
+    --------
+    >>> measures = damage_measures(model, displacement="displacement", measures=["peak drift"], height=3.0)
+    >>> predicted = propagate(posterior, samples, quantity=measures)
+    >>> predicted.mean.round(4)  # doctest: +SAMPLED
+    array([[0.0275]])
     """
     from ..models.rc_column import RCColumn
 

@@ -64,6 +64,8 @@ class ParkAng(NamedTuple):
             f"{number(1e-3 * self.yield_force)} kN, beta {number(self.beta)}{said}"
         )
 
+    __repr__ = __str__
+
     def check(self) -> None:
         """Raise ValueError if a constant is no positive and finite number; `beta` may be zero."""
         for name, value in (("ultimate_displacement", self[0]), ("yield_force", self[1])):
@@ -107,6 +109,12 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
         If `theta` has another length, or no bar yields or none of the three events is reached up to a drift of 20 %.
     SimulationFailed
         If the analysis does not converge.
+
+    Examples
+    --------
+    >>> print(park_ang_constants(column))
+    Park-Ang index: ultimate displacement 365 mm, yield force 512 kN, beta 0.05 (static analysis at nominal
+    parameters: first yield of a bar, fracture of the hoops; beta assumed)
     """
     from ..models.rc_column_analysis import expect_fracture
 

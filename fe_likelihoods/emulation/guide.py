@@ -113,6 +113,11 @@ class ResponseGuide:
         counts as one.
     log_density_error : float
         Standard error of the log normalising constant of `log_density`.
+
+    Examples
+    --------
+    >>> guide = posterior.guide(starts=6)
+    >>> guided = SMCSampler(40, posterior.ndim, posterior, vectorize=True, guide=guide, seed=1)
     """
 
     # a response does not depend on how long its simulation takes

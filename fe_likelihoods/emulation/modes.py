@@ -436,8 +436,10 @@ def find_modes(posterior: Any, starts: int = 6, seed: Any = None, max_simulation
 
     Examples
     --------
-    >>> search = find_modes(posterior, seed=1)
-    >>> [(mode.parameters, mode.log_evidence) for mode in search.modes]
+    >>> from fe_likelihoods.emulation.modes import find_modes
+    >>> found = find_modes(posterior, seed=1)
+    >>> len(found.modes)
+    1
     """
     starts = check_starts(starts)
     target = ResponseTarget(posterior)

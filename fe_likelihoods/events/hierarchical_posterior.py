@@ -62,7 +62,9 @@ class Varying:
 
     Examples
     --------
-    >>> Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))
+    >>> stiffness = Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))  # median, standard deviation of the logarithm
+    >>> stiffness.scale
+    'log'
     """
 
     location: Distribution
@@ -134,9 +136,11 @@ class HierarchicalPosterior:
 
     Examples
     --------
-    >>> tests = {name: StoredPosterior(chain, posterior.prior) for name, chain in chains.items()}
-    >>> posterior = HierarchicalPosterior(tests, {"stiffness": Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))})
-    >>> sampler = SMCSampler(500, posterior.ndim, posterior, vectorize=True)
+    >>> varying = {"stiffness": Varying(LogNormal(1.0, 0.5), HalfNormal(0.3))}
+    >>> population = HierarchicalPosterior(tests, varying)
+    >>> population.parameter_names
+    ['median_stiffness', 'sd_log_stiffness']
+    >>> run = SMCSampler(100, population.ndim, population, vectorize=True)
     """
 
     def __init__(

@@ -54,8 +54,16 @@ class Hierarchy:
 
     Examples
     --------
-    >>> hierarchy = Hierarchy(posterior, sampler.get_chain(flat=True))
-    >>> prediction = propagate(model, hierarchy.new_test(500), record=record)
+    >>> new = hierarchy.new_test(500, rng=1)
+    >>> new["stiffness"].shape
+    (500,)
+    >>> print(hierarchy)
+    Population of 3 tests, 200 samples: north, middle, south
+    hyper-parameter ...
+    median_stiffness ...
+    sd_log_stiffness ...
+    damping ...
+    The tests differ in stiffness by ...
     """
 
     def __init__(self, posterior: HierarchicalPosterior, samples: Any, seed: int = 0) -> None:
@@ -158,6 +166,11 @@ class Hierarchy:
         -----
         UserWarning
             If more than 1 % of the draws are outside the tests' prior bounds; the parameters are named.
+
+        Examples
+        --------
+        >>> sorted(hierarchy.new_test(100, rng=1))
+        ['damping', 'stiffness']
         """
         if not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")

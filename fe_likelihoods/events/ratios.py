@@ -117,7 +117,9 @@ class EventRatios:
 
     Examples
     --------
-    >>> EventRatios([0.95, 1.08, 0.99, 1.04]).quantile(0.95)  # upper end of the 90 % interval of a new ratio
+    >>> ratios = EventRatios([0.95, 1.08, 0.99, 1.04])
+    >>> [round(float(ratios.quantile(p)), 2) for p in (0.05, 0.5, 0.95)]  # of a new ratio
+    [0.82, 1.01, 1.25]
     """
 
     values: ArrayLike
@@ -234,6 +236,11 @@ class EventRatios:
         ------
         ValueError
             If a probability is not between 0 and 1, or a predicted value is not positive.
+
+        Examples
+        --------
+        >>> round(float(EventRatios([0.95, 1.08, 0.99, 1.04]).quantile(0.95)), 2)
+        1.25
         """
         predicted, probability = np.asarray(predicted, dtype=float), np.asarray(probability, dtype=float)
         if not ((0.0 < probability) & (probability < 1.0)).all() or not _positive(predicted):

@@ -60,6 +60,8 @@ class HierarchyChecks(NamedTuple):
         lines.append(f"error of the log-evidence: {self.log_evidence_error:.2f}")
         return "\n".join([*lines, *map(str, self.findings)])
 
+    __repr__ = __str__
+
 
 def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, seed: int = 0) -> HierarchyChecks:
     """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""

@@ -104,6 +104,8 @@ class StiffnessLoss(NamedTuple):
         ]
         return "\n".join([*lines, *labelled(self.findings)])
 
+    __repr__ = __str__
+
 
 def stiffness_loss(
     before: StoredPosterior,
@@ -160,8 +162,12 @@ def stiffness_loss(
 
     Examples
     --------
-    >>> found = stiffness_loss(StoredPosterior.from_run(run1), StoredPosterior.from_run(run2), ["k_1", "k_2"])
-    >>> found.probability(0.1), found.presence(0.1)
+    >>> draw, wide = np.random.default_rng(1).normal, Prior({"k_1": LogNormal(1.0, 0.5), "k_2": LogNormal(1.0, 0.5)})
+    >>> before = StoredPosterior(draw([1.0, 1.0], 0.03, size=(500, 2)), wide)
+    >>> after = StoredPosterior(draw([0.7, 1.0], 0.03, size=(500, 2)), wide)
+    >>> found = stiffness_loss(before, after, ["k_1", "k_2"])
+    >>> found.probability(0.1).round(1)  # of a loss of 10 % or more, in each storey
+    array([0.9, 0. ])
     """
     names = tuple(names)
     _check(names, presence, damaged, common, most, n_draws)

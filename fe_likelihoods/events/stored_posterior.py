@@ -71,7 +71,9 @@ class StoredPosterior:
 
     Examples
     --------
-    >>> StoredPosterior(sampler.get_chain(flat=True), posterior.prior, log_evidence=sampler.log_evidence)
+    >>> stored = StoredPosterior(samples, posterior.prior, log_evidence=sampler.log_evidence)
+    >>> stored.samples.shape
+    (300, 4)
     """
 
     samples: Any
@@ -99,6 +101,11 @@ class StoredPosterior:
         Returns
         -------
         StoredPosterior
+
+        Examples
+        --------
+        >>> StoredPosterior.from_run(sampler, posterior).samples.shape
+        (300, 4)
         """
         verdict, signed = sampler.verdict, sampler.signed_sample
         findings = [each for each in verdict.findings if each.severity != NOTE]

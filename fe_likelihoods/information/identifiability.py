@@ -157,6 +157,8 @@ class Identifiability(NamedTuple):
     def __str__(self) -> str:
         return " ".join(self.sentences)
 
+    __repr__ = __str__
+
 
 def _percent(share: float) -> str:
     return f"{100.0 * min(share, 1.0):.2g}" if share < 0.995 else "100"
@@ -290,9 +292,8 @@ def identifiability(
 
     Examples
     --------
-    >>> print(identifiability(posterior))
-    These data determine Ec and Es (5 and 8 % of the prior's standard deviation are left). They say little of a1 (95 %
-    of the prior's standard deviation is left).
+    >>> print(identifiability(posterior, samples))  # doctest: +SAMPLED
+    These data determine stiffness and damping (1.1 and 2.5 % of the prior's standard deviation are left).
     """
     if samples is not None:
         return of_samples(posterior, samples)

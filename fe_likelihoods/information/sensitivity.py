@@ -77,6 +77,8 @@ class Sensitivity(NamedTuple):
             lines.append("The emulator is rough: the indices need more simulations.")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def sensitivity(
     model: Model,
@@ -122,7 +124,11 @@ def sensitivity(
 
     Examples
     --------
-    >>> print(sensitivity(model, posterior, peak("displacement")))
+    >>> print(sensitivity(model, prior, peak("displacement"), simulations=60))  # doctest: +SAMPLED
+    parameter        first        total
+    stiffness  0.23 ± 0.03  0.32 ± 0.04
+    damping    0.68 ± 0.04  0.77 ± 0.03
+    From 60 simulations; the emulator leaves 1.4 % unexplained.
     """
     given = getattr(prior, "prior", prior)
     known = (given if isinstance(given, Prior) else Prior(given)).subset(model.parameter_names)

@@ -136,6 +136,8 @@ class SensorRanking(NamedTuple):
         ]
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def _with_error(value: float, error: float) -> str:
     return number(value) if np.isnan(error) else f"{number(value)} ± {number(error, 2)}"
@@ -298,8 +300,14 @@ def rank_sensors(
 
     Examples
     --------
-    >>> column = RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5", "strain@1.2:0.5"))
-    >>> print(rank_sensors(column, posterior, target=peak("displacement"), target_model=column.with_record(design)))
+    >>> building = LinearStructure(frame, record)
+    >>> storeys = {name: LogNormal(1.0, 0.2) for name in building.parameter_names}
+    >>> print(rank_sensors(building, storeys, draws=20))  # doctest: +SAMPLED
+    2 of 2 sensors, from derivatives at 20 draws (100 simulations)
+    sensor    alone [nat]     gain [nat]  together [nat]     lead [nat]
+    roof     2.81 ± 0.068   2.81 ± 0.068    2.81 ± 0.068  0.502 ± 0.023
+    floor 1  2.31 ± 0.071  0.948 ± 0.024    3.76 ± 0.091              -
+    Standard deviations left with all of them: stiffness_1 24 %, stiffness_2 59 %, damping_1 22 %, damping_2 99 %
     """
     given = getattr(prior, "prior", prior)
     given = given if isinstance(given, Prior) else Prior(given)

@@ -62,8 +62,10 @@ class JointLikelihood(SumOfParts):
 
     Examples
     --------
-    >>> joint = JointLikelihood({"component": bearing_test, "system": bridge_test})
-    >>> posterior = Posterior(joint, prior)
+    >>> second = FELikelihood(LinearOscillator(record, period=0.5), measurements)
+    >>> joint = JointLikelihood({"first": likelihood, "second": second}, separate=["damping"])
+    >>> joint.parameter_names
+    ('stiffness', 'damping_first', 'damping_second', 'sigma_acceleration', 'sigma_displacement')
     """
 
     def __init__(self, likelihoods: Mapping[str, FELikelihood], *, separate: Sequence[str] = ()) -> None:
@@ -150,6 +152,12 @@ class JointLikelihood(SumOfParts):
         ------
         ValueError
             If the name is unknown, a parameter is missing, or an array has another shape.
+
+        Examples
+        --------
+        >>> joint = JointLikelihood({"first": likelihood, "second": likelihood}, separate=["damping"])
+        >>> sorted(joint.samples_of("second", np.ones((3, 5))))
+        ['damping', 'stiffness']
         """
         likelihood = self[name]
         if not isinstance(samples, Mapping):

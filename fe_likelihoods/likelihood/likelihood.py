@@ -104,6 +104,15 @@ class FELikelihood(SumOfParts):
     -----
     UserWarning
         If noise is a share of the level in only a part of the motion, because samples are missing.
+
+    Examples
+    --------
+    >>> likelihood = FELikelihood(model, measurements)
+    >>> likelihood.parameter_names
+    ('stiffness', 'damping', 'sigma_acceleration', 'sigma_displacement')
+    >>> true, nominal = likelihood.log_likelihood([[1.1, 0.9, 0.5, 0.02], [1.0, 1.0, 0.5, 0.02]])
+    >>> bool(true > nominal)
+    True
     """
 
     def __init__(
@@ -193,6 +202,11 @@ class FELikelihood(SumOfParts):
         ------
         ValueError
             If the model cannot be shortened, or the time is not within the measurements.
+
+        Examples
+        --------
+        >>> likelihood.first(5.0).n_samples
+        101
         """
         measurements = self.measurements.trim(0.0, seconds)
         # the time of a sample, which leaves no doubt about the length of the response
@@ -224,6 +238,11 @@ class FELikelihood(SumOfParts):
             For a wrong number of parameters.
         SimulationFailed
             If the simulation fails.
+
+        Examples
+        --------
+        >>> likelihood.residuals([1.1, 0.9]).shape  # measured minus simulated
+        (2, 200)
         """
         theta = np.asarray(theta, dtype=float)
         n_structural = self.simulator.n_structural
@@ -305,7 +324,15 @@ class FELikelihood(SumOfParts):
         return [self.fingerprint, type(noise).__qualname__, *noise.parameter_names, complete_repr(noise)]
 
     def report(self) -> dict:
-        """Summary of the simulations, see `Posterior.report`."""
+        """Summary of the simulations, see `Posterior.report`.
+
+        Examples
+        --------
+        >>> once = FELikelihood(model, measurements)
+        >>> values = once.log_likelihood([[1.1, 0.9, 0.5, 0.02], [1.1, 0.9, 0.6, 0.02]])  # another noise: no simulation
+        >>> once.report()["simulations"]
+        1
+        """
         return self.simulator.report()
 
     def marginal(self, priors: Mapping[str, Distribution]) -> "FELikelihood":

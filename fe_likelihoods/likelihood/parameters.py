@@ -35,6 +35,11 @@ class Parameter(NamedTuple):
         Nominal value, in the unit of the samples: 1 for multiples of nominal values, NaN where none is known.
     multiple_of : str
         What a multiple is a multiple of, such as "28.3 GPa"; empty for other parameters.
+
+    Examples
+    --------
+    >>> [parameter.label for parameter in posterior.parameters]
+    ['stiffness [x nominal]', 'damping [x nominal]', 'sigma_acceleration [g]', 'sigma_displacement [cm]']
     """
 
     name: str

@@ -52,9 +52,12 @@ class Posterior:
 
     Examples
     --------
-    >>> posterior = Posterior(FELikelihood(model, measurements), prior)
-    >>> sampler = emcee.EnsembleSampler(32, posterior.ndim, posterior, vectorize=True)
-    >>> sampler.run_mcmc(posterior.sample_start(32), 1000)
+    >>> posterior = Posterior(likelihood, prior)
+    >>> posterior.parameter_names
+    ['stiffness', 'damping', 'sigma_acceleration', 'sigma_displacement']
+    >>> log_density = posterior([1.1, 0.9, 0.1, 0.005])
+    >>> posterior(posterior.sample_prior(5, rng=1)).shape  # many points at once
+    (5,)
     """
 
     def __init__(
@@ -114,7 +117,15 @@ class Posterior:
         return self.likelihood.data_fingerprint
 
     def log_prob(self, x: Any) -> np.ndarray | float:
-        """Log-prior plus log-likelihood: the posterior density up to the evidence."""
+        """Log-prior plus log-likelihood: the posterior density up to the evidence.
+
+        Examples
+        --------
+        >>> bool(posterior.log_prob([1.1, 0.9, 0.5, 0.02]) == posterior([1.1, 0.9, 0.5, 0.02]))
+        True
+        >>> posterior.log_prob([-1.0, 0.9, 0.5, 0.02])  # outside the prior: nothing is simulated
+        -inf
+        """
         points = as_points(x, self.prior.names)
         log_prior = self.prior.logpdf(points)
         return log_prior + self.likelihood.log_likelihood(points, log_prior > -np.inf)
@@ -154,7 +165,13 @@ class Posterior:
         return possible if points.ndim == 2 else bool(possible[0])
 
     def prior_transform(self, u: np.ndarray) -> np.ndarray:
-        """Map from the unit cube to the parameters, (ndim,) or (n, ndim), for nested samplers."""
+        """Map from the unit cube to the parameters, (ndim,) or (n, ndim), for nested samplers.
+
+        Examples
+        --------
+        >>> posterior.prior_transform([0.5, 0.5, 0.5, 0.5]).round(3)  # medians of the prior
+        array([1.   , 2.1  , 0.674, 0.034])
+        """
         return self.prior.transform(u)
 
     def sample_prior(self, n: int, rng: RandomState = None) -> np.ndarray:
@@ -169,6 +186,11 @@ class Posterior:
         Returns
         -------
         (n, ndim) float
+
+        Examples
+        --------
+        >>> posterior.sample_prior(1000, rng=1).shape
+        (1000, 4)
         """
         return self.prior.rvs(n, rng)
 
@@ -192,6 +214,12 @@ class Posterior:
         ------
         ValueError
             If fewer than n simulations succeed among the largest of 100 n and 1000 draws.
+
+        Examples
+        --------
+        >>> start = posterior.sample_start(32, rng=1)
+        >>> bool(np.all(np.isfinite(posterior(start))))
+        True
         """
         rng = np.random.default_rng(rng) if isinstance(rng, int | np.integer) else rng
         found = np.empty((0, self.ndim))
@@ -206,7 +234,13 @@ class Posterior:
         )
 
     def first(self, seconds: float) -> "Posterior":
-        """The posterior of the first part of the measurements, see `FELikelihood.first`."""
+        """The posterior of the first part of the measurements, see `FELikelihood.first`.
+
+        Examples
+        --------
+        >>> posterior.first(5.0).likelihood.n_samples
+        101
+        """
         return Posterior(self.likelihood.first(seconds), self.prior)
 
     def marginal(self) -> "Posterior":
@@ -220,6 +254,11 @@ class Posterior:
         ------
         ValueError
             If the noise is not white, has sensor noise, or is integrated out already.
+
+        Examples
+        --------
+        >>> posterior.marginal().parameter_names
+        ['stiffness', 'damping']
         """
         likelihood = self.likelihood.marginal(self.prior.distributions)
         return Posterior(likelihood, self.prior.subset(likelihood.parameter_names))
@@ -248,6 +287,13 @@ class Posterior:
         ValueError
             If the noise is not integrated out (its parameters are in the samples), or if a simulation fails or fits
             exactly.
+
+        Examples
+        --------
+        >>> marginal = posterior.marginal()
+        >>> complete = marginal.draw_noise(samples[:, :2], rng=1)
+        >>> sorted(complete)
+        ['damping', 'sigma_acceleration', 'sigma_displacement', 'stiffness']
         """
         return self.likelihood.draw_noise(x, rng)
 
@@ -277,6 +323,13 @@ class Posterior:
         -----
         The likelihood caches the responses that the guide requests, in memory and in the file of its cache, so another
         sampler with a guide repeats no simulation of them.
+
+        Examples
+        --------
+        >>> guided = SMCSampler(40, posterior.ndim, posterior, vectorize=True, guide=posterior.guide(), seed=1)
+        >>> state = guided.run_mcmc(None, 1)
+        >>> bool(10 * guided.simulations < sampler.simulations)
+        True
         """
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
@@ -354,8 +407,9 @@ class Posterior:
         --------
         >>> with posterior.evaluation_queue() as queue:
         ...     tickets = queue.submit(posterior.sample_prior(100))
-        ...     for ticket, log_prob in queue.collect():    # the first that have ended
-        ...         print(ticket, log_prob)
+        ...     ended = queue.collect()  # tickets and log-probabilities of the first that have ended
+        >>> ended[0][0] in tickets
+        True
         """
         return EvaluationQueue(self.likelihood, self.prior, responses)
 
@@ -403,6 +457,13 @@ class Posterior:
             the cause is not the model; the first 1000), ``failure_count``, ``transient_failures`` (failures that a
             later run simulates again, see `FailureLog`), ``failure_reasons`` (count per reason), ``seconds`` (wall time
             of the simulations). For a `JointLikelihood` also ``likelihoods``, the report of each part.
+
+        Examples
+        --------
+        >>> once = Posterior(FELikelihood(model, measurements), prior)
+        >>> value = once([1.1, 0.9, 0.5, 0.02])
+        >>> once.report()["simulations"]
+        1
         """
         return self.likelihood.report()
 

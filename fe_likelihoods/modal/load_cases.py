@@ -48,9 +48,12 @@ class LoadTest:
 
     Examples
     --------
-    >>> test = LoadTest(channels, ["truck at midspan", "truck at quarter point"], to_si(deflections, "mm"))
-    >>> model = test.model(deflection, ("EI",))
-    >>> posterior = Posterior(FELikelihood(model, test.measurements), {"EI": LogNormal(1.0, 0.3)} | test.known)
+    >>> from fe_likelihoods.modal.load_cases import LoadTest
+    >>> midspan = Channel("midspan", "displacement", "mm")
+    >>> test = LoadTest([midspan], ["truck at midspan", "two trucks"], [[0.0021, 0.0039]], errors={"midspan": 1e-4})
+    >>> bridge = test.model(lambda theta: np.array([[0.002, 0.004]]) / theta[0], ["EI"])
+    >>> Posterior(FELikelihood(bridge, test.measurements), {"EI": LogNormal(1.0, 0.3)} | test.known).parameter_names
+    ['EI']
     """
 
     channels: Sequence[Channel]
@@ -140,7 +143,9 @@ def read_load_test(
 
     Examples
     --------
-    >>> test = read_load_test("truck.csv", [Channel("midspan", "displacement", "mm")], errors={"midspan": 1e-4})
+    >>> from fe_likelihoods.modal.load_cases import read_load_test
+    >>> sensors = [Channel("midspan", "displacement", "mm")]
+    >>> test = read_load_test("truck.csv", sensors, errors={"midspan": 1e-4})  # doctest: +SKIP
     """
     table = read_table(path)
     names, values = [column.name for column in table.columns], []

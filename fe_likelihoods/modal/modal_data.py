@@ -58,8 +58,10 @@ class ModalData:
 
     Examples
     --------
-    >>> data = ModalData([0.88, 2.75], [[0.38, 0.72, 0.96, 1.0], [-1.0, -0.72, 0.26, 0.84]],
-    ...                  ["floor 1", "floor 2", "floor 3", "floor 4"], frequency_cv=0.005, shape_error=0.02)
+    >>> identified = ModalData([2.9, 7.8], [[0.62, 1.0], [-1.0, 0.62]], ["floor 1", "roof"],
+    ...                        frequency_cv=0.005, shape_error=0.02)
+    >>> identified.shapes.shape  # identifications, modes, sensors
+    (1, 2, 2)
     """
 
     frequencies: Any
@@ -270,6 +272,13 @@ def real_shapes(shapes: Any) -> tuple[np.ndarray, np.ndarray]:
     scatter : (...,) float
         Angles whose tangent is the norm of the imaginary parts over the norm of the real parts that is left [deg]:
         below about 10 degrees, little is lost.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.modal.modal_data import real_shapes
+    >>> shapes, phases = real_shapes([[1.0 + 0.1j, 2.0 + 0.2j]])
+    >>> (shapes / shapes[0, 0]).round(2)
+    array([[1., 2.]])
     """
     shapes = np.asarray(shapes, dtype=complex)
     turned = shapes * np.exp(-0.5j * np.angle(np.square(shapes).sum(axis=-1, keepdims=True)))

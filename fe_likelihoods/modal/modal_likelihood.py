@@ -61,10 +61,12 @@ class ModalLikelihood(FELikelihood):
 
     Examples
     --------
-    >>> likelihood = ModalLikelihood(ShearFrame(floors, masses, stiffnesses), data)
-    >>> prior = {name: LogNormal(1.0, 0.2) for name in likelihood.model.parameter_names}
-    >>> errors = {"frequency_error": LogNormal(0.005, 0.5), "shape_error": LogNormal(0.03, 0.5)}
-    >>> posterior = Posterior(likelihood, prior | errors)
+    >>> identified = ModalData([2.9, 7.8], [[0.62, 1.0], [-1.0, 0.62]], ["floor 1", "roof"],
+    ...                        frequency_cv=0.005, shape_error=0.02)
+    >>> modal = ModalLikelihood(frame, identified)
+    >>> calibrated = Posterior(modal, {name: LogNormal(1.0, 0.2) for name in modal.parameter_names})
+    >>> calibrated.parameter_names
+    ['stiffness_1', 'stiffness_2']
     """
 
     def __init__(
@@ -122,7 +124,11 @@ class ModalLikelihood(FELikelihood):
 
         Examples
         --------
-        >>> print(likelihood.predict_modes(sampler.get_chain(flat=True), held_out))
+        >>> shapes, sensors = [[0.62, 1.0], [-1.0, 0.62]], ["floor 1", "roof"]
+        >>> modal = ModalLikelihood(frame, ModalData([2.9, 7.8], shapes, sensors, frequency_cv=0.005, shape_error=0.02))
+        >>> draws = np.random.default_rng(1).lognormal(0.0, 0.2, size=(100, 2))
+        >>> print(modal.predict_modes(draws))
+        mode  measured [Hz]  computed [Hz] ...
         """
         paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
         names = paired.parameter_names

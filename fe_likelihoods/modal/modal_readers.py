@@ -78,7 +78,11 @@ def read_modal_data(
 
     Examples
     --------
-    >>> data = read_modal_data("modes.csv", frequency_cv=0.005, shape_error=0.02)
+    >>> table = [[2.9, 0.62, 1.0], [7.8, -1.0, 0.62]]
+    >>> np.savetxt("modes.csv", table, delimiter=",", header="frequency_Hz,floor 1,roof", comments="")
+    >>> identified = read_modal_data("modes.csv", frequency_cv=0.005, shape_error=0.02)
+    >>> identified.sensors
+    ('floor 1', 'roof')
     """
     if hasattr(source, "Fn") and hasattr(source, "Phi"):
         return _of_result(source, sensors, options)

@@ -25,7 +25,14 @@ _STEP = 1e-4  # for central differences of matrices, as a share of a parameter
 
 
 def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
-    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor."""
+    """Channels of a model that has modes: ``frequency`` [Hz], and the component of the shapes at each sensor.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.modal.mode_models import modal_channels
+    >>> [channel.name for channel in modal_channels(["floor 1", "roof"])]
+    ['frequency', 'floor 1', 'roof']
+    """
     return Channel("frequency", "frequency", "Hz"), *(Channel(name, "dimensionless", "1") for name in sensors)
 
 
@@ -45,6 +52,14 @@ def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) ->
     ------
     SimulationFailed
         If a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies differ.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.modal.mode_models import modal_response
+    >>> modal_response([2.9, 7.8], [[0.62, 1.0], [-1.0, 0.62]])  # frequencies, then a row for each sensor
+    array([[ 2.9 ,  7.8 ],
+           [ 0.62, -1.  ],
+           [ 1.  ,  0.62]])
     """
     frequencies, shapes = np.asarray(frequencies, dtype=float), np.asarray(shapes)
     if frequencies.ndim != 1 or shapes.ndim != 2 or len(shapes) != len(frequencies):
@@ -140,10 +155,12 @@ class FunctionModes(FunctionModel):
 
     Examples
     --------
-    >>> def frame(theta):
+    >>> def stiffness_and_mass(theta):
     ...     k1, k2 = theta
     ...     return np.array([[k1 + k2, -k2], [-k2, k2]]), np.eye(2)
-    >>> model = FunctionModes(frame, ("k1", "k2"), {"floor 1": 0, "floor 2": 1}, 2)
+    >>> modes = FunctionModes(stiffness_and_mass, ["k1", "k2"], {"floor 1": 0, "floor 2": 1}, n_modes=2)
+    >>> modes.simulate([900.0, 900.0]).shape
+    (3, 2)
     """
 
     def __init__(

@@ -83,9 +83,11 @@ class EquivalentLinear:
 
     Examples
     --------
-    >>> deck = EquivalentLinear(BridgeDeck("ch7"), reference=0.003)
-    >>> model = LinearStructure(deck, [footing, south_end, north_end])
-    >>> (acceleration,) = model.simulate([4.5, 0.1, 0.8, 0.15, 0.3])
+    >>> deck = EquivalentLinear(BridgeDeck("middle"), reference=0.003)
+    >>> deck.parameter_names
+    ('frequency', 'damping', 'share', 'softening', 'damping_growth')
+    >>> bridge = LinearStructure(deck, [record, record, record])
+    >>> (acceleration,) = bridge.simulate([4.5, 0.1, 0.8, 0.15, 0.3])
     """
 
     parts: Parts

@@ -114,10 +114,16 @@ class ExecutableModel(UserModel):
 
     Examples
     --------
-    >>> model = ExecutableModel(
-    ...     ["frame3d", "column.inp"], {"column.inp": Path("column.template")}, "top.out", ("stiffness",),
-    ...     (Channel("top", "relative displacement", "mm"),), 0.01, 2000, time_limit=60.0,
+    A program that reads ``case.txt`` and writes one line per sample into ``top.txt``:
+
+    >>> import sys
+    >>> code = "k = float(open('case.txt').read()); print(0.1 / k, file=open('top.txt', 'w'))"
+    >>> program = ExecutableModel(
+    ...     [sys.executable, "-c", code], {"case.txt": "$stiffness"}, "top.txt", ["stiffness"],
+    ...     [Channel("top", "displacement", "mm")], dt=0.01, n_steps=1, time_limit=60.0,
     ... )
+    >>> program.simulate([2.0])
+    array([[0.05]])
     """
 
     def __init__(

@@ -99,13 +99,21 @@ class FunctionModel(UserModel):
 
     Examples
     --------
-    >>> def cantilever(theta): ...
-    >>> model = FunctionModel(cantilever, ("stiffness",), (Channel("tip", "displacement", "mm"),), 0.01, 2000)
+    >>> def free_vibration(theta):
+    ...     return np.exp(-0.3 * time) * np.cos(6.0 * np.sqrt(theta[0]) * time)[np.newaxis]
+    >>> top = Channel("top", "displacement", "mm")
+    >>> function = FunctionModel(free_vibration, ["stiffness"], [top], dt=0.05, n_steps=200)
+    >>> function.simulate([1.1]).shape
+    (1, 200)
 
-    With the excitation as an argument of the function:
+    With the excitation as an argument of the function, for predictions under other records:
 
-    >>> def shaken(theta, record): ...
-    >>> model = FunctionModel(shaken, ("stiffness",), (Channel("tip", "displacement", "mm"),), record=eq1)
+    >>> def at_rest(theta, record):
+    ...     return theta[0] * record.acceleration[np.newaxis]
+    >>> base = Channel("base", "acceleration", "g")
+    >>> function = FunctionModel(at_rest, ["gain"], [base], record=record)
+    >>> function.with_record(record.trim(0.0, 5.0)).simulate([1.0]).shape
+    (1, 101)
     """
 
     def __init__(

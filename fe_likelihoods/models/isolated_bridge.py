@@ -157,6 +157,14 @@ class IsolatedBridge(ThreadedModel):
     ``Kd_1``, ``Kd_2``      spring stiffness of one damper [N/m]
     ``C0_1``, ``C0_2``      dashpot coefficient of one damper [N s/m]
     ======================  ==================================================================
+
+    Examples
+    --------
+    >>> bridge = IsolatedBridge(record.resample(0.005), outputs=5)
+    >>> bridge.parameter_names
+    ('fmin_1', 'df_1', 'a_1', 'fmin_2', 'df_2', 'a_2', 'Kd_1', 'C0_1', 'Kd_2', 'C0_2')
+    >>> bridge.simulate(np.ones(10)).shape
+    (5, 1991)
     """
 
     record: Record

@@ -106,6 +106,12 @@ class Bearing:
         numerical setting: peak pier accelerations differ by a third between 0.13 mm and zero.
     gamma : float
         Constant of the Bouc-Wen law with A = 1, exponent 2 and beta = 1 - gamma; above 0.5, at most 1.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.models.isolated_bridge_parts import Bearing
+    >>> rough = Bearing(load=70e3, f_min=0.08)
+    >>> bridge = IsolatedBridge(record.resample(0.005), bearings=(rough, rough))
     """
 
     load: float = 70e3
@@ -134,6 +140,12 @@ class Damper:
         Dashpot coefficient of one damper [N s/m].
     count : int
         Number of dampers at the pier.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.models.isolated_bridge_parts import Damper
+    >>> softer = Damper(viscosity=10e3, count=1)
+    >>> bridge = IsolatedBridge(record.resample(0.005), dampers=(softer, softer))
     """
 
     stiffness: float = 2575e3

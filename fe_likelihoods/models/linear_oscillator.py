@@ -45,8 +45,10 @@ class LinearOscillator(StructuralModel):
 
     Examples
     --------
-    >>> model = LinearOscillator(record, period=0.8, damping_ratio=0.05)
-    >>> acceleration, displacement = model.simulate([1.1, 0.9])
+    >>> oscillator = LinearOscillator(record, period=0.8, damping_ratio=0.05)
+    >>> acceleration, displacement = oscillator.simulate([1.1, 0.9])
+    >>> acceleration.shape
+    (200,)
     """
 
     parameter_names = ("stiffness", "damping")

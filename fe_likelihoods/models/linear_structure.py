@@ -107,10 +107,10 @@ class LinearStructure(ExternalModel):
 
     Examples
     --------
-    >>> model = LinearStructure(BridgeDeck("ch7"), [footing, south_end, north_end])
-    >>> (acceleration,) = model.simulate([3.7, 0.09, 0.8])
-    >>> frame = ShearFrame({"floor 1": 1, "roof": 2}, [1.0, 1.0], [900.0, 900.0])
-    >>> drifts = LinearStructure(frame, base, outputs=("displacement@floor 1", "displacement@roof:floor 1"))
+    >>> building = LinearStructure(frame, record, outputs=("floor 1", "displacement@roof:floor 1"))
+    >>> building.parameter_names
+    ('stiffness_1', 'stiffness_2', 'damping_1', 'damping_2')
+    >>> acceleration, drift = building.simulate([1.1, 0.9, 0.03, 0.03])
     """
 
     path_dependent = False

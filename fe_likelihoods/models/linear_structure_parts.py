@@ -47,6 +47,15 @@ class BridgeDeck:
     ------
     ValueError
         If there is no channel, or a fixed value is not between 0 and 1.
+
+    Examples
+    --------
+    >>> deck = BridgeDeck("middle", share=0.8)
+    >>> deck.parameter_names
+    ('frequency', 'damping')
+    >>> bridge = LinearStructure(deck, [record, record, record])  # base of the column, both ends
+    >>> bridge.simulate([3.5, 0.05]).shape
+    (1, 200)
     """
 
     middle: str = "middle"
@@ -132,6 +141,14 @@ class ShearFrame:
     ------
     ValueError
         If a floor does not exist, values are not positive, their numbers differ, or no mass is fixed.
+
+    Examples
+    --------
+    >>> frame = ShearFrame({"floor 1": 1, "roof": 2}, masses=[1.0, 1.0], stiffnesses=[900.0, 900.0])
+    >>> frame.parameter_names
+    ('stiffness_1', 'stiffness_2', 'damping_1', 'damping_2')
+    >>> LinearStructure(frame, record).simulate([1.0, 1.0, 0.03, 0.03]).shape
+    (2, 200)
     """
 
     floors: tuple[tuple[str, int], ...]

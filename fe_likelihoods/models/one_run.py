@@ -50,12 +50,14 @@ def one_run(
 
     Examples
     --------
-    >>> parts = {"modes": (modal_channels(sensors), 1.0, 4), "trucks": (test.channels, 1.0, len(test.cases))}
-    >>> files = {"modes": "modes.txt", "trucks": "deflections.txt"}
-    >>> models = one_run(
-    ...     parts, files, lambda output, **options: ExecutableModel(command, templates, output, names, **options)
-    ... )
-    >>> modes, trucks = ModalLikelihood(models["modes"], data), FELikelihood(models["trucks"], test.measurements)
+    >>> from fe_likelihoods.models.one_run import one_run
+    >>> midspan, pier = Channel("midspan", "displacement", "mm"), Channel("pier", "displacement", "mm")
+    >>> parts = {"trucks": ([midspan], 1.0, 2), "wind": ([pier], 1.0, 3)}  # channels, step and number of samples
+    >>> def all_at_once(theta):
+    ...     return {"trucks": [[0.1, 0.2]] / theta[0], "wind": [[0.3, 0.2, 0.1]] / theta[0]}
+    >>> models = one_run(parts, all_at_once, lambda output, **options: FunctionModel(output, ["EI"], **options))
+    >>> sorted(models)
+    ['trucks', 'wind']
     """
     if not parts or (isinstance(output, Mapping) and set(output) != set(parts)):
         raise ValueError(f"one_run: expected an output for each of the parts {', '.join(parts)}; got {output!r}")

@@ -206,17 +206,11 @@ class OpenSeesModel(FunctionModel):
 
     Examples
     --------
-    >>> def frame(ops, theta):
-    ...     ops.model("basic", "-ndm", 2, "-ndf", 3)
-    ...     ...
-    >>> model = OpenSeesModel(frame, ("stiffness",), (Channel("top", "displacement", "mm"),), 0.01, 2000)
-
-    With the excitation as an argument of the function, for predictions under other records:
-
-    >>> def shaken_frame(ops, theta, record):
-    ...     ops.timeSeries("Path", 1, "-dt", record.dt, "-values", *record.acceleration)
-    ...     ...
-    >>> model = OpenSeesModel(shaken_frame, ("stiffness",), (Channel("top", "displacement", "mm"),), record=eq1)
+    >>> def bar(ops, theta):  # in a module of your own
+    ...     ops.model("basic", "-ndm", 1, "-ndf", 1)
+    ...     ...  # nodes, elements, loads, and ops.analyze
+    ...     return [[ops.nodeDisp(2, 1)]]
+    >>> opensees = OpenSeesModel(bar, ["stiffness"], [Channel("top", "displacement", "mm")], dt=0.01, n_steps=1)
     """
 
     def __init__(

@@ -209,6 +209,14 @@ class RCColumn(ThreadedModel):
     ``Cf``            coefficient of Coffin and Manson, with `fatigue`
     ``Cd``            coefficient of strength loss, with `fatigue`
     ================  ============================================================
+
+    Examples
+    --------
+    >>> column = RCColumn.lhpost(record)  # full-scale bridge column of the LHPOST tests
+    >>> column.parameter_names
+    ('Ec', 'Es', 'a0', 'a1', 'ft')
+    >>> acceleration, displacement = column.simulate(np.ones(5))
+    >>> strains = RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5"))
     """
 
     loading: Record | DisplacementHistory
@@ -262,6 +270,11 @@ class RCColumn(ThreadedModel):
         Returns
         -------
         RCColumn
+
+        Examples
+        --------
+        >>> RCColumn.lhpost(record, substeps=2, outputs=("displacement", "base_shear")).simulate(np.ones(5)).shape
+        (2, 200)
         """
         return cls(loading, **(lhpost_arguments() | changes))
 

@@ -99,6 +99,12 @@ def material_curves(
         If the parameters describe no column.
     ValueError
         If the strains are not finite numbers, or not below 0.9.
+
+    Examples
+    --------
+    >>> core, cover, steel = material_curves(column, np.ones(5))
+    >>> [round(float(curve.stress.min()) / 1e6, 1) for curve in (core, cover)]  # confined and unconfined strength [MPa]
+    [-52.3, -42.1]
     """
     sections, values = _sections(column, theta)
     core_peak = -sections.concrete[0, concrete04.E0]
@@ -145,6 +151,12 @@ def moment_curvature(
         If the parameters describe no column, or the section cannot carry the axial force at a curvature.
     ValueError
         If the curvatures are not a vector of finite numbers.
+
+    Examples
+    --------
+    >>> curves = moment_curvature(column, np.ones(5), np.linspace(0.0, 0.03, 50))
+    >>> round(float(curves.moment.max()) / 1e6, 2)  # MN m
+    5.49
     """
     sections, values = _sections(column, theta)
     curvature = np.array(curvature, dtype=float)

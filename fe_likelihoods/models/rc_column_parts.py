@@ -43,6 +43,13 @@ class Concrete:
         decreased to `softening_ratio` ft and drops to zero.
     softening_ratio : float
         Ratio of the stress at the end of the softening branch to ft.
+
+    Examples
+    --------
+    >>> concrete = Concrete(fc=40e6, ec=30e9, ft=3e6)  # Pa
+    >>> column = RCColumn.lhpost(record, concrete=concrete)
+    >>> column.nominal["Ec"]
+    30000000000.0
     """
 
     fc: float
@@ -86,6 +93,11 @@ class Steel:
         Strain at the onset of hardening.
     ultimate_strain : float
         Strain at `fu`.
+
+    Examples
+    --------
+    >>> steel = Steel(fy=500e6, fu=700e6, es=200e9, esh=5e9, hardening_strain=0.01, ultimate_strain=0.12)
+    >>> stronger = RCColumn.lhpost(record, steel=steel)
     """
 
     fy: float
@@ -151,6 +163,12 @@ class LowCycleFatigue:
         Exponent of Coffin and Manson, at most 1.
     cd : float
         Coefficient of strength loss, at least `cf`; a large coefficient means no loss before fracture.
+
+    Examples
+    --------
+    >>> fatigue = LowCycleFatigue(cf=0.26)
+    >>> RCColumn.lhpost(record, fatigue=fatigue, parameters=("Ec", "Cf")).parameter_names
+    ('Ec', 'Cf')
     """
 
     cf: float = 0.26
@@ -202,6 +220,12 @@ class Bars:
     first_angle : float
         Angle between the direction of negative displacements and the first bar [rad]. It matters only where the bars
         are not symmetric to the axis of bending, such as an odd number of bars.
+
+    Examples
+    --------
+    >>> bars = Bars(number=18, diameter=0.0358, area=1.006e-3)
+    >>> round(bars.number * bars.area, 4)  # all bars [m²]
+    0.0181
     """
 
     number: int
@@ -238,6 +262,11 @@ class Hoops:
         Strain at fracture.
     spiral : bool
         Whether the reinforcement is a spiral.
+
+    Examples
+    --------
+    >>> hoops = Hoops(diameter=0.0159, spacing=0.152, fy=450e6)
+    >>> stirrups = RCColumn.lhpost(record, hoops=hoops)
     """
 
     diameter: float
@@ -271,6 +300,12 @@ class Patches:
         Number of wedges.
     core_rings, cover_rings : int
         Number of rings in the core and in the cover.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.models.rc_column_parts import Patches
+    >>> RCColumn.lhpost(record, mesh=Patches(wedges=20, core_rings=10)).mesh
+    Patches(wedges=20, core_rings=10, cover_rings=2)
     """
 
     wedges: int = 20

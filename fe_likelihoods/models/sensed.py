@@ -52,6 +52,11 @@ class Sensor:
         calibration that is known to 5 %; negative for the opposite sign. Default: 1.
     lag : Distribution, optional
         Prior of the time by which it is late [s], such as ``TruncatedNormal(0, 0.02, -0.1, 0.1)``. Default: 0.
+
+    Examples
+    --------
+    >>> Sensor(gain=LogNormal(1.0, 0.05)).gain
+    LogNormal(median=1.0, log_sd=0.05)
     """
 
     gain: Distribution | None = None
@@ -101,8 +106,8 @@ class SensedModel:
 
     Examples
     --------
-    >>> sensed = SensedModel(model, {"deck": Sensor(LogNormal(1, 0.05), TruncatedNormal(0, 0.02, -0.1, 0.1))})
-    >>> posterior = Posterior(FELikelihood(sensed, measurements), priors | sensed.priors)
+    >>> sensed = SensedModel(model, {"displacement": Sensor(LogNormal(1, 0.05))})  # a factor of about 1
+    >>> posterior = Posterior(FELikelihood(sensed, measurements), prior | sensed.priors)
 
     Notes
     -----

@@ -57,7 +57,11 @@ class ModalModel:
 
     Examples
     --------
-    >>> model = LinearStructure(ModalModel(["roof", "floor 20"], 3), base)
+    >>> tower = ModalModel(["roof", "floor 20"], n_modes=1)
+    >>> tower.parameter_names
+    ('frequency_1', 'damping_1', 'shape_roof_1', 'shape_floor 20_1')
+    >>> LinearStructure(tower, record).simulate([0.2, 0.02, 1.4, 0.7]).shape
+    (2, 200)
     """
 
     channels: tuple[str, ...]
@@ -124,8 +128,10 @@ class GroupedFrame:
 
     Examples
     --------
-    >>> frame = GroupedFrame({"roof": 6}, [1.0] * 6, [900.0] * 6, groups=[1, 1, 1, 2, 2, 2])
-    >>> LinearStructure(frame, base).simulate([1.1, 0.9, 0.02])
+    >>> tower = GroupedFrame({"roof": 6}, [1.0] * 6, [900.0] * 6, groups=[1, 1, 1, 2, 2, 2])
+    >>> tower.parameter_names
+    ('stiffness_1', 'stiffness_2', 'damping')
+    >>> (acceleration,) = LinearStructure(tower, record).simulate([1.1, 0.9, 0.02])
     """
 
     floors: tuple[tuple[str, int], ...]
@@ -219,8 +225,11 @@ class ShearFlexuralBeam:
 
     Examples
     --------
-    >>> beam = ShearFlexuralBeam({"roof": 1.0, "floor 20": 0.5}, n_modes=5)
-    >>> LinearStructure(beam, base).simulate([0.2, 6.0, 0.015])
+    >>> tower = ShearFlexuralBeam({"roof": 1.0, "floor 20": 0.5}, n_modes=5)
+    >>> tower.parameter_names
+    ('frequency', 'alpha', 'damping')
+    >>> LinearStructure(tower, record).simulate([0.2, 6.0, 0.015]).shape
+    (2, 200)
     """
 
     heights: tuple[tuple[str, float], ...]

@@ -56,6 +56,14 @@ class UMBridgeModel(ExternalModel):
     ------
     ConnectionError, ValueError
         If the server cannot be reached; if it has no such model, or arguments are wrong or do not fit the model.
+
+    Examples
+    --------
+    A server at this address must run; ``docs/own_model.rst`` starts one.
+
+    >>> remote = UMBridgeModel(
+    ...     "http://localhost:4242", "forward", ["stiffness"], [Channel("top", "displacement", "mm")], dt=0.01
+    ... )  # doctest: +SKIP
     """
 
     def __init__(

@@ -60,6 +60,17 @@ class AutoregressiveNoise:
     References
     ----------
     .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
+
+    Examples
+    --------
+    >>> noise = AutoregressiveNoise(model.channels)
+    >>> noise.parameter_names
+    ('sigma_acceleration', 'sigma_displacement', 'rho_acceleration', 'rho_displacement')
+    >>> errors = {name: HalfNormal(0.1) for name in noise.parameter_names[:2]}
+    >>> correlations = {name: Uniform(-0.99, 0.99) for name in noise.parameter_names[2:]}
+    >>> correlated = Posterior(FELikelihood(model, measurements, noise), {
+    ...     "stiffness": LogNormal(1.0, 0.2), "damping": Uniform(0.2, 4.0), **errors, **correlations,
+    ... })
     """
 
     channels: Sequence[Channel]

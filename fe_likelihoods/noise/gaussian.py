@@ -149,9 +149,14 @@ class GaussianNoise:
 
     Examples
     --------
-    >>> noise = GaussianNoise(model.channels, level="response", window=1.0, sensor={"top": 0.005})
-    >>> posterior = Posterior(FELikelihood(model, measurements, noise), prior | {"share_top": HalfNormal(0.5)})
-    >>> propagate(posterior, samples, record=weaker, noise=True)  # noise of the weaker response
+    >>> GaussianNoise(model.channels).parameter_names
+    ('sigma_acceleration', 'sigma_displacement')
+
+    Errors that grow with the response, beside a known noise of the sensors [SI]:
+
+    >>> shares = GaussianNoise(model.channels, level="response", window=1.0, sensor=[0.01, 0.001])
+    >>> shares.parameter_names
+    ('share_acceleration', 'share_displacement')
     """
 
     channels: Sequence[Channel]

@@ -44,7 +44,7 @@ class KnownNoise:
 
     Examples
     --------
-    >>> noise = KnownNoise(GaussianNoise(model.channels), {"sigma_top": 0.002})
+    >>> noise = KnownNoise(GaussianNoise(model.channels), {"sigma_displacement": 0.002})
     """
 
     def __init__(self, noise: Noise, known: Mapping[str, float]) -> None:

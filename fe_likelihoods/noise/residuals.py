@@ -76,6 +76,8 @@ class ResidualChecks(NamedTuple):
             lines.append(f"{name:<{width}} {unit:>11} {sizes} {counts} {self.white[i]:>11.2g} {self.normal[i]:>11.2g}")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def lag_one_sums(residuals: np.ndarray) -> np.ndarray:
     """Statistics of an AR(1) error of residuals (n_channels, n_steps) [SI]: J, D and E of `AutoregressiveNoise`.
@@ -195,6 +197,12 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
        doi:10.2307/2983560.
     .. [2] C. S. Bretherton et al. (1999), "The effective number of spatial degrees of freedom of a time-varying field",
        Journal of Climate 12, 1990-2009.
+
+    Examples
+    --------
+    >>> residuals = likelihood.residuals([1.1, 0.9])
+    >>> effective_samples(residuals).round()  # doctest: +SAMPLED
+    array([178., 180.])
     """
     correlation, missing = autocorrelation(residuals), np.isnan(residuals)
     n = correlation.shape[1]
@@ -228,6 +236,12 @@ def innovations(residuals: np.ndarray, lag_one: np.ndarray) -> np.ndarray:
     ValueError
         If the residuals have another shape, fewer than two samples, non-finite values, or only zeros in a channel; for
         a wrong number of correlations, or one that is not between -1 and 1.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.noise.residuals import innovations
+    >>> innovations(likelihood.residuals([1.1, 0.9]), np.array([0.2, 0.1])).shape
+    (2, 199)
     """
     residuals = _checked(residuals)
     rho = np.asarray(lag_one, dtype=float)
@@ -277,6 +291,13 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
     ----------
     .. [1] C. M. Jarque, A. K. Bera (1987), "A test for normality of observations and regression residuals",
        International Statistical Review 55, 163-172, doi:10.2307/1403192.
+
+    Examples
+    --------
+    >>> print(residual_checks(likelihood.residuals([1.1, 0.9]), model.channels))
+    channel             unit        mean          sd     lag one     samples independent     p white    p normal
+    acceleration           g    -0.00376      0.0471       -0.07         200         178        0.36        0.31
+    displacement          cm      -0.181        1.79       -0.21         200         180      0.0027        0.33
     """
     from scipy import stats  # takes 0.5 s to import, and every noise imports this module
 

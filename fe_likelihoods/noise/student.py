@@ -63,7 +63,8 @@ class StudentNoise:
 
     Examples
     --------
-    >>> likelihood = FELikelihood(model, test.measurements, StudentNoise(test.channels))
+    >>> from fe_likelihoods.noise.student import StudentNoise
+    >>> likelihood = FELikelihood(model, measurements, StudentNoise(model.channels))
     """
 
     channels: Sequence[Channel]

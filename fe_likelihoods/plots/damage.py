@@ -55,6 +55,15 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     ------
     ValueError
         If there are no limit states of strains, or an event is unknown.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> quiet = record.followed_by(Record("rest", record.dt, [0.0, 0.0]), rest=20.0)
+    >>> complete = RCColumn.lhpost(quiet)
+    >>> complete = replace(complete, outputs=damage_outputs(complete))
+    >>> predicted = propagate(complete, np.ones((3, 5)), quantity=damage_measures(complete))
+    >>> figure = plot_damage(damage(predicted, noise=False))
     """
     import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable

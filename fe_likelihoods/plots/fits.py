@@ -65,10 +65,9 @@ def plot_fit(
 
     Examples
     --------
-    >>> likelihood = posterior.likelihood
-    >>> points = {"before the update": nominal, "posterior mean": samples.mean(axis=0)}
-    >>> responses = {title: measured.values - likelihood.residuals(x) for title, x in points.items()}
-    >>> plot_fit(measured, responses).savefig("fit.png")
+    >>> before = model.simulate([1.0, 1.0])
+    >>> after = model.simulate(samples.mean(axis=0)[:2])
+    >>> figure = plot_fit(measurements, {"before the update": before, "posterior mean": after})
     """
     if window is not None and not window > 0.0:
         raise ValueError(f"window must be a positive number of seconds or None; got {window!r}")

@@ -59,6 +59,10 @@ def plot_record(record: Record, axes: Axes | None = None, unit: str = "g") -> Ax
     ------
     ValueError
         If the unit is unknown or is not a unit of acceleration.
+
+    Examples
+    --------
+    >>> axes = plot_record(record)
     """
     shown = from_si(record.acceleration, unit, "acceleration")
     axes = new_axes(axes, (8.0, 2.6))
@@ -111,6 +115,10 @@ def plot_spectrum(
     ValueError
         If there is no damping ratio, `quantity` is not one of the three, or the unit has another dimension; as
         `Record.spectrum`.
+
+    Examples
+    --------
+    >>> axes = plot_spectrum(record, np.geomspace(0.1, 3.0, 50), damping_ratios=[0.05])
     """
     if quantity not in _SPECTRUM_UNITS or not len(damping_ratios):
         raise ValueError(
@@ -178,8 +186,7 @@ def plot_histories(
 
     Examples
     --------
-    >>> plot_histories(measured)
-    >>> plot_histories(measured, response, ["top"])
+    >>> figure = plot_histories(measurements, channels=["displacement"])
     """
     sources = [source for source in (measurements, response) if source is not None]
     if not sources:
@@ -257,7 +264,7 @@ def plot_response(model: Model, theta: np.ndarray, measurements: Measurements | 
 
     Examples
     --------
-    >>> plot_response(column, [1.0, 1.0, 1.0, 1.0, 1.0], measured)
+    >>> figure = plot_response(model, [1.1, 0.9], measurements)
     """
     response = Measurements(model.channels, model.dt, model.simulate(np.asarray(theta, dtype=float)))
     return plot_histories(measurements, response, time_label=getattr(model, "time_label", "time [s]"))
@@ -291,7 +298,7 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
 
     Examples
     --------
-    >>> plot_residuals(likelihood.residuals(theta), likelihood.model.channels, likelihood.model.dt)
+    >>> figure = plot_residuals(likelihood.residuals([1.1, 0.9]), model.channels, model.dt)
     """
     import matplotlib.pyplot as plt
     from scipy.special import ndtri

@@ -44,6 +44,11 @@ def plot_material(
     ------
     ValueError
         If there is no curve, or a unit is unknown or of another quantity.
+
+    Examples
+    --------
+    >>> core, cover, steel = material_curves(column, np.ones(5))
+    >>> axes = plot_material(core, cover)
     """
     if not curves:
         raise ValueError("expected one or more curves; got none; give the results of material_curves(column, theta)")
@@ -79,6 +84,10 @@ def plot_moment_curvature(
     -------
     matplotlib Axes
         The axes with the figure. The labels have the axial force, positive in tension.
+
+    Examples
+    --------
+    >>> axes = plot_moment_curvature(moment_curvature(column, np.ones(5), np.linspace(0.0, 0.03, 50)))
     """
     many = dict(curves) if isinstance(curves, Mapping) else {"": curves}
     axes = _with_origin(new_axes(axes, (5.4, 4.0)))

@@ -48,7 +48,8 @@ def plot_bands(
 
     Examples
     --------
-    >>> plot_bands(prediction, measurements)
+    >>> figure = plot_bands(prediction, measurements)
+    >>> figure.savefig("bands.png")
     """
     time = prediction.time
     names = [channel.name for channel in prediction.channels]
@@ -99,6 +100,13 @@ def plot_fragility(
     -------
     matplotlib Figure
         The figure, with one axes.
+
+    Examples
+    --------
+    >>> motions = [record.scale(factor) for factor in (0.8, 0.9, 1.0, 1.1, 1.2)]
+    >>> ratios = EventRatios([0.93, 1.10, 1.02, 0.99])
+    >>> curve = fragility(posterior, samples, motions, peak("displacement"), 8.0, unit="cm", ratios=ratios)
+    >>> figure = plot_fragility(curve)
     """
     import matplotlib.pyplot as plt
 

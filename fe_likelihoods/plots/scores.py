@@ -59,6 +59,10 @@ def plot_scores(
     ValueError
         If there are no scores, scores of histories and of numbers are mixed, levels differ, or a measured number is
         zero.
+
+    Examples
+    --------
+    >>> figure = plot_scores(prediction.score(measurements))
     """
     import matplotlib.pyplot as plt
 

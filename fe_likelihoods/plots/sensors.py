@@ -30,6 +30,10 @@ def plot_ranking(ranking: SensorRanking) -> Figure:
     -------
     matplotlib Figure
         With one or two axes.
+
+    Examples
+    --------
+    >>> figure = plot_ranking(rank_sensors(model, prior, draws=20))
     """
     import matplotlib.pyplot as plt
 

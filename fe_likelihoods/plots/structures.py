@@ -48,6 +48,10 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
     -------
     matplotlib Axes
         The axes with the figure.
+
+    Examples
+    --------
+    >>> axes = plot_section(column)
     """
     from matplotlib.collections import LineCollection, PatchCollection
     from matplotlib.patches import Circle, Patch
@@ -107,6 +111,10 @@ def plot_sensors(model: RCColumn | LinearStructure, axes: Axes | None = None, ra
     ------
     ValueError
         If a rank is of no channel, or the structure has no heights.
+
+    Examples
+    --------
+    >>> axes = plot_sensors(RCColumn.lhpost(record, outputs=("displacement", "strain@0.1:0.5")))
     """
     names, ranks = [channel.name for channel in model.channels], list(ranks)
     if unknown := [name for name in ranks if name not in names]:
@@ -238,7 +246,7 @@ def plot_hysteresis(model: RCColumn | IsolatedBridge, theta: np.ndarray) -> Figu
 
     Examples
     --------
-    >>> plot_hysteresis(column, [1.0, 1.0, 1.0, 1.0, 1.0])
+    >>> figure = plot_hysteresis(column, np.ones(5))
     """
     if isinstance(model, IsolatedBridge):
         return _bearing_loops(replace(model, every=1).history(theta))

@@ -75,6 +75,8 @@ class AveragedPrediction(NamedTuple):
         first = f"Average of the models {shares}; {what}; sd within and between models"
         return "\n".join([first, text_table(rows), *labelled(self.findings)])
 
+    __repr__ = __str__
+
     @property
     def sd(self) -> np.ndarray:
         """Standard deviation, shape (...)."""
@@ -103,6 +105,14 @@ def average_predictions(
     ValueError
         If the names differ, the probabilities are negative or do not sum to one, or the predictions differ in channels,
         step, shape, noise or the state from which they start.
+
+    Examples
+    --------
+    >>> flexible = propagate(LinearOscillator(record, period=1.1), samples[:, :2])
+    >>> stiff = propagate(model, samples[:, :2])
+    >>> average = average_predictions({"flexible": flexible, "stiff": stiff}, {"flexible": 0.2, "stiff": 0.8})
+    >>> average.mean.shape
+    (2, 200)
     """
     if not predictions or set(predictions) != set(probabilities):
         raise ValueError(

@@ -84,9 +84,12 @@ def propagate_few(
 
     Examples
     --------
-    >>> few = SMCSampler(30, posterior.ndim, posterior, vectorize=True, guide=posterior.guide())
-    >>> few.run_mcmc(None, 1)
-    >>> propagate_few(posterior, few.signed_sample, quantity=peak("top"), record=design_motion)
+    >>> few = SMCSampler(40, posterior.ndim, posterior, vectorize=True, guide=posterior.guide(), seed=1)
+    >>> state = few.run_mcmc(None, 1)
+    >>> stronger = record.scale(1.2)
+    >>> predicted = propagate_few(posterior, few.signed_sample, quantity=peak("displacement"), record=stronger)
+    >>> len(predicted.values), predicted.mean.round(3)  # doctest: +SAMPLED
+    (30, np.float64(0.099))
     """
     if not all(hasattr(sample, name) for name in ("coords", "weights", "rounds", "expectation")):
         raise ValueError(

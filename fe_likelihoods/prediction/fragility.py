@@ -112,6 +112,8 @@ class Fragility(NamedTuple):
         ]
         return "\n".join([*lines, *([f"The probabilities contain {self.uncertainty}."] if self.uncertainty else [])])
 
+    __repr__ = __str__
+
     def band(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
         """Band that contains the probabilities under all records together.
 
@@ -151,7 +153,14 @@ class Fragility(NamedTuple):
 
 
 def peak_ground_acceleration(record: Record | Sequence[Record]) -> float:
-    """Return the largest absolute acceleration of a record, or of the first one of several components [m/s²]."""
+    """Return the largest absolute acceleration of a record, or of the first one of several components [m/s²].
+
+    Examples
+    --------
+    >>> from fe_likelihoods.prediction.fragility import peak_ground_acceleration
+    >>> round(peak_ground_acceleration(record), 2)  # m/s²
+    0.93
+    """
     return float(np.max(np.abs(_components(record)[0].acceleration)))
 
 
@@ -253,6 +262,25 @@ def fragility(
     UserWarning
         If the model error is left out without ``noise=False``. As `propagate`; with a `Hierarchy`, also if peaks are
         outside the range of all its tests, where each `StoredPosterior` has its measurements.
+
+    Examples
+    --------
+    >>> motions = [record.scale(factor) for factor in (0.8, 0.9, 1.0, 1.1, 1.2)]
+    >>> ratios = EventRatios([0.93, 1.10, 1.02, 0.99])  # measured to predicted peaks of earlier events
+    >>> curve = fragility(
+    ...     posterior, samples, motions, peak("displacement"), 8.0, unit="cm", ratios=ratios, seed=1
+    ... )
+    >>> print(curve)  # doctest: +SAMPLED
+    Probability to exceed 0.08 m, from the state 'virgin'
+    record   intensity [m/s2]  P(exceed)  MC error          interval  failed  collapsed
+    shaking              0.74     0.0777   0.00061  0.00138 to 0.372       0          0
+    shaking             0.833      0.295    0.0017   0.0528 to 0.699       0          0
+    shaking             0.925      0.624    0.0019    0.255 to 0.924       0          0
+    shaking              1.02      0.856     0.001    0.515 to 0.992       0          0
+    shaking              1.11      0.952   0.00039        0.734 to 1       0          0
+    lognormal fragility curve: median 0.89 +- 0.054 m/s2, dispersion 0.129 +- 0.028
+    The probabilities contain the uncertainty of the parameters and the error of the model, from the ratios of 4
+    events.
     """
     if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")

@@ -74,6 +74,13 @@ def fit_fragility(intensity: ArrayLike, exceedances: ArrayLike, trials: ArrayLik
     ValueError
         If the points do not determine a rising curve: fewer than two intensities, none or all of the trials exceed,
         every intensity with an exceedance is above every one without, or the probability decreases with intensity.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.prediction.fragility_curve import fit_fragility
+    >>> curve = fit_fragility([1.0, 2.0, 4.0], [1, 10, 19], [20, 20, 20])  # 20 trials at each intensity
+    >>> round(float(curve.median), 2)
+    2.0
     """
     intensity, exceedances, trials = (np.asarray(each, dtype=float) for each in (intensity, exceedances, trials))
     if not intensity.shape == exceedances.shape == trials.shape or intensity.ndim != 1:

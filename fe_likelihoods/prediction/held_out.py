@@ -62,6 +62,8 @@ class HeldOutScores(NamedResults):
             lines.append(f"{name}: {shares} (intervals of 95 % for the share in further events)")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 class LeftOutTests(NamedResults):
     """The population without each test, `LeftOut` by name; ``print`` gives a table."""
@@ -144,6 +146,15 @@ def leave_one_out(
 
     Examples
     --------
-    >>> print(leave_one_out(hierarchy).scores(posteriors, quantity=peak("deck")))
+    >>> def sample(population):
+    ...     run = SMCSampler(100, population.ndim, population, vectorize=True, seed=1)
+    ...     state = run.run_mcmc(None, 1)
+    ...     return run.get_chain(flat=True)
+    >>> left_out = leave_one_out(hierarchy, sample=sample)
+    >>> print(left_out.scores(posteriors, quantity=peak("displacement")))
+    event   displacement [cm]  90% interval of displacement  PIT of displacement  log density
+    north ...
+    middle ...
+    south ...
     """
     return LeftOutTests(without_each(hierarchy, sample, seed))

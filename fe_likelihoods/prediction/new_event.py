@@ -78,6 +78,12 @@ def event_ratios(
         are missing, a value or a spread is not positive, and as `EventRatios`.
     SimulationFailed
         If the simulation of an event at these parameters fails.
+
+    Examples
+    --------
+    >>> ratios = event_ratios(hierarchy, posteriors, peak("displacement"))
+    >>> ratios.values.round(2)  # doctest: +SAMPLED
+    array([1.55, 1.51, 0.86])
     """
     return _ratios(hierarchy, posteriors, quantity, _checked_spread(spread), prior_events)[0]
 
@@ -157,7 +163,14 @@ def predict_new_event(
 
     Examples
     --------
-    >>> predict_new_event(hierarchy, posteriors, record, quantity=peak("deck")).quantiles
+    >>> stronger = record.scale(1.5)
+    >>> new = predict_new_event(hierarchy, posteriors, stronger, quantity=peak("displacement"))
+    >>> print(new)  # doctest: +SAMPLED
+    Prediction: 500 samples, of measured values, by the ratios of 3 events; effective sample size 500
+    the ratio of a new event has no mean: use the quantiles; 50% of their squared width is due to the prior of the
+    scatter between events
+    value         unit  mean  MC error  sd   5 %  50 %  95 %
+    displacement    cm     -         -   -  10.9    18  29.9
     """
     if not isinstance(posteriors, Mapping) or not posteriors:
         raise ValueError(

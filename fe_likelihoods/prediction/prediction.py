@@ -129,7 +129,13 @@ class Prediction:
         return np.arange(self.mean.shape[1]) * self.dt
 
     def quantile(self, probability: float) -> np.ndarray:
-        """Return the quantile, shape (...), for one of the `probabilities`; raise ValueError for another one."""
+        """Return the quantile, shape (...), for one of the `probabilities`; raise ValueError for another one.
+
+        Examples
+        --------
+        >>> prediction.quantile(0.95).shape
+        (2, 200)
+        """
         if probability not in self.probabilities:
             raise ValueError(
                 f"no quantile {probability!r} in this prediction, it has {self.probabilities}: propagate with "
@@ -200,6 +206,11 @@ class Prediction:
         Notes
         -----
         Between the samples of the histories, the quantiles are interpolated, which is approximate.
+
+        Examples
+        --------
+        >>> prediction.coverage(measurements).round(2)  # doctest: +SAMPLED
+        array([0.91, 0.9 ])
         """
         if not lower < upper:
             raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
@@ -256,6 +267,14 @@ class Prediction:
         Measurements contain the model error and sensor noise: score a prediction with ``noise=True``, unless the
         quantity is known to be free of them. For histories, CRPS and PIT are computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
+
+        Examples
+        --------
+        >>> scores = prediction.score(measurements)
+        >>> print(scores)
+        channel       unit    RMS  RRMSE    CRPS  interval score ...
+        acceleration     g ...
+        displacement    cm ...
         """
         if not 0.0 < level < 1.0:
             raise ValueError(f"score: level must be a probability between 0 and 1; got {level!r}")

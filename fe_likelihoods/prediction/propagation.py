@@ -214,6 +214,17 @@ def propagate(
         another record or of another `model`, is more than twice the largest measured peak of the calibration, or less
         than half of the smallest one; the power of another record is in a band of less than a fifth of the width in
         the calibration; the response to another record is the response to the calibration record.
+
+    Examples
+    --------
+    >>> prediction = propagate(posterior, samples, noise=True)
+    >>> prediction.mean.shape, prediction.quantile(0.95).shape
+    ((2, 200), (2, 200))
+    >>> stronger = propagate(posterior, samples, quantity=peak("displacement"), record=record.scale(2.0))
+    >>> print(stronger)  # doctest: +SAMPLED
+    Prediction: 300 samples, without measurement noise; effective sample size 300
+    value         unit  mean  MC error     sd   5 %  50 %  95 %
+    displacement    cm  16.5      0.01  0.173  16.2  16.5  16.8
     """
     known = calibration_of(posterior_or_model if calibrated is None else list(calibrated))
     posterior_or_model, samples = part_of(posterior_or_model, samples, part, noise)
@@ -335,6 +346,11 @@ def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.nd
     ------
     ValueError
         As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
+
+    Examples
+    --------
+    >>> fit_measures(posterior, samples).shape
+    (300, 2)
     """
     posterior, samples = part_of(posterior, samples, part, False)
     source = read_source(posterior)

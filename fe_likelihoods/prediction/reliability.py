@@ -104,6 +104,8 @@ class Exceedance(NamedTuple):
         said = f"\nThe probability contains {self.uncertainty}." if self.uncertainty else ""
         return text_table(rows) + said
 
+    __repr__ = __str__
+
 
 def exceedance(
     prediction_or_values: Prediction | ArrayLike,
@@ -160,10 +162,12 @@ def exceedance(
 
     Examples
     --------
-    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record, noise="model")  # noise in shares
-    >>> exceedance(drift, 50.0, unit="mm")
-    >>> drift = propagate(posterior, samples, quantity=peak("top"), record=record)
-    >>> exceedance(drift, 50.0, unit="mm", ratios=EventRatios([0.93, 1.10, 1.02]))
+    >>> peaks = propagate(posterior, samples, quantity=peak("displacement"))
+    >>> print(exceedance(peaks, 8.0, unit="cm", ratios=EventRatios([0.93, 1.10, 1.02])))  # doctest: +SAMPLED
+    threshold [m]  probability  MC error       interval  upper end by the events alone
+    0.08                 0.631    0.0017  0.222 to 0.95                          0.992
+    The probability contains the uncertainty of the parameters and the error of the model, from the ratios of 3
+    events.
     """
     prediction = prediction_or_values if isinstance(prediction_or_values, Prediction) else None
     if prediction is not None:

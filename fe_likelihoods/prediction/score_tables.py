@@ -107,6 +107,8 @@ class HistoryScores(NamedTuple):
         left_out = ", ".join(f"{n} of {c.name}" for c, n in zip(self.channels, self.without_spread, strict=True) if n)
         return f"{text_table(rows)}\nPIT without samples whose predicted standard deviation is zero: {left_out}"
 
+    __repr__ = __str__
+
 
 class QuantityScores(NamedTuple):
     """Scores of predicted numbers, such as peaks, each against one measured value.
@@ -172,6 +174,8 @@ class QuantityScores(NamedTuple):
             row = [name, unit, measured, median, f"{lower} to {upper}", within, crps, score, f"{self.pit[k]:.3f}"]
             rows.append(row)
         return text_table(rows)
+
+    __repr__ = __str__
 
 
 def score_histories(

@@ -61,6 +61,12 @@ def crps_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarr
     ------
     ValueError
         If a standard deviation is negative.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.prediction.scores import crps_normal
+    >>> float(crps_normal(0.0, 1.0, 0.0).round(4))
+    0.2337
     """
     mean, sd, observed = _normal("crps_normal", mean, sd, observed)
     error = observed - mean
@@ -96,6 +102,12 @@ def crps_samples(values: ArrayLike, observed: ArrayLike, effective_sample_size: 
     ------
     ValueError
         If there are fewer than two samples, the shapes do not fit, or the effective sample size is not above 1.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.prediction.scores import crps_samples
+    >>> float(crps_samples([0.0, 1.0, 2.0], 1.0).round(3))
+    0.0
     """
     ascending, observed = _samples(values, observed)
     n = len(ascending)
@@ -131,6 +143,11 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, leve
     ------
     ValueError
         If the level is not between 0 and 1, or a lower end is above its upper end.
+
+    Examples
+    --------
+    >>> interval_score([0.9, 0.9], [1.1, 1.1], [1.0, 1.2], level=0.9)  # inside: the width; outside: a penalty
+    array([0.2, 2.2])
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"interval_score: level must be a probability between 0 and 1; got {level!r}")
@@ -194,6 +211,8 @@ class Share(NamedTuple):
     def __str__(self) -> str:
         low, high = (100.0 * each for each in self.interval)
         return f"{self.inside} of {self.n}: {low:.0f} to {high:.0f} %"
+
+    __repr__ = __str__
 
 
 def share_within(pit: ArrayLike, level: float) -> Share:

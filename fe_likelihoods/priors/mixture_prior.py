@@ -205,8 +205,10 @@ def fit_mixture(
 
     Examples
     --------
-    >>> mixture = fit_mixture(sampler.get_chain(flat=True), posterior.prior, model.parameter_names)
-    >>> prior = Prior({mixture.names: mixture, "sigma_displacement": HalfNormal(0.01)})
+    >>> mixture = fit_mixture(samples, posterior.prior, model.parameter_names)
+    >>> next_prior = Prior({mixture.names: mixture, "sigma_displacement": HalfNormal(0.01)})
+    >>> next_prior.names
+    ('stiffness', 'damping', 'sigma_displacement')
     """
     points = as_points(samples, prior.names)
     names = prior.names if names is None else tuple(names)

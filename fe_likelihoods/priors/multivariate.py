@@ -99,7 +99,9 @@ class MultivariateNormal(MultivariateDistribution):
 
     Examples
     --------
-    >>> Prior({("stiffness", "damping"): MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])})
+    >>> stiffness_and_damping = MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])
+    >>> Prior({("stiffness", "damping"): stiffness_and_damping, "sigma": HalfNormal(0.1)}).names
+    ('stiffness', 'damping', 'sigma')
     """
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike) -> None:

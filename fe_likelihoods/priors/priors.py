@@ -46,14 +46,12 @@ class Prior:
 
     Examples
     --------
-    >>> prior = Prior({"stiffness": TruncatedNormal(1.0, 0.3), "sigma_displacement": HalfNormal(0.03)})
-    >>> prior.rvs(1000, 42).shape
+    >>> independent = Prior({"stiffness": TruncatedNormal(1.0, 0.3), "sigma": HalfNormal(0.03)})
+    >>> independent.rvs(1000, 42).shape
     (1000, 2)
-
-    Two correlated parameters:
-
     >>> correlated = MultivariateNormal([1.0, 1.0], [[0.04, 0.01], [0.01, 0.09]])
-    >>> prior = Prior({("stiffness", "damping"): correlated, "sigma_displacement": HalfNormal(0.03)})
+    >>> Prior({("stiffness", "damping"): correlated, "sigma": HalfNormal(0.03)}).dim
+    3
     """
 
     def __init__(self, distributions: Mapping[str | tuple[str, ...], Distribution | MultivariateDistribution]) -> None:
@@ -224,6 +222,11 @@ class Prior:
         Returns
         -------
         ndarray[size, dim]
+
+        Examples
+        --------
+        >>> posterior.prior.rvs(5, 1).shape
+        (5, 4)
         """
         if isinstance(random_state, int | np.integer):
             random_state = np.random.default_rng(random_state)

@@ -161,10 +161,9 @@ def report(
 
     Examples
     --------
-    >>> report(sampler, posterior, propagate(posterior, samples), out="results/report.html")
-    >>> several = {"histories": None, "peaks": [peak("top")]}
-    >>> second = propagate(posterior, samples, record=record, quantity=several, noise=True)
-    >>> report(sampler, posterior, events={"second shaking": second}, measured={"second shaking": measurements})
+    >>> path = report(sampler, posterior, prediction, out="report.html")
+    >>> path.name
+    'report.html'
     """
     run = read_run(sampler, posterior, names=names, truth=truth, discard=discard, thin=thin)
     return write_page(Path(out), run, prediction, title=title, measured=measured, events=events, repeat=repeat)

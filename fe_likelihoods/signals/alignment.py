@@ -160,6 +160,13 @@ def align(
     The standard error follows from least squares with correlated errors: the information of a channel is a^2 sum r'^2 /
     (s^2 k), with the variance s^2 of the errors and k = 1 + 2 sum_j q_j p_j for the autocorrelations q of the errors
     and p of the derivative r' of the reference.
+
+    Examples
+    --------
+    >>> early = Measurements(measurements.channels, 0.05, measurements.values[:, 10:])  # begins 0.5 s too late
+    >>> found = align(measurements, early)
+    >>> round(found.lag, 2)
+    -0.5
     """
     pairs = _pairs(reference, measurements, channels)
     longest = min(max(p.end, float(np.ptp(p.times))) for p in pairs)

@@ -39,6 +39,12 @@ class Dataset(NamedTuple):
         The response.
     attributes : dict
         Free attributes, such as the true parameters of synthetic data.
+
+    Examples
+    --------
+    >>> data = problems.bridge_column_data("short")
+    >>> data.record.dt, data.measurements.values.shape
+    (0.015625, (2, 640))
     """
 
     record: Record
@@ -68,6 +74,13 @@ def write_dataset(path: str | Path, record: Record, measurements: Measurements, 
     ------
     ValueError
         If the attributes have other values, or the folder does not exist.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.signals.datasets import read_dataset, write_dataset
+    >>> write_dataset("test.h5", record, measurements, {"note": "synthetic"})
+    >>> read_dataset("test.h5").attributes["note"]
+    'synthetic'
     """
     import h5py  # imported here because it takes longer to import than this package
 

@@ -51,8 +51,10 @@ def growing_durations(
 
     Examples
     --------
-    >>> for seconds in growing_durations(record.acceleration, record.dt)[:-1]:
-    ...     part = FELikelihood(model, measurements).first(seconds)
+    >>> durations = growing_durations(record.acceleration, record.dt)
+    >>> shorter = likelihood.first(durations[0])
+    >>> likelihood.n_samples, shorter.n_samples
+    (200, 16)
     """
     dt = check_step(dt, "the record")
     rows = np.atleast_2d(np.asarray(acceleration, dtype=float))

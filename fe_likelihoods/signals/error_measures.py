@@ -38,7 +38,7 @@ def rrmse(
 
     Examples
     --------
-    >>> float(rrmse([1.1, 2.2], [1.0, 2.0]))
+    >>> round(float(rrmse([1.1, 2.2], [1.0, 2.0])), 3)
     0.1
     """
     predicted, measured = np.asarray(predicted, dtype=float), np.asarray(measured, dtype=float)

@@ -71,9 +71,10 @@ class Events(Record):
 
     Examples
     --------
-    >>> events = Events([eq1, eq2], rest=10.0)
-    >>> response = RCColumn.lhpost(events).simulate(np.ones(5))
-    >>> response[:, events.window("EQ2").samples]  # the response to EQ2 of the column that EQ1 has damaged
+    >>> events = Events([record, record.scale(2.0)], rest=5.0, names=["first", "second"])
+    >>> response = LinearOscillator(events).simulate([1.0, 1.0])
+    >>> response[:, events.window("second").samples].shape
+    (2, 200)
     """
 
     records: tuple[Record, ...]
@@ -130,7 +131,14 @@ class Events(Record):
         return inside
 
     def window(self, name: str) -> EventWindow:
-        """Return the window of one event; raise ValueError if there is no event of this name."""
+        """Return the window of one event; raise ValueError if there is no event of this name.
+
+        Examples
+        --------
+        >>> events = Events([record, record.scale(2.0)], rest=5.0, names=["first", "second"])
+        >>> events.window("second").start
+        15.0
+        """
         if name not in self.names:
             raise ValueError(f"no event {name!r}; the events are {', '.join(self.names)}")
         return self.windows[self.names.index(name)]
@@ -139,6 +147,13 @@ class Events(Record):
         """Return the parts of histories (..., n_steps) over the joined record by event, without the pauses.
 
         ValueError if the histories and the joined record have different numbers of samples.
+
+        Examples
+        --------
+        >>> events = Events([record, record.scale(2.0)], rest=5.0, names=["first", "second"])
+        >>> response = LinearOscillator(events).simulate([1.0, 1.0])
+        >>> {name: part.shape for name, part in events.split(response).items()}
+        {'first': (2, 200), 'second': (2, 200)}
         """
         values = np.asarray(values)
         if values.shape[-1:] != (self.n_steps,):
@@ -153,6 +168,13 @@ class Events(Record):
         has all channels over the joined record, with NaN in the pauses and wherever nothing was measured. ValueError if
         there are no measurements, an event is unknown, the steps differ, samples are outside of their event or between
         the steps of the joined record, or a channel has another quantity in another event.
+
+        Examples
+        --------
+        >>> events = Events([record, record.scale(2.0)], rest=5.0, names=["first", "second"])
+        >>> joined = events.join({"first": measurements, "second": measurements})  # NaN in the pause
+        >>> joined.values.shape
+        (2, 500)
         """
         if not isinstance(measurements, Mapping) or not measurements:
             raise ValueError(f"expected Measurements for one or more of {', '.join(self.names)}; got {measurements!r}")

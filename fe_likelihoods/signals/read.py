@@ -131,7 +131,10 @@ def read_record(
 
     Examples
     --------
-    >>> record = read_record("logger.csv", column="base", units="g")
+    >>> table = [[0.00, 0.00], [0.01, 0.05], [0.02, -0.02]]
+    >>> np.savetxt("motion.csv", table, delimiter=",", header="time_s,acceleration_g", comments="")
+    >>> read_record("motion.csv").acceleration.round(3)  # m/s²
+    array([ 0.   ,  0.49 , -0.196])
     """
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
@@ -153,7 +156,16 @@ def read_csv(
     missing: Sequence[float] | None = None,
     resample: float | None = None,
 ) -> Record:
-    """Read a ground motion from a table as `read_record` does; files of other formats are refused."""
+    """Read a ground motion from a table as `read_record` does; files of other formats are refused.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.signals.read import read_csv
+    >>> table = [[0.00, 0.00], [0.01, 0.05], [0.02, -0.02]]
+    >>> np.savetxt("motion.csv", table, delimiter=",", header="time_s,acceleration_g", comments="")
+    >>> read_csv("motion.csv").dt
+    0.01
+    """
     return _read(
         path, "read_csv", units, dt, column, None, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
     )
@@ -400,8 +412,11 @@ def read_columns(
 
     Examples
     --------
-    >>> top = Channel("top", "acceleration", "g")
-    >>> measured = read_columns("logger.csv", [top], ["a_top"], units="g", time_unit="s")
+    >>> table = [[0.00, 0.0], [0.01, 1.5], [0.02, 2.0]]
+    >>> np.savetxt("measured.csv", table, delimiter=",", header="time_s,top_mm", comments="")
+    >>> measured = read_columns("measured.csv", [Channel("top", "relative displacement", "mm")], ["top_mm"])
+    >>> measured.values  # m
+    array([[0.    , 0.0015, 0.002 ]])
     """
     if (reader := recognise_reader(path)) is not None:
         if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
@@ -482,8 +497,11 @@ def read_imposed_test(
 
     Examples
     --------
-    >>> force = Channel("base", "force", "kN")
-    >>> test = read_imposed_test("cyclic.csv", "disp_mm", [force], ["force_kN"])
+    >>> table = [[0.0, 0.0], [10.0, 120.0], [-10.0, -115.0]]
+    >>> np.savetxt("cyclic.csv", table, delimiter=",", header="top_mm,force_kN", comments="")
+    >>> test = read_imposed_test("cyclic.csv", "top_mm", [Channel("force", "force", "kN")], ["force_kN"])
+    >>> test.history.displacement  # m
+    array([ 0.  ,  0.01, -0.01])
     """
     table = read_table(path, skip)
     imposed = Channel(displacement, "displacement", displacement_unit or "m")

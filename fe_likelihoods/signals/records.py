@@ -41,6 +41,14 @@ class Record:
     ------
     ValueError
         If the step is not positive, or the samples are not a one-dimensional array of at least two finite numbers.
+
+    Examples
+    --------
+    >>> record = Record("short motion", 0.01, [0.0, 0.5, -0.3, 0.1])  # m/s²
+    >>> record.duration, record.n_steps
+    (0.03, 4)
+    >>> record.scale(2.0).acceleration
+    array([ 0. ,  1. , -0.6,  0.2])
     """
 
     name: str
@@ -102,6 +110,11 @@ class Record:
         frequency keeps less than 0.3 %. Before the first sample and after the last sample the record is continued by
         its mirror image in time and sign about this sample, so that an offset, a drift or a cut does not cause
         oscillations at the ends.
+
+        Examples
+        --------
+        >>> record.resample(0.01).n_steps
+        996
         """
         new_dt = check_step(dt, self.name)
         exact = self.dt / new_dt
@@ -131,13 +144,24 @@ class Record:
         """Return the part of the record between two times [s], both included. Time starts again from zero.
 
         ValueError unless 0 <= start < stop <= duration (the default of `stop`), and 2 samples or more remain.
+
+        Examples
+        --------
+        >>> record.trim(2.0, 8.0).duration
+        6.0
         """
         window = sample_window(self.name, self.n_steps, self.dt, start, stop)
         note = f"trimmed to {window.start * self.dt:g} ... {(window.stop - 1) * self.dt:g} s"
         return Record(self.name, self.dt, self.acceleration[window], self._source(note))
 
     def scale(self, factor: float) -> "Record":
-        """Return the record with all samples multiplied by `factor`; ValueError if it is not finite."""
+        """Return the record with all samples multiplied by `factor`; ValueError if it is not finite.
+
+        Examples
+        --------
+        >>> Record("short motion", 0.01, [0.0, 0.5, -0.3]).scale(2.0).acceleration
+        array([ 0. ,  1. , -0.6])
+        """
         if not math.isfinite(factor):
             raise ValueError(f"scale factor of {self.name!r} must be a finite number, got {factor!r}")
         note = f"scaled by {factor:g}"
@@ -150,6 +174,11 @@ class Record:
         yielding, residual displacements) is its state at the beginning of the other record. The pause is rounded to
         whole steps. To keep the times of the events, join the records with `fe_likelihoods.signals.events.Events`.
         ValueError if `other` is not a `Record` or has another step, or `rest` is negative or not finite.
+
+        Examples
+        --------
+        >>> record.followed_by(record.scale(0.5), rest=5.0).n_steps
+        500
         """
         if not isinstance(other, Record):
             raise ValueError(f"{self.name!r} must be followed by a Record, got {type(other).__name__}")
@@ -171,7 +200,14 @@ class Record:
     def spectrum(
         self, periods: Sequence[float] | NDArray[np.float64] | None = None, damping_ratio: float = 0.05
     ) -> ResponseSpectrum:
-        """Compute the elastic response spectrum, see `fe_likelihoods.signals.response_spectrum.response_spectrum`."""
+        """Compute the elastic response spectrum, see `fe_likelihoods.signals.response_spectrum.response_spectrum`.
+
+        Examples
+        --------
+        >>> spectrum = record.spectrum([0.5, 1.0, 2.0], damping_ratio=0.05)
+        >>> spectrum.pseudo_acceleration.shape
+        (3,)
+        """
         return response_spectrum(self.acceleration, self.dt, periods, damping_ratio)
 
     def _source(self, note: str) -> str:
@@ -202,6 +238,13 @@ class DisplacementHistory:
     ------
     ValueError
         If the displacements are not a one-dimensional array of at least two finite numbers.
+
+    Examples
+    --------
+    >>> cycles = DisplacementHistory("cyclic test", [0.0, 0.02, -0.02, 0.04, -0.04, 0.0])  # m
+    >>> tested = RCColumn.lhpost(cycles, parameters=("Ec", "fc", "fy"))
+    >>> tested.simulate(np.ones(3)).shape  # the force at each step
+    (1, 6)
     """
 
     name: str

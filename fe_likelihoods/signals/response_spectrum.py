@@ -79,6 +79,12 @@ def response_spectrum(
     ValueError
         If the samples are not a one-dimensional finite array, the step is not positive, the periods are not
         one-dimensional, finite and long enough, or the damping ratio is out of range.
+
+    Examples
+    --------
+    >>> from fe_likelihoods.signals.response_spectrum import response_spectrum
+    >>> response_spectrum(record.acceleration, record.dt, [0.5, 1.0]).displacement.shape
+    (2,)
     """
     try:
         acceleration, dt = check_samples(acceleration, "acceleration", "the motion"), check_step(dt, "the motion")

@@ -60,6 +60,16 @@ class DaskExecutor(PoolExecutor):
     ------
     ValueError
         If `longest_wait` or an amount of `resources` is not positive.
+
+    Examples
+    --------
+    The number of workers and cores is chosen on the cluster: see ``docs/clusters.rst``.
+
+    >>> from distributed import Client
+    >>> with Client(processes=False, n_workers=1, dashboard_address=":0") as client:
+    ...     executor = DaskExecutor(client, longest_wait=60.0)
+    ...     print(list(executor.map(abs, [-1, 2])))
+    [1, 2]
     """
 
     other_processes = True

@@ -59,6 +59,16 @@ class SimulationFailed(FailedRun):
     `reason` says why, in words. It may end with the duration of the run, as in "crashed after 12.3 s"
     (`split_seconds`). A reason that begins with "collapse" says that the structure has collapsed (`is_collapse`): this
     is a result, which `fe_likelihoods.prediction.fragility.fragility` counts as an exceedance.
+
+    Examples
+    --------
+    >>> def displacement(theta):
+    ...     if theta[0] < 0.5:
+    ...         raise SimulationFailed("collapse: the stiffness is below a half")
+    ...     return model.simulate([theta[0], 1.0])[1:]
+    >>> function = FunctionModel(displacement, ["stiffness"], model.channels[1:], dt=0.05, n_steps=200)
+    >>> FELikelihood(function, measurements.select(["displacement"])).log_likelihood([0.4, 0.02])
+    -inf
     """
 
     def __init__(self, reason: str) -> None:
@@ -117,6 +127,17 @@ class Model(Protocol):
     Tables and figures use ``nominal``, the nominal values [SI] by parameter name, where parameters are multiples of
     nominal values; ``nominal_units`` with their units; and ``parameter_units`` with the units of other parameters, in
     words (`fe_likelihoods.likelihood.parameters.describe_parameters`).
+
+    Examples
+    --------
+    >>> class Pulse:
+    ...     parameter_names, channels, dt, n_steps = ("amplitude",), model.channels[1:], 0.05, 200
+    ...     fingerprint = "pulse, version 1"
+    ...     def simulate(self, theta):
+    ...         return theta[0] * np.exp(-time)[np.newaxis]
+    >>> own = FELikelihood(Pulse(), measurements.select(["displacement"]))
+    >>> own.parameter_names
+    ('amplitude', 'sigma_displacement')
     """
 
     @property

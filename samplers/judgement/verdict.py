@@ -115,6 +115,15 @@ class Verdict(_Stored):
     findings : tuple of `samplers.finding.Finding`
         What speaks against the result, each with its severity and what to do; empty for a verdict that version 0.2 has
         stored.
+
+    Examples
+    --------
+    >>> sampler.verdict.status
+    'converged'
+    >>> print(sampler.verdict)
+    Converged: effective sample size ... (of 100 walkers) from ... simulations.
+    >>> sampler.verdict.reasons
+    ()
     """
 
     _run: RunParts | None = None
@@ -223,6 +232,8 @@ class Verdict(_Stored):
             needed = f"{self.more_simulations:.0f} more simulations are needed, possibly several times as many"
             more = [f"At least about {needed}."]
         return " ".join([first, *(f"{reason[0].upper()}{reason[1:]}." for reason in self.reasons), *more])
+
+    __repr__ = __str__
 
 
 def judge(

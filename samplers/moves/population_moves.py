@@ -189,6 +189,11 @@ class RandomWalkMove(_FittedMove):
     ----------
     Roberts, G. O., Gelman, A. & Gilks, W. R. (1997), Weak convergence and optimal scaling of random walk Metropolis
     algorithms, Annals of Applied Probability 7(1), doi:10.1214/aoap/1034625254
+
+    Examples
+    --------
+    >>> walk = RandomWalkMove(adapt=True)
+    >>> walking = SMCSampler(100, posterior.ndim, posterior, moves=walk, recycle=False, vectorize=True)
     """
 
     def __init__(self, scale: float | None = None, adapt: bool = False, target: float | None = 0.234):
@@ -301,6 +306,11 @@ class MixtureMove(_FittedMove):
     ----------
     ter Braak, C. J. F. (2006), A Markov chain Monte Carlo version of the genetic algorithm differential evolution,
     Statistics and Computing 16, doi:10.1007/s11222-006-8769-1
+
+    Examples
+    --------
+    >>> moves = [(MixtureMove(), 0.8), (RandomWalkMove(), 0.2)]
+    >>> mixed = SMCSampler(100, posterior.ndim, posterior, moves=moves, vectorize=True)
     """
 
     takes_mixture = True

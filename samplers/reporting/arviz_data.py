@@ -72,6 +72,12 @@ def to_arviz(
         ``sample_stats`` and, where they are known, ``prior``, ``observed_data``, ``constant_data``,
         ``posterior_predictive``, ``log_likelihood`` and ``predictions``; ``docs/arviz`` describes them. A slash in the
         name of a parameter or channel becomes ``_``.
+
+    Examples
+    --------
+    >>> data = to_arviz(sampler, parameter_names=posterior.parameter_names)
+    >>> data.posterior["stiffness"].shape
+    (1, 300)
     """
     import arviz
     import xarray

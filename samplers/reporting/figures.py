@@ -105,6 +105,10 @@ def plot_corner(
     -------
     matplotlib.figure.Figure
         With axes of shape (k, k) for k parameters; the axes above the diagonal are empty.
+
+    Examples
+    --------
+    >>> figure = plot_corner(samples, posterior, names=["stiffness", "damping"])
     """
     import corner
     import matplotlib.pyplot as plt
@@ -198,6 +202,10 @@ def plot_marginals(
     title says by how much.
 
     Parameters and errors as for `plot_corner`. All parameters are drawn, in one axes each.
+
+    Examples
+    --------
+    >>> figure = plot_marginals(samples, posterior)
     """
     import matplotlib.pyplot as plt
 

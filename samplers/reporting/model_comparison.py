@@ -84,7 +84,7 @@ class ModelComparison(NamedTuple):
         rows += [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join(rows)
 
-    __str__ = table
+    __str__ = __repr__ = table
 
 
 def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None = None) -> ModelComparison:
@@ -107,6 +107,10 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     >>> comparison = compare_models({"elastic": (-120.3, 0.1), "inelastic": (-118.9, 0.1)})
     >>> comparison.best
     'inelastic'
+    >>> print(comparison)
+    model           log evidence  log Bayes factor  prior      probability      95 % interval
+    inelastic  -118.900 +- 0.100    0.000 +- 0.000    0.5  0.8022 +- 0.022  0.7545 ... 0.8425
+    elastic    -120.300 +- 0.100   -1.400 +- 0.141    0.5  0.1978 +- 0.022  0.1575 ... 0.2455
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")

@@ -29,6 +29,10 @@ def plot_run(sampler: Any) -> "Figure":
     Astronomical Society 493(3), doi:10.1093/mnras/staa278).
 
     `sampler` is a tempered sampler that has run; ValueError if it has no stages.
+
+    Examples
+    --------
+    >>> figure = plot_run(sampler)
     """
     import matplotlib.pyplot as plt
 

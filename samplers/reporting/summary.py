@@ -104,6 +104,8 @@ class Summary(NamedTuple):
             rows.append((name, *("-" if cell == "nan" else cell for cell in cells)))
         return "\n".join(aligned(rows))
 
+    __repr__ = __str__
+
 
 def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ...]:
     """The given names, or theta_0, theta_1, ...; ValueError if there is not one per parameter."""
@@ -137,6 +139,15 @@ def summary(
     Returns
     -------
     Summary
+
+    Examples
+    --------
+    >>> print(summary(samples, posterior.parameter_names))  # doctest: +SAMPLED
+    parameter              mean  MC error         sd  MC error       CV
+    stiffness            1.1022         -   0.002393         -  0.00217
+    damping             0.86008         -    0.02466         -   0.0287
+    sigma_acceleration  0.46343         -     0.0243         -   0.0524
+    sigma_displacement  0.01823         -  0.0009417         -   0.0517
     """
     samples = np.asarray(samples, dtype=float)
     if samples.ndim != 2 or len(samples) < 2:
@@ -186,6 +197,14 @@ def ladder_table(sampler: Any) -> str:
     """Table of the tempering stages (`samplers.Stage`), estimates of the evidence, and summary of the verdict.
 
     ValueError if the sampler has no stages.
+
+    Examples
+    --------
+    >>> print(ladder_table(sampler))  # doctest: +ELLIPSIS
+    stage       beta   ESS  acceptance  sweeps  distinct  d log Z  evaluations  time [s]
+    ...
+    log evidence 376...
+    Converged: one mode; ...
     """
     stages = finished_ladder(sampler)
     table = [("stage", "beta ", *(heading for heading, _, _ in _STAGE))]
@@ -242,6 +261,8 @@ class SamplerComparison(NamedTuple):
             rows.append((name, str(n), time, f"{ess:.0f}", f"{ess / n:.2e}", evidence))
         return "\n".join(aligned(rows))
 
+    __repr__ = __str__
+
 
 def comparison_table(
     samplers: Mapping[str, Any], seconds: Mapping[str, float] | None = None, discard: int = 0
@@ -261,6 +282,12 @@ def comparison_table(
         Wall times [s] of samplers that do not measure them, by name.
     discard : int
         Burn-in of emcee's sampler: number of initial iterations that are left out.
+
+    Examples
+    --------
+    >>> print(comparison_table({"SMC": sampler}))  # doctest: +ELLIPSIS
+    sampler  evaluations  seconds  ESS  ESS/evaluation      log evidence
+    SMC ...
     """
     given = {} if seconds is None else dict(seconds)
     if not samplers:

@@ -96,6 +96,25 @@ class Guide(Protocol):
         How parts of the posterior were searched for, as a clause of the verdict.
     ``fingerprint`` : str
         Identity of the guide: a run is resumed only with the same fingerprint.
+
+    Examples
+    --------
+    A normal density near the posterior, which is not refined:
+
+    >>> class Normal:
+    ...     findings = ()  # there are no other modes
+    ...     mean, sd = samples.mean(axis=0), 1.5 * samples.std(axis=0)
+    ...     def draw(self, n, random):
+    ...         return random.normal(self.mean, self.sd, size=(n, len(self.mean)))
+    ...     def log_density(self, coords):
+    ...         z = (coords - self.mean) / self.sd
+    ...         return -0.5 * np.sum(z**2 + np.log(2.0 * np.pi * self.sd**2), axis=1)
+    ...     def refine(self, coords, log_prob, session):
+    ...         pass
+    >>> guided = SMCSampler(50, posterior.ndim, posterior, vectorize=True, guide=Normal(), seed=1)
+    >>> state = guided.run_mcmc(None, 1)
+    >>> bool(guided.simulations < 1000 and abs(guided.log_evidence - sampler.log_evidence) < 1.0)
+    True
     """
 
     def draw(self, n: int, random: np.random.RandomState, /) -> np.ndarray:

@@ -308,3 +308,42 @@ def test_a_guided_run_goes_on_after_an_interrupt_in_the_search(act, guided_evide
     again.run_mcmc(None, 0)
     assert again.failure_count == 0 and any(np.array_equal(calls[7], theta) for theta in calls[8:])
     assert again.log_evidence == guided_evidence
+
+
+class FailingPool:
+    """A pool that fails once, at its `at`-th call."""
+
+    def __init__(self, at):
+        self.at, self.calls = at, 0
+
+    def map(self, function, items):
+        self.calls += 1
+        if self.calls == self.at:
+            raise OSError("no space left on device")
+        return list(map(function, items))
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_an_exception_says_that_the_run_is_kept_and_goes_on(stored, tmp_path):
+    def sampler(at, name):
+        backend = emcee.backends.HDFBackend(tmp_path / name) if stored else None
+        return SMCSampler(30, 2, Gaussian(2), pool=FailingPool(at), backend=backend, seed=1)
+
+    whole, broken = sampler(0, "whole.h5"), sampler(4, "broken.h5")
+    whole.run_mcmc(None, 3)
+    with pytest.raises(OSError, match="no space left") as caught:
+        broken.run_mcmc(None, 3)
+    (note,) = caught.value.__notes__
+    assert "90 evaluations and 0 steps are kept in" in note and "call run_mcmc again" in note
+    assert ("broken.h5" in note) == stored
+    broken.run_mcmc(None, 3)
+    np.testing.assert_array_equal(broken.get_chain(), whole.get_chain())
+    assert broken.evaluations == whole.evaluations
+
+
+def test_a_refused_argument_says_nothing_of_what_is_kept():
+    sampler = SMCSampler(30, 2, Gaussian(2), vectorize=True, seed=1)
+    sampler.run_mcmc(None, 1)
+    with pytest.raises(ValueError) as caught:
+        sampler.run_mcmc(None, -1)
+    assert not hasattr(caught.value, "__notes__")
