@@ -8,7 +8,6 @@ from samplers import SMCSampler, compare_models, ladder_table
 from samplers.estimates.genealogy import worst_effective_sample_size
 from samplers.judgement.clusters import find_clusters
 from samplers.judgement.verdict import Verdict
-from samplers.output import _parsed
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -109,9 +108,3 @@ def test_worst_direction_is_a_combination_of_parameters(rng):
     assert worst_effective_sample_size(1e9 * chain + 1e12, founders) == pytest.approx(
         worst_effective_sample_size(chain, founders), rel=1e-3
     )
-
-
-def test_a_verdict_stored_without_findings_is_read():
-    """As version 0.2 has stored it."""
-    _, verdict = _parsed({"verdict": ["usable", ["few starts"], 10.0, None, 3.0, "of 5 walkers"]})
-    assert verdict == Verdict("usable", ("few starts",), 10.0, None, 3.0, "of 5 walkers") and verdict.findings == ()
