@@ -17,11 +17,11 @@ from fe_likelihoods import (
     FELikelihood,
     LinearStructure,
     Measurements,
-    arias_intensity,
     peak,
     read_record,
 )
 from fe_likelihoods.prediction.new_event import _event, _ratios
+from fe_likelihoods.prediction.quantities import arias_intensity
 from fe_likelihoods.priors.between_events import BETWEEN_EVENTS
 
 MEMBERS = "CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2"
