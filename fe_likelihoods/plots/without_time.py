@@ -175,7 +175,7 @@ def plot_modes(modes: PredictedModes, before: PredictedModes | None = None, labe
     for each in data.frequencies / measured:
         first.errorbar(places, each, errors, fmt="o", color=ORANGE, markersize=4, label=text)
     _name(first, [f"{number}\n{f:.4g} Hz" for number, f in zip(data.mode_numbers, measured, strict=True)])
-    first.set(ylabel="frequency over measured frequency [-]", xlabel="mode")
+    first.set(ylabel="computed over measured frequency", xlabel="mode")
     first.grid(alpha=0.25)
     for axes, k in zip(others, shaped, strict=False):
         middle, reach = _interval(modes.shapes[:, k])

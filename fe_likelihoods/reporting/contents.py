@@ -164,14 +164,14 @@ def evidence(run: FinishedRun) -> list[str]:
         return ["This sampler gives no evidence; SMCSampler and TMCMCSampler do."]
     sampler, check = run.sampler, run.check
     lines = [
-        f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2f}. Only differences between models "
+        f"Log-evidence {sampler.log_evidence:.2f} ± {sampler.log_evidence_error:.2g}. Only differences between models "
         "for the same data mean something: a difference of 3 is odds of 20 to 1."
     ]
     if check is not None:
         own, error = sampler.log_evidence_ladder, sampler.ladder[-1].log_evidence_error
         text = (
-            f"Check: the tempering stages (or all weighted draws) give {own:.2f} ± {error:.2f}, {check.evaluations} "
-            f"independent draws give {check.log_evidence:.2f} ± {check.error:.2f} (effective sample size "
+            f"Check: the tempering stages (or all weighted draws) give {own:.2f} ± {error:.2g}, {check.evaluations} "
+            f"independent draws give {check.log_evidence:.2f} ± {check.error:.2g} (effective sample size "
             f"{check.effective_sample_size:.2g}, Pareto shape of the weights {check.pareto_shape:.2f})."
         )
         return [*lines, text if check.reliable else f"{text} Its weights are too uneven to confirm anything."]

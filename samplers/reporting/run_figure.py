@@ -87,7 +87,7 @@ def _headline(sampler: Any) -> str:
         return f"{number}, {cost}, ended by the limit of simulations at beta = {sampler.ended_at:.3g}"
     if stages[-1].beta < 1.0:
         return f"{number}, {cost}, not finished: beta = {stages[-1].beta:.3g}"
-    return f"{number}, {cost}, " + rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2f}"
+    return f"{number}, {cost}, " + rf"$\log Z$ = {sampler.log_evidence:.2f} $\pm$ {sampler.log_evidence_error:.2g}"
 
 
 def _draw_phases(axes: "Axes", sampler: Any) -> None:

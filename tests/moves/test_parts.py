@@ -71,7 +71,7 @@ def test_one_step_without_a_part_stays_near_the_fit(rng):
         )
 
 
-@pytest.mark.parametrize(("ndim", "fitted"), [(5, 0), (6, population_moves.PARTS)])
+@pytest.mark.parametrize(("ndim", "fitted"), [(14, 0), (15, population_moves.PARTS)])
 def test_few_parameters_need_no_parts(ndim, fitted, rng):
     move = MixtureMove()
     move.calibrate(rng.standard_normal((100, ndim)), np.full(100, 0.01))
