@@ -366,11 +366,10 @@ def check_other_events(rows: Sequence[ParameterRow]) -> list[Finding]:
     factors = {row.label: float(np.sqrt(1.0 + 2.0 * (sd / row.cv) ** 2)) for row, sd in known}
     if not factors:
         return []
-    differing = [f"{row.label} by about {percent(sd)}" for row, sd in known]
+    differing = [f"{row.label} by about {percent(sd)} (factor {factors[row.label]:.2g})" for row, sd in known]
     text = (
-        f"The standard deviations hold for this event. Between events of one structure {listed(differing)} differ, so "
-        "that for another event they are too small by factors of "
-        f"{listed([f'{factor:.2g} ({label})' for label, factor in factors.items()])}."
+        "The standard deviations hold for this event. For another event of the same structure they are too small, "
+        f"because parameters differ between events: {listed(differing)}."
     )
     action = "Predict another event with this spread (in Python, predict_new_event), or calibrate several events."
     return [Finding("Another event differs", NOTE, text, action, factors)]

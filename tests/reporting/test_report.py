@@ -379,4 +379,4 @@ def test_the_most_severe_finding_decides_and_is_the_first_sentence(page, vibrati
     assert {finding.kind for finding in judgement.findings} >= set(page.notes) - {"True values are missed"}
     assert str(judgement) in page.text and judgement.status in page.text
     (other,) = (each for each in judgement.findings if each.kind == "Another event differs")
-    assert other.numbers["damping"] > 1.0 and "for another event they are too small by factors of" in page.text
+    assert other.numbers["damping"] > 1.0 and "For another event of the same structure" in page.text
