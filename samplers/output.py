@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
 CHECKSUM = "checksum"
+ATTRIBUTES = {"version", "nwalkers", "ndim", "has_blobs", "iteration"}  # of every chain of emcee
 STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
@@ -274,7 +275,9 @@ def run_of_file(backend: HDFBackend) -> str | None:
             group.visititems(read_object)
             if not group.attrs.get("iteration", 0) and "run" not in group.attrs and "log_prob" not in group:
                 return None  # emcee was killed while it made the group
-            whole = {"chain", "log_prob", "accepted"} <= set(group) and "iteration" in group.attrs
+            names = list(group.attrs)  # a kill while one is replaced loses another one, or leaves one twice
+            whole = ATTRIBUTES <= set(names) and len(set(names)) == len(names)
+            whole &= {"chain", "log_prob", "accepted"} <= set(group)
             if whole and ("run" in group.attrs or "tempering" in group):  # else a chain of emcee
                 whole = group.attrs.get(CHECKSUM) == _checksum(group, _checksum_of_steps(group)[1])
             return group.attrs.get("run", "") if whole else DAMAGED

@@ -162,9 +162,15 @@ def damage_attributes(group):
     group.attrs["random_state_9"] = group.attrs["random_state_2"]
 
 
+def lose_an_attribute(group):
+    """The same, with a checksum that is right."""
+    del group.attrs["has_blobs"]
+
+
 @pytest.mark.parametrize(
     "damage",
-    [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder, damage_attributes],
+    [damage_accepted, damage_iteration, damage_random_state, damage_last_step, damage_ladder, damage_attributes]
+    + [lose_an_attribute],
 )
 def test_half_of_a_step_is_found_and_the_chain_made_again(whole, damage, tmp_path):
     """As a process leaves it that is killed in HDF5; nothing is evaluated but a comparison."""
