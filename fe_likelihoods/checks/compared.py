@@ -6,6 +6,8 @@ Responses are taken from the caches of the likelihood where they are there; the 
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,12 +27,13 @@ from ..signals.events import find_events
 from ..simulation.faults import ChangedModel
 from ..simulation.model import SimulationFailed, simulate_batch
 from .run import FinishedRun
+from .slow_motion import FEWEST_DRAWS, SlowMotion, slow_motions
 
 __all__ = ["ChannelFit", "Compared", "Fit", "Fits", "compare", "data_sets_of", "draws_to_compare", "fit_data_sets"]
 
 logger = logging.getLogger(__name__)
 
-MOST_DRAWS, FEWEST_DRAWS = 100, 5  # of the prior
+MOST_DRAWS = 100  # of the prior
 SECONDS = 10.0  # of simulations of these draws
 MOST_STORED = 100  # responses of a guide that are compared in addition
 
@@ -49,7 +52,8 @@ class Window(NamedTuple):
         return np.where(self.inside, values, np.nan)[..., self.rows[:, None], self.columns]
 
 
-class Compared(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Compared:
     """Measurements of one event, and responses to compare with them: the fit, draws of the prior, others of a guide."""
 
     title: str  # name of the data set and of the event; empty if there is one only
@@ -57,8 +61,14 @@ class Compared(NamedTuple):
     responses: np.ndarray  # (n, n_channels, n_samples) at the times of the samples [SI]
     fitted: bool  # whether the first response is the fit, not one more draw of the prior
     parts: dict[str, np.ndarray]  # shares of each support's motion in the responses of a linear structure
-    draws: slice = slice(None)  # the responses that are draws of the prior
+    draws: slice = field(default_factory=lambda: slice(None))  # the responses that are draws of the prior
     modal: "ModalFit | None" = None  # modes of the responses, instead of these
+
+    @cached_property
+    def slow(self) -> dict[str, SlowMotion]:
+        """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
+        is_history = not self.modal and self.measurements.is_history
+        return slow_motions(self.measurements, self.responses[self.draws]) if is_history else {}
 
 
 class ModalFit(NamedTuple):
@@ -179,7 +189,7 @@ def compare(
     draws and `samples` are compared.
     """
     n = len(likelihood.model.parameter_names)
-    if hasattr(likelihood, "predict_modes"):
+    if likelihood.is_modal:
         modal = _modes(likelihood, points[int(fitted) :], samples if fitted else None)
         no = np.empty((0, *likelihood.measurements.values.shape))
         return (Compared(key, likelihood.measurements, no, fitted, {}, modal=modal),)
@@ -263,7 +273,7 @@ def fit_data_sets(run: FinishedRun) -> Fits:
         point, n = run.centre[columns], len(likelihood.model.parameter_names)
         draws = draws_to_compare(run.posterior)[:, columns]
         compared += compare(likelihood, np.stack([point, *draws]), True, key, run.samples[:, columns])
-        if hasattr(likelihood, "predict_modes"):
+        if likelihood.is_modal:
             fits.append(Fit(key, likelihood.measurements, {}, None, (), "modal", compared[-1].modal))
             continue
         batch = likelihood.simulate(np.stack([start[columns], point])[:, :n])

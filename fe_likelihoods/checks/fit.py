@@ -19,7 +19,7 @@ from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, dr
 from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal_faults import check_modes
-from .slow_motion import find_slow_faults, slow_motions
+from .slow_motion import find_slow_faults
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
 
@@ -101,7 +101,7 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
         faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
-        slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each)}
+        slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each.slow)}
         if any(fault.kind == "input lag" for fault in faults):  # of which the outputs' lags are a consequence
             slow = {key: fault for key, fault in slow.items() if key[0] != "lag"}
         for fault in faults:
@@ -300,9 +300,7 @@ def check_damping(model: Any, theta: np.ndarray, compared: Iterable[Compared]) -
     if not large:
         return []
     compared = [each for each in compared if not each.modal]
-    known = all(
-        len(slow_motions(each)) == each.measurements.n_channels and not find_slow_faults(each) for each in compared
-    )
+    known = all(len(each.slow) == each.measurements.n_channels and not find_slow_faults(each.slow) for each in compared)
     text = f"The damping ratio of the fit is {listed([f'{ratio:.2g} ({name})' for name, ratio in large.items()])}."
     if known:
         text += " It does not make up for gains or clocks, which are right where parameters hardly change the response."

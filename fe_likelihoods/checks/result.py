@@ -24,7 +24,6 @@ from .fit import (
 )
 from .run import FinishedRun, read_run
 from .screening import check_data, check_gaps
-from .slow_motion import slow_motions
 from .steps import (
     StepTest,
     check_stronger_motion,
@@ -139,7 +138,7 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
     slow, unknown = [], []
     for each in (each for each in fits.compared if not each.modal and each.measurements.is_history):
-        known = slow_motions(each)
+        known = each.slow
         for channel in each.measurements.channels:
             where = f"{channel.name} ({each.title})" if each.title else channel.name
             if channel.name in known:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SensorFault", "find_sensor_faults"]
+__all__ = ["SensorFault", "find_sensor_faults", "runs_of"]
 
 FEWEST = 50  # samples that are judged
 MATTERS = 0.25  # of the peak, or of the standard deviation: smaller parts hardly change a sum of squares
@@ -78,7 +78,7 @@ def _without(x: np.ndarray, spans: tuple[tuple[int, int], ...]) -> np.ndarray:
     return x
 
 
-def _runs(true: np.ndarray) -> list[tuple[int, int]]:
+def runs_of(true: np.ndarray) -> list[tuple[int, int]]:
     """First index and index after the last of each run of true values."""
     edges = np.diff(np.concatenate([[0], true.astype(int), [0]]))
     return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
@@ -95,7 +95,7 @@ def _flat_parts(x: np.ndarray) -> list[tuple[int, int]]:
     found = []
     if np.count_nonzero(known > equal) < FEWEST:  # steps are what it consists of
         return []
-    for first, last in _runs(steps <= equal):
+    for first, last in runs_of(steps <= equal):
         sides = (steps[max(first - STILL, 0) : first], steps[last : last + STILL])
         beside = [np.square(side[np.isfinite(side)]).mean() for side in sides if np.isfinite(side).any()]
         if beside and min(beside) >= least**2:
@@ -110,7 +110,7 @@ def _clipped(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     for top in (np.nanmax(x), np.nanmin(x)):
         at = np.abs(x - top) <= equal
         if sum(last - first + 1 for first, last in flat if at[first]) >= CLIPPED:
-            found += [(first, stop - 1) for first, stop in _runs(at)]
+            found += [(first, stop - 1) for first, stop in runs_of(at)]
     return tuple(sorted(found))
 
 
@@ -124,14 +124,14 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     if len(x) > 2 * (length + beside):
         quiet, sides = _moving_deviation(x, length), _moving_deviation(x, beside)
         for least in MATTERS * 2.0 ** np.arange(4):
-            for start, stop in _runs(quiet <= least * level / VANISHED):
+            for start, stop in runs_of(quiet <= least * level / VANISHED):
                 first, after = start, stop - 1 + length
                 if first >= beside and after + beside <= len(x):
                     found = np.minimum(sides[first - beside], sides[after])
                     still[first:after] |= bool(
                         np.isfinite(found) and found >= least * level and not still[start:stop].any()
                     )
-    return tuple((first, stop - 1) for first, stop in _runs(still))
+    return tuple((first, stop - 1) for first, stop in runs_of(still))
 
 
 def _moving_deviation(x: np.ndarray, length: int) -> np.ndarray:

@@ -10,17 +10,20 @@ There, measurement y and response r have the spectra Y and R, and the gain g and
 Where the draws agree nowhere, or measurement and response are not coherent there, nothing is known.
 """
 
+from collections.abc import Mapping
 from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
-from .compared import FEWEST_DRAWS, Compared
+from ..signals.channels import Measurements
 from .data_faults import FACTOR, Fault
 from .finding import SMALL_PROBABILITY
+from .sensor_faults import runs_of
 
-__all__ = ["SlowMotion", "compare_slow_motion", "find_slow_faults", "slow_motions"]
+__all__ = ["FEWEST_DRAWS", "SlowMotion", "compare_slow_motion", "find_slow_faults", "slow_motions"]
 
+FEWEST_DRAWS = 5  # of the prior
 AGREE = 0.1  # difference of a draw from the median, half of the draws: gains of 45 right fits are then 0.96 to 1.21
 SMOOTH = 7  # lines of the spectrum over which powers are averaged, and fewest lines of a band
 TAPER = 0.05  # share of the record at either end
@@ -61,8 +64,8 @@ def compare_slow_motion(measured: np.ndarray, draws: np.ndarray, step: float) ->
     smooth = np.ones(SMOOTH) / SMOOTH
     power = np.convolve(np.abs(centre) ** 2, smooth, "same")
     disagree = np.convolve(np.median(np.abs(spectra - centre), axis=0) ** 2, smooth, "same") >= AGREE**2 * power
-    edges = np.flatnonzero(np.diff(np.concatenate([[1], disagree[2:], [1]]).astype(int))) + 2
-    runs = [run for run in edges.reshape(-1, 2) if run[1] - run[0] >= SMOOTH and run[0] <= np.argmax(power)]
+    disagree[:2] = True  # the mean, and what the taper makes of it
+    runs = [run for run in runs_of(~disagree) if run[1] - run[0] >= SMOOTH and run[0] <= np.argmax(power)]
     if not runs:
         return None
     band = slice(*runs[0])  # below it, filtered motions are noise
@@ -93,22 +96,20 @@ def compare_slow_motion(measured: np.ndarray, draws: np.ndarray, step: float) ->
     )
 
 
-def slow_motions(compared: Compared) -> dict[str, SlowMotion]:
-    """Channels whose measurement follows the draws of the prior in such a band, by name."""
-    measured, found = compared.measurements, {}
-    if compared.modal or not measured.is_history:
-        return {}
+def slow_motions(measured: Measurements, draws: np.ndarray) -> dict[str, SlowMotion]:
+    """Channels whose measurement follows draws of the prior (n, n_channels, n_samples) in such a band, by name."""
+    found = {}
     for row, (channel, values, step) in enumerate(zip(measured.channels, measured.values, measured.steps, strict=True)):
-        slow = compare_slow_motion(values, compared.responses[compared.draws, row], step)
+        slow = compare_slow_motion(values, draws[:, row], step)
         found |= {channel.name: slow} if slow is not None and slow.coherence > COHERENT else {}
     return found
 
 
-def find_slow_faults(compared: Compared) -> list[tuple[Fault, tuple[float, float]]]:
+def find_slow_faults(known: Mapping[str, SlowMotion]) -> list[tuple[Fault, tuple[float, float]]]:
     """Factors, signs and lags of channels in the band [Hz] that no parameter changes, and this band."""
     found: list[tuple[Fault, tuple[float, float]]] = []
     sure = NormalDist().inv_cdf(1.0 - 0.5 * SMALL_PROBABILITY)  # standard deviations
-    for name, slow in slow_motions(compared).items():
+    for name, slow in known.items():
         faults = {"sign": np.nan} if slow.gain < 0.0 else {}
         if abs(np.log(abs(slow.gain))) > max(np.log(FACTOR), sure * slow.error):
             faults["factor"] = abs(slow.gain)

@@ -75,7 +75,7 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         if record.source:
             say(f"  from {record.source}")
     say(f"Measurements: {measured.description or 'without a description'}")
-    modal = hasattr(likelihood, "predict_modes")
+    modal = likelihood.is_modal
     if modal:
         say(str(model.data))
     for channel, values in () if modal else zip(measured.channels, measured.values, strict=True):
@@ -125,7 +125,7 @@ def _say_simulation(
         )
     checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
     say(f"One simulation takes {checked.seconds:.2g} s")
-    if hasattr(likelihood, "predict_modes"):
+    if likelihood.is_modal:
         say(f"At the mean of the prior:\n{likelihood.predict_modes(mean[None, :n]).short()}")
     else:
         response = likelihood.simulate(mean[None, :n]).response[0]
@@ -185,7 +185,7 @@ def _draw(problem: Problem, seconds: float, picture: Path) -> None:
     n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
     structural = len(posterior.likelihood.model.parameter_names)
     draws = posterior.sample_prior(n, np.random.RandomState(1))[:, :structural]
-    if hasattr(posterior.likelihood, "predict_modes"):
+    if posterior.likelihood.is_modal:
         save_picture(
             plot_modes(posterior.likelihood.predict_modes(draws), label=f"{n} draws of the prior, 90 %"), picture
         )

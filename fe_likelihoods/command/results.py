@@ -31,7 +31,7 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     with np.errstate(divide="ignore", invalid="ignore"):
         cv = sd / np.abs(mean)
     moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
-    modal = hasattr(posterior.likelihood, "predict_modes")
+    modal = posterior.likelihood.is_modal
     fit = _mode_rows(posterior, run.samples) if modal else _fit_rows(posterior, run.samples)
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [

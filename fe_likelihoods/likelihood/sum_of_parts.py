@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ class SumOfParts:
     """Base class of `FELikelihood`, which is its only part, and `JointLikelihood`. The parts are independent."""
 
     parameter_names: tuple[str, ...]
+    is_modal: ClassVar[bool] = False  # whether the data are natural frequencies and mode shapes
 
     @abstractmethod
     def parts(self) -> list[tuple[Any, list[int]]]:

@@ -69,6 +69,8 @@ class ModalLikelihood(FELikelihood):
     ['stiffness_1', 'stiffness_2']
     """
 
+    is_modal = True
+
     def __init__(
         self,
         model: Model | Any,

@@ -65,7 +65,7 @@ def _data_set(key: str, likelihood: FELikelihood) -> DataSet:
         f"{channel.name} [{channel.unit}], {count} {f'values{along}' if along else f'samples at {step:g} s'}"
         for channel, count, step in zip(measurements.channels, samples, measurements.steps, strict=True)
     ]
-    if hasattr(likelihood, "predict_modes"):
+    if likelihood.is_modal:
         data = model.data
         times = f", identified {data.n_sets} times" if data.n_sets > 1 else ""
         channels = [f"{data.n_modes} modes at {data.n_sensors} sensors{times}"]
@@ -88,7 +88,7 @@ def summary_sentences(
     if sets:
         models = " and ".join(sorted({each.model for each in sets}))
         n_channels = sum(len(likelihood.measurements.channels) for likelihood, _ in run.likelihood.parts())
-        modal = any(hasattr(likelihood, "predict_modes") for likelihood, _ in run.likelihood.parts())
+        modal = any(likelihood.is_modal for likelihood, _ in run.likelihood.parts())
         what = "modes" if modal and len(sets) == 1 else "modes and channels" if modal else "channels"
         channels = f"{n_channels} measured {what if n_channels > 1 else what[:-1]}"
         what = f"{len(rows)} parameters of {models} and its noise were updated with {channels}"

@@ -1,5 +1,7 @@
 """Gains, signs and clocks are known where no parameter changes the response, whatever a fit makes of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -154,7 +156,7 @@ def test_a_damping_that_no_structure_has_speaks_against_a_fit_unless_gains_and_c
     (found,) = check_damping(model, np.array([9.9, 0.6, 0.5]), [known, unknown])
     assert found.severity == "wrong" and found.numbers == {"damping": 0.6}
     assert check_damping(model, np.array([9.9, 0.6, 0.5]), [known])[0].severity == "note"
-    halved = known._replace(measurements=Measurements(model.channels, STEP, 0.5 * true))
+    halved = replace(known, measurements=Measurements(model.channels, STEP, 0.5 * true))
     assert check_damping(model, np.array([9.9, 0.6, 0.5]), [halved])[0].severity == "wrong"
     oscillator = LinearOscillator(motions(rng, 1)[0], 0.3, damping_ratio=0.05)
     assert check_damping(oscillator, np.array([1.0, 3.0]), [unknown]) == []

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import warnings
+from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 
 import emcee
@@ -204,7 +205,7 @@ def test_a_sensor_with_the_opposite_sign_is_named(vibrating):
     finished = read_run(*vibrating)
     rows, fits = parameter_rows(finished), fit_data_sets(finished)
     (one,) = fits.compared
-    turned = fits._replace(compared=(one._replace(responses=-one.responses),))
+    turned = fits._replace(compared=(replace(one, responses=-one.responses),))
     notes = {n.kind: n for n in check_run(finished, rows, turned, Failures((), 0, 1)).findings}
     assert "opposite signs: top" in notes["A sign may be wrong"].text
     assert "The model does not follow the measurements" not in notes  # the sign explains it
