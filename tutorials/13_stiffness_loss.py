@@ -177,6 +177,7 @@ def alone(first: StoredPosterior, second: StoredPosterior) -> np.ndarray:
 losses = {"after": (found.loss, alone(calibrated["before"], calibrated["after"]))}
 losses["colder, no damage"] = control.loss, alone(calibrated["before"], calibrated["colder, no damage"])
 truths = {"after": true_loss, "colder, no damage": 1.0 - scatter[1]}
+STOREYS_SHOWN = range(2, 21, 2)
 fig, axes = plt.subplots(2, 2, figsize=(9, 7), sharex=True, sharey="row", layout="constrained")
 for row, (name, draws) in zip(axes, losses.items(), strict=True):
     for ax, each, title in zip(row, draws, ("compared by stiffness_loss", "two calibrations alone"), strict=True):
@@ -188,13 +189,13 @@ for row, (name, draws) in zip(axes, losses.items(), strict=True):
     row[0].set_ylabel("stiffness loss [%]")
     row[0].legend()
 for ax in axes[1]:
-    ax.set_xlabel("storey")
+    ax.set(xlabel="storey", xticks=STOREYS_SHOWN)
 fig.savefig(args.out / "losses.png", dpi=150)
 
 fig, ax = plt.subplots(figsize=(7, 3.5), layout="constrained")
 for shift, (label, each) in zip((-0.2, 0.2), {"after": found, "colder, no damage": control}.items(), strict=True):
     ax.bar(np.arange(1, STOREYS + 1) + shift, each.probability(0.1), width=0.4, label=label)
-ax.set_xlabel("storey")
+ax.set(xlabel="storey", xticks=STOREYS_SHOWN)
 ax.set_ylabel("P(stiffness loss > 10 %)")
 ax.set_ylim(0.0, 1.02)
 ax.legend()
