@@ -1,8 +1,8 @@
 """Adapter for PyMC: a `pymc.Model` with PyMC's distributions as priors and the log-likelihood as a black box.
 
-A finite-element model has no gradients, so only the samplers of PyMC that need none can be used: `pymc.sample_smc`,
-which gives the evidence, and `pymc.sample` with the step method `pymc.DEMetropolisZ`, `pymc.Metropolis` or
-`pymc.Slice`.
+Models that know the derivatives of their response (``jacobian``) have a gradient, so that `pymc.sample` uses NUTS.
+Without one, only samplers that need no gradient can be used: `pymc.sample_smc`, which gives the evidence, and
+`pymc.sample` with the step method `pymc.DEMetropolisZ`, `pymc.Metropolis` or `pymc.Slice`.
 """
 
 from __future__ import annotations
@@ -47,6 +47,9 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
     >>> with to_pymc(posterior):  # doctest: +SKIP
     ...     trace = pymc.sample_smc(2000)
 
+    >>> with to_pymc(posterior):  # the oscillator knows its derivatives  # doctest: +SKIP
+    ...     trace = pymc.sample(1000, chains=4)  # NUTS
+
     Pass starting points where the posterior is not zero; the default starting point of PyMC may be elsewhere:
 
     >>> starts = [dict(zip(posterior.parameter_names, x)) for x in posterior.sample_start(4)]
@@ -62,17 +65,22 @@ def to_pymc(posterior: Posterior) -> pymc.Model:
         )
     with pymc.Model() as model:
         parameters = [_translated(name, d) for name, d in posterior.prior.distributions.items()]
-        pymc.Potential("log_likelihood", _op_class()(posterior)(pytensor.tensor.stack(parameters)))
+        pymc.Potential("log_likelihood", _make_op(posterior)(pytensor.tensor.stack(parameters)))
     return model
 
 
 def _make_op(posterior: Posterior) -> object:
     """Construct the operator; pickles refer to this function because the class is created at run time."""
-    return _op_class()(posterior)
+    return _op_classes()[0](posterior)
+
+
+def _make_gradient(posterior: Posterior) -> object:
+    """Construct the operator of the gradient, for pickles."""
+    return _op_classes()[1](posterior)
 
 
 @functools.cache
-def _op_class() -> type:
+def _op_classes() -> tuple[type, type]:
     import pytensor.tensor
     from pytensor.graph.op import Op
 
@@ -89,7 +97,23 @@ def _op_class() -> type:
         def perform(self, node, inputs, outputs) -> None:
             outputs[0][0] = np.array(self.posterior.log_likelihood(inputs[0]))
 
-    return LogLikelihood
+        def grad(self, inputs, output_gradients) -> list:
+            if not self.posterior.is_differentiable:  # pymc.sample then takes a step without gradient
+                raise NotImplementedError("the model has no method jacobian")
+            return [output_gradients[0] * Gradient(self.posterior)(inputs[0])]
+
+    class Gradient(LogLikelihood):
+        otypes = (pytensor.tensor.dvector,)
+
+        def perform(self, node, inputs, outputs) -> None:
+            outputs[0][0] = self.posterior.grad_log_likelihood(inputs[0])
+
+        def __reduce__(self) -> tuple:
+            return _make_gradient, (self.posterior,)
+
+        grad = Op.grad  # a second derivative is not known
+
+    return LogLikelihood, Gradient
 
 
 def _translated(name: str, distribution: Distribution) -> object:

@@ -9,6 +9,7 @@ density is zero.
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
 from .block_likelihood import BlockLogLikelihood
 from .evaluation_queue import EvaluationQueue
+from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
 from .known_errors import without_known
 from .likelihood import FELikelihood
@@ -140,6 +142,68 @@ class Posterior:
         """Log-likelihood; -inf outside the support of the prior, where nothing is simulated."""
         points = as_points(x, self.prior.names)
         return self.likelihood.log_likelihood(points, self.prior.logpdf(points) > -np.inf)
+
+    @property
+    def is_differentiable(self) -> bool:
+        """Whether `grad_log_prob` can be computed: all models know the derivatives of their response."""
+        return all(getattr(part.model, "jacobian", None) is not None for part, _ in self.likelihood.parts())
+
+    def grad_log_prob(self, x: Any) -> np.ndarray:
+        """Gradient of `log_prob`, for models that know the derivatives of their response (``jacobian``).
+
+        Hamiltonian samplers and optimisers need it. A point costs one simulation, whose response is cached, and one
+        call of the model's ``jacobian``.
+
+        Parameters
+        ----------
+        x : array_like (ndim,) or (n, ndim), or mapping
+            As for `log_prob`.
+
+        Returns
+        -------
+        (ndim,) or (n, ndim) float
+            By the units of the parameters. Zeros where `log_prob` is -inf.
+
+        Raises
+        ------
+        ValueError
+            If a model has no ``jacobian``, or it fails.
+
+        Examples
+        --------
+        >>> posterior.grad_log_prob([1.1, 0.9, 0.5, 0.02]).shape
+        (4,)
+        """
+        return self._gradient(x, with_prior=True)
+
+    def grad_log_likelihood(self, x: Any) -> np.ndarray:
+        """Gradient of `log_likelihood`; see `grad_log_prob`, of which it is the part without the prior."""
+        return self._gradient(x, with_prior=False)
+
+    def _gradient(self, x: Any, with_prior: bool) -> np.ndarray:
+        if not self.is_differentiable:
+            kinds = ", ".join(sorted({type(part.model).__name__ for part, _ in self.likelihood.parts()}))
+            raise ValueError(
+                "the gradient needs models with a method jacobian(theta), the derivatives (n_parameters, n_channels, "
+                f"n_steps) of the response; got {kinds}: give FunctionModel jacobian=, or use a sampler without gradients"
+            )
+        points = as_points(x, self.prior.names)
+        rows = np.atleast_2d(points)
+        gradient, bounds = np.zeros(rows.shape), self.prior.bounds
+        inside = np.flatnonzero(self.possible(rows))
+        if len(inside):
+            sd = self._scales
+            gradient[inside], good = likelihood_gradient(self.likelihood, rows[inside], sd, bounds)
+            for k in inside[good] if with_prior else ():
+                gradient[k] += slopes_along(self.prior.logpdf, rows[k], sd, bounds)
+        return gradient if points.ndim == 2 else gradient[0]
+
+    @cached_property
+    def _scales(self) -> np.ndarray:
+        """Standard deviation (ndim,) of each parameter in the middle of the prior, about."""
+        return np.diag(
+            self.prior.from_normal(0.5 * np.eye(self.ndim)) - self.prior.from_normal(-0.5 * np.eye(self.ndim))
+        )
 
     def finite_log_likelihood(self, x: Any) -> np.ndarray | float:
         """`log_likelihood` with -1e100 instead of -inf, for clients that reject infinite values.

@@ -240,19 +240,32 @@ def _served(name: str, thing: Any) -> Any:
             raise ValueError(f"expected a config with at most a density, one of {densities}; got {config}")
         return inputs
 
-    def evaluate(parameters: list[list[float]], config: dict[str, Any]) -> list[list[float]]:
+    def numbers(parameters: list[list[float]]) -> np.ndarray:
         point = np.asarray(parameters)
         if point.dtype.kind not in "fiu" or not np.isfinite(point).all():
             raise ValueError(f"expected finite numbers; got {str(parameters)[:200]}")
+        return point.astype(float)
+
+    def evaluate(parameters: list[list[float]], config: dict[str, Any]) -> list[list[float]]:
+        point = numbers(parameters)
         if densities:
-            (value,) = getattr(thing, config.get("density", densities[0]))(point.astype(float))
+            (value,) = getattr(thing, config.get("density", densities[0]))(point)
             return [[max(float(value), -1e100)]]  # JSON has no infinite numbers
-        (response,), (reason,) = simulate_batch(thing, point.astype(float))
+        (response,), (reason,) = simulate_batch(thing, point)
         if reason:
             raise SimulationFailed(reason)
         return response.tolist()
 
+    def gradient(out: int, into: int, parameters: list, sens: list[float], config: dict[str, Any]) -> list[float]:
+        density = config.get("density", densities[0])
+        if density == "log_prior":
+            raise ValueError("expected the density log_prob or log_likelihood for a gradient; got log_prior")
+        (slopes,) = getattr(thing, f"grad_{density}")(numbers(parameters))
+        return (sens[0] * slopes).tolist()
+
     model = _package().Model(name)
     model.supports_evaluate, model.__call__ = lambda: True, evaluate
+    if getattr(thing, "is_differentiable", False):
+        model.supports_gradient, model.gradient = lambda: True, gradient
     model.get_input_sizes, model.get_output_sizes = input_sizes, lambda config: outputs
     return model

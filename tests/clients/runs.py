@@ -184,6 +184,25 @@ def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
     return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
 
 
+def _pymc_nuts(posterior: Posterior, seed: int) -> Found:
+    import pymc
+
+    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(4, seed)]
+    with to_pymc(posterior):
+        trace = pymc.sample(
+            500,
+            tune=500,
+            initvals=starts,
+            chains=4,
+            cores=1,
+            random_seed=seed,
+            progressbar=False,
+            compute_convergence_checks=False,
+        )
+    assert "tree_depth" in trace.sample_stats  # NUTS
+    return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
+
+
 def _uqpy(posterior: Posterior, seed: int) -> Found:
     from UQpy.sampling.mcmc import Stretch
 
@@ -218,6 +237,7 @@ CLIENTS = {
     "ultranest": Client("ultranest", "ultranest", _CLIENTS, _ultranest),
     "pymc-smc": Client("pymc", "pymc", _CLIENTS, _pymc_smc),
     "pymc-mcmc": Client("pymc", "pymc", _CLIENTS, _pymc_mcmc),
+    "pymc-nuts": Client("pymc", "pymc", _CLIENTS, _pymc_nuts),
     "pocomc": Client("pocomc", "pocomc", _MAKE, _pocomc),
     "uqpy": Client("UQpy", "UQpy", _MAKE, _uqpy),
 }

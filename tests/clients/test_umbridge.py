@@ -72,9 +72,12 @@ def test_posterior_is_served_with_all_digits(ours):
             expected = getattr(posterior, density)(point)
             assert client([point.tolist()], {"density": density}) == [[expected]], density
         assert client([point.tolist()]) == [[posterior(point)]]
+        for density in ("log_prob", "log_likelihood"):
+            expected = 2.0 * getattr(posterior, f"grad_{density}")(point)
+            assert client.gradient(0, 0, [point.tolist()], [2.0], {"density": density}) == expected.tolist()
     for point in ([1.0, 9.0, 0.5, 0.01], [1.0, CRITICAL + 0.1, 0.5, 0.01]):  # outside the prior, and failed
         assert posterior(np.array(point)) == -np.inf and client([point]) == [[-1e100]]
-    assert not (client.supports_gradient() or client.supports_apply_jacobian() or client.supports_apply_hessian())
+    assert client.supports_gradient() and not (client.supports_apply_jacobian() or client.supports_apply_hessian())
 
 
 @pytest.mark.parametrize(
