@@ -28,6 +28,7 @@ from .predictive_draws import MeasuredData, PredictiveDraws, measured_data, pred
 
 if TYPE_CHECKING:
     from ..emulation.guide import ResponseGuide
+    from .posterior_modes import PosteriorModes
 
 __all__ = ["Posterior"]
 
@@ -185,7 +186,8 @@ class Posterior:
             kinds = ", ".join(sorted({type(part.model).__name__ for part, _ in self.likelihood.parts()}))
             raise ValueError(
                 "the gradient needs models with a method jacobian(theta), the derivatives (n_parameters, n_channels, "
-                f"n_steps) of the response; got {kinds}: give FunctionModel jacobian=, or use a sampler without gradients"
+                f"n_steps) of the response; got {kinds}: give FunctionModel jacobian=, or use a sampler that needs no "
+                "gradient"
             )
         points = as_points(x, self.prior.names)
         rows = np.atleast_2d(points)
@@ -398,6 +400,47 @@ class Posterior:
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)
+
+    def mode(self, starts: int = 6, seed: Any = None, max_simulations: float | None = None) -> "PosteriorModes":
+        """The modes of the density: most probable parameters, Laplace covariances and evidences.
+
+        The search of `guide` finds the modes. Each is then refined by a few simulations, and by differences of the
+        responses where the model has no ``jacobian``. Responses are cached, so a sampler with a guide, or another
+        search, repeats none of them.
+
+        Parameters
+        ----------
+        starts : int
+            As for `guide`.
+        seed : int, Generator or RandomState, optional
+            Of the starts.
+        max_simulations : float, optional
+            Limit of the search.
+
+        Returns
+        -------
+        PosteriorModes
+            Print it for a table; ``modes[0].parameters`` are the most probable ones.
+
+        Raises
+        ------
+        ValueError
+            As `guide`.
+
+        Notes
+        -----
+        The Laplace approximation takes the response as linear within a mode. On a posterior that is curved or cut by a
+        bound it is rough: sample with a guide.
+
+        Examples
+        --------
+        >>> found = posterior.mode(seed=1)
+        >>> len(found.modes), found.modes[0].converged
+        (1, True)
+        """
+        from .posterior_modes import posterior_modes  # scipy.optimize is slow to import
+
+        return posterior_modes(self, starts, seed, max_simulations)
 
     def measured_data(self) -> MeasuredData:
         """The measurements, without missing samples, and the records of the excitation; nothing is simulated."""
