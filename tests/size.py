@@ -1,66 +1,64 @@
 """Size of the project in one table: ``python -m tests.size``, or ``make size``.
 
-It measures the checkout in the current folder; another one by ``cd checkout && python /path/to/size.py``. Frames are
-those on the stack from `run_mcmc` (included) to the user's function (excluded), counted while the function runs.
+It measures the checkout in the current folder: lines by room beside their budgets, words, and frames on the stack from
+`run_mcmc` (included) to the user's function (excluded), counted while the function runs.
 """
 
 import ast
 import sys
-import tempfile
-import threading
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
 from importlib import import_module
-from inspect import Parameter, signature
 from pathlib import Path
 
-import emcee
 import numpy as np
 
-from tests.prose import count, docstrings
+from tests.prose import docstrings
 
 ROOT = Path.cwd()
-PACKAGES = ("samplers", "fe_likelihoods")
+BUDGETS = {  # lines of Python files, docstrings included
+    "samplers": 8000,
+    **{
+        f"fe_likelihoods/{room}": budget
+        for room, budget in {
+            "emulation": 1600,
+            "likelihood": 2300,
+            "simulation": 2200,
+            "cache": 1300,
+            "noise": 2100,
+            "priors": 1400,
+            "signals": 3800,
+            "models": 5200,
+            "kernels": 3400,
+            "prediction": 3300,
+            "events": 1700,
+            "information": 1000,
+            "column_damage": 600,
+            "checks": 1600,
+            "reporting": 1000,
+            "plots": 1400,
+            "command": 1900,
+            "adapters": 500,
+            "modal": 1200,
+        }.items()
+    },
+    "fe_likelihoods": 38_000,
+    "tests": 38_000,
+    "benchmarks": 2500,
+    "tutorials": 2000,
+}
 WALKERS = 300  # enough that SMCSampler recycles
 
 
-# ---------------------------------------------------------------- text
-
-
-def lines_of(folder: str) -> tuple[int, int, int]:
-    """Files, lines, and lines of code (no blank lines, comments and docstrings) of the Python files of a folder."""
-    files = sorted((ROOT / folder).rglob("*.py"))
+def lines_of(folder: str) -> tuple[int, int]:
+    """Lines, and lines of code (no blank lines, comments and docstrings), of the Python files of a folder."""
     lines = code = 0
-    for path in files:
+    for path in sorted((ROOT / folder).rglob("*.py")):
         text = path.read_text()
-        documented = docstrings(ast.parse(text))
-        prose = {number for node in documented for number in range(node.lineno, node.end_lineno + 1)}
+        prose = {n for node in docstrings(ast.parse(text)) for n in range(node.lineno, node.end_lineno + 1)}
         numbered = list(enumerate(text.splitlines(), 1))
         lines += len(numbered)
-        code += sum(bool(s := line.strip()) and s[0] != "#" and number not in prose for number, line in numbered)
-    return len(files), lines, code
-
-
-# ---------------------------------------------------------------- names and settings
-
-
-def count_fields(settings: type) -> int:
-    """Fields of a dataclass; a field that is a dataclass itself counts as its fields."""
-    values = vars(settings())
-    nested = [type(values[field.name]) for field in fields(settings)]
-    return sum(count_fields(kind) if is_dataclass(kind) else 1 for kind in nested)
-
-
-def arguments_of(sampler: type) -> tuple[int, int]:
-    """Numbers of arguments in emcee's order and of keyword arguments, without the settings."""
-    settings = {field.name for field in fields(import_module("samplers.settings").Settings)}
-    given = [p for p in signature(sampler).parameters.values() if p.kind is not Parameter.VAR_KEYWORD]
-    keywords = [p.name for p in given if p.kind is Parameter.KEYWORD_ONLY]
-    return len(given) - len(keywords), len(set(keywords) - settings)
-
-
-# ---------------------------------------------------------------- frames
+        code += sum(bool(s := line.strip()) and s[0] != "#" and n not in prose for n, line in numbered)
+    return lines, code
 
 
 class Normal:
@@ -90,52 +88,21 @@ def stack_to(name: str) -> list[str]:
     return files[:found]
 
 
-def describe(stacks: list[list[str]], package: str) -> str:
+def describe(stacks: list[list[str]]) -> str:
     """Frames and distinct files of the deepest stack."""
     stack = max(stacks, key=len)
-    files = set(stack)
-    own = sum(is_in(package, file) for file in files)
-    return f"{len(stack)} frames in {len(files)} files, {own} of {package}"
+    return f"{len(stack)} frames in {len(set(stack))} files"
 
 
-def is_in(package: str, file: str) -> bool:
-    return f"/{package}/" in file
-
-
-def files_entered(package: str, run: Callable[[], object]) -> int:
-    """Files of a package whose functions a run calls, in any thread."""
-    entered = set()
-
-    def note(frame, event, _):
-        if event == "call" and frame.f_code.co_name != "<module>":
-            entered.add(frame.f_code.co_filename)
-
-    threading.setprofile(note)
-    sys.setprofile(note)
-    try:
-        run()
-    finally:
-        sys.setprofile(None)
-        threading.setprofile(None)
-    return sum(is_in(package, file) for file in entered)
-
-
-def frames_of(sampler: type, package: str) -> Iterator[tuple[str, str]]:
-    """Deepest stacks of the two parts of a run, and the files of a package that a whole run enters."""
-    start = np.random.default_rng(1).standard_normal((WALKERS, 3))
-    posterior = Normal()
+def frames_of(sampler: type) -> list[str]:
+    """Deepest stacks of the two parts of a run: annealing, and steps at beta = 1."""
+    posterior, found = Normal(), []
     run = sampler(WALKERS, 3, posterior)
-    if package == "samplers":
-        run.run_mcmc(start, 0)
-        yield "run_mcmc to the function, annealing, deepest", describe(posterior.stacks, package)
+    for start, steps in ((np.random.default_rng(1).standard_normal((WALKERS, 3)), 0), (None, 3)):
         posterior.stacks.clear()
-    run.run_mcmc(None if package == "samplers" else start, 3)
-    yield "run_mcmc to the function at beta = 1, deepest", describe(posterior.stacks, package)
-    with tempfile.TemporaryDirectory() as folder:
-        for label, file in (("in memory", None), ("with an HDF5 file", f"{folder}/chain.h5")):
-            backend = file and emcee.backends.HDFBackend(file)
-            count = files_entered(package, lambda: sampler(WALKERS, 3, Normal(), backend=backend).run_mcmc(start, 3))  # noqa: B023
-            yield f"files of {package} entered, {label}", str(count)
+        run.run_mcmc(start, steps)
+        found.append(describe(posterior.stacks))
+    return found
 
 
 def frames_to_kernels() -> str:
@@ -166,44 +133,21 @@ def frames_to_kernels() -> str:
     finally:
         for module, key, value in replaced:
             setattr(module, key, value)
-    return (
-        describe(stacks, "fe_likelihoods") if any(stacks) else "not seen: the kernel runs in a thread or is no global"
-    )
-
-
-# ---------------------------------------------------------------- the table
+    return describe(stacks) if any(stacks) else "not seen: the kernel runs in a thread or is no global"
 
 
 def rows():
     """Pairs of label and value, in the order of the table."""
-    for folder in (*PACKAGES, "tests", "benchmarks", "tutorials"):
-        if (ROOT / folder).is_dir():
-            files, lines, code = lines_of(folder)
-            yield f"{folder}: files, lines, lines of code", f"{files}, {lines}, {code}"
-    guides = {"docs": sorted((ROOT / "docs").rglob("*.rst")), "README": [ROOT / "README.md"]}
-    for label, paths in guides.items():
-        paths = [path for path in paths if not {"api", "tutorials", "_build"} & set(path.parts[len(ROOT.parts) :])]
-        yield f"{label}: files, words", f"{len(paths)}, {sum(len(path.read_text().split()) for path in paths)}"
-    for package in PACKAGES:
-        found = count(ROOT / package)
-        yield f"{package}: words of docstrings", str(found.words)
-        yield '    "that of", "those of", "the one of" per 1000', f"{found.pronouns:.2f}"
-        yield '    "of (the) noun of" per 1000', f"{found.chains:.2f}"
-        yield f"{package}: public names", str(len(import_module(package).__all__))
-    samplers = import_module("samplers")
-    yield "settings that a user may change", str(count_fields(import_module("samplers.settings").Settings))
-    theirs = emcee.EnsembleSampler(WALKERS, 3, Normal())
-    for label, value in frames_of(emcee.EnsembleSampler, "emcee"):
-        yield f"EnsembleSampler: {label}", value
-    for sampler in (samplers.SMCSampler, samplers.TMCMCSampler):
-        name = sampler.__name__
-        positional, keywords = arguments_of(sampler)
-        yield f"{name}: emcee's arguments, further arguments, without settings", f"{positional}, {keywords}"
-        public = {member for member in dir(sampler(WALKERS, 3, Normal())) if member[0] != "_"}
-        yield f"{name}: public members, of these beyond emcee's", f"{len(public)}, {len(public - set(dir(theirs)))}"
-        yield f"{name}: classes between it and emcee's", str(len(sampler.__mro__) - len(type(theirs).__mro__) - 1)
-        for label, value in frames_of(sampler, "samplers"):
-            yield f"{name}: {label}", value
+    for folder, budget in BUDGETS.items():
+        lines, code = lines_of(folder)
+        yield f"{folder}: lines, budget, lines of code", f"{lines:6d} {budget:6d} {code:6d}"
+    pages = [path for path in (ROOT / "docs").rglob("*.rst") if not {"api", "tutorials", "_build"} & set(path.parts)]
+    words = sum(len(path.read_text().split()) for path in pages)
+    yield "docs: pages, words, budget", f"{len(pages)} {words} 45000"
+    yield "README: words", str(len((ROOT / "README.md").read_text().split()))
+    for name in ("SMCSampler", "TMCMCSampler"):
+        annealing, final = frames_of(getattr(import_module("samplers"), name))
+        yield f"{name}: run_mcmc to the function, annealing, at beta = 1", f"{annealing}; {final}"
     yield "posterior(theta) to a kernel of the bridge column", frames_to_kernels()
 
 
@@ -211,4 +155,4 @@ if __name__ == "__main__":
     sys.path.insert(0, str(ROOT))
     warnings.simplefilter("ignore")
     for label, value in rows():
-        print(f"{label:<74} {value}", flush=True)
+        print(f"{label:<70} {value}", flush=True)
