@@ -15,6 +15,7 @@ from .events.stored_posterior import StoredPosterior
 from .information.identifiability import identifiability
 from .information.sensitivity import sensitivity
 from .information.sensors import rank_sensors
+from .likelihood.function_likelihood import FunctionLikelihood
 from .likelihood.joint import JointLikelihood
 from .likelihood.likelihood import FELikelihood
 from .likelihood.posterior import Posterior
@@ -85,6 +86,7 @@ __all__ = [
     "Events",
     "ExecutableModel",
     "FELikelihood",
+    "FunctionLikelihood",
     "FunctionModel",
     "FunctionModes",
     "GaussianNoise",

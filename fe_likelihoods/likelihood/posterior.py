@@ -43,7 +43,7 @@ class Posterior:
 
     Parameters
     ----------
-    likelihood : FELikelihood or JointLikelihood
+    likelihood : FELikelihood, JointLikelihood or FunctionLikelihood
     prior : Prior, or mapping of parameter names to distributions
         It must have exactly the likelihood's parameters, in any order. A number instead of a distribution is the known
         value of a noise parameter, which is then no parameter of the posterior.
@@ -147,7 +147,8 @@ class Posterior:
     @property
     def is_differentiable(self) -> bool:
         """Whether `grad_log_prob` can be computed: all models know the derivatives of their response."""
-        return all(getattr(part.model, "jacobian", None) is not None for part, _ in self.likelihood.parts())
+        models = [part.model for part, _ in self.likelihood.parts()]
+        return bool(models) and all(getattr(model, "jacobian", None) is not None for model in models)
 
     def grad_log_prob(self, x: Any) -> np.ndarray:
         """Gradient of `log_prob`, for models that know the derivatives of their response (``jacobian``).
@@ -299,6 +300,14 @@ class Posterior:
             f"of {n}); report() has the reasons: correct the model or narrow the prior"
         )
 
+    def _check_models(self, what: str) -> None:
+        """ValueError if the likelihood is a function without a model."""
+        if not self.likelihood.parts():
+            raise ValueError(
+                f"{what} needs the responses of a model, and {type(self.likelihood).__name__} has none: describe the "
+                "data by an FELikelihood, with FunctionModel for a model of your own"
+            )
+
     def first(self, seconds: float) -> "Posterior":
         """The posterior of the first part of the measurements, see `FELikelihood.first`.
 
@@ -397,6 +406,7 @@ class Posterior:
         >>> bool(10 * guided.simulations < sampler.simulations)
         True
         """
+        self._check_models("a guide")
         from ..emulation.guide import ResponseGuide  # scipy.special and scipy.optimize are slow to import
 
         return ResponseGuide(self, starts)
@@ -438,6 +448,7 @@ class Posterior:
         >>> len(found.modes), found.modes[0].converged
         (1, True)
         """
+        self._check_models("the search for modes")
         from .posterior_modes import posterior_modes  # scipy.optimize is slow to import
 
         return posterior_modes(self, starts, seed, max_simulations)
@@ -472,6 +483,7 @@ class Posterior:
         SimulationFailed
             If a sample cannot be simulated.
         """
+        self._check_models("a prediction")
         return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
 
     def block_log_likelihood(self, samples: Any, seconds: float | None = None) -> BlockLogLikelihood:
@@ -518,6 +530,7 @@ class Posterior:
         >>> ended[0][0] in tickets
         True
         """
+        self._check_models("asynchronous work")
         return EvaluationQueue(self.likelihood, self.prior, responses)
 
     def when_simulated(self, callback: Callable[[float], None] | None) -> None:
@@ -532,7 +545,7 @@ class Posterior:
             `JointLikelihood`. It must not raise. None ends the announcements.
         """
         parts = self.likelihood.parts()
-        share = 1.0 / len(parts)
+        share = 1.0 / max(len(parts), 1)
         for likelihood, _ in parts:
             likelihood.simulator.when_simulated = None if callback is None else lambda n: callback(n * share)
 

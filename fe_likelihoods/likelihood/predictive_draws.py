@@ -140,8 +140,10 @@ def predictive_draws(
 
 
 def _named_parts(likelihood: FELikelihood | JointLikelihood) -> Iterator[tuple[str, FELikelihood, list[int]]]:
-    names = [f"{key}_" for key in likelihood.likelihoods] if isinstance(likelihood, JointLikelihood) else [""]
-    for name, (part, columns) in zip(names, likelihood.parts(), strict=True):
+    parts = likelihood.parts()
+    joint = isinstance(likelihood, JointLikelihood)
+    names = [f"{key}_" for key in likelihood.likelihoods] if joint else [""] * len(parts)
+    for name, (part, columns) in zip(names, parts, strict=True):
         yield name, part, columns
 
 

@@ -1,0 +1,124 @@
+"""Log-likelihood of one's own, without a model: for priors, samplers, reports and clients of this package."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..priors.points import as_points
+from ..simulation.faults import reason_of
+from ..simulation.interrupts import raise_if_it_ends_the_run
+from ..simulation.label import items_of
+from .failure_log import FailureLog
+from .parameters import Parameter
+from .sum_of_parts import COUNTS, SumOfParts
+
+__all__ = ["FunctionLikelihood"]
+
+
+class FunctionLikelihood(SumOfParts):
+    """Any log-likelihood of named parameters, as a likelihood of a `Posterior`.
+
+    Samplers, `to_arviz`, tables, figures and the adapters take the posterior. What needs a model or its responses does
+    not: guides, `Posterior.mode`, predictions and the report of a run.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(theta) -> float``, or ``function(thetas) -> (n,)`` with `vectorize`. NaN, inf and exceptions are
+        failures, counted with their parameters: the log-likelihood is -inf there. -inf is no failure.
+    parameter_names : sequence of str
+        Names of the parameters in theta.
+    vectorize : bool
+        Whether the function takes points (n, ndim), as in emcee.
+    units : mapping of str to str, optional
+        Units of parameters, for labels.
+
+    Raises
+    ------
+    ValueError
+        If the function cannot be called, or the names are missing, repeated or not text.
+
+    Examples
+    --------
+    >>> own = FunctionLikelihood(lambda theta: -0.5 * np.sum((theta - 1.0) ** 2), ["k", "c"])
+    >>> both = Posterior(own, {"k": LogNormal(1.0, 0.3), "c": LogNormal(1.0, 0.3)})
+    >>> both.parameter_names
+    ['k', 'c']
+    """
+
+    fast_parameters = ()
+
+    def __init__(
+        self,
+        function: Callable,
+        parameter_names: Sequence[str],
+        vectorize: bool = False,
+        units: dict[str, str] | None = None,
+    ) -> None:
+        names = () if isinstance(parameter_names, str) else tuple(parameter_names)
+        if not callable(function):
+            raise ValueError(f"FunctionLikelihood: expected a function of the parameters; got {function!r}")
+        if not names or len(set(names)) != len(names) or not all(isinstance(name, str) and name for name in names):
+            raise ValueError(f"FunctionLikelihood: expected different names of parameters; got {parameter_names!r}")
+        if unknown := set(units or ()) - set(names):
+            raise ValueError(f"FunctionLikelihood: units of {', '.join(sorted(unknown))}, which are no parameters")
+        self.function, self.parameter_names, self.vectorize = function, names, vectorize
+        self.parameters = tuple(Parameter(name, (units or {}).get(name, "")) for name in names)
+        self._failures = FailureLog(names, 1.0)
+        self._evaluations = 0
+
+    def log_likelihood(self, x: Any, inside: Any = True) -> np.ndarray | float:
+        """Log-likelihood (n,) of points (n, ndim), or a float; -inf where the function fails and not `inside`."""
+        points = as_points(x, self.parameter_names)
+        rows = np.atleast_2d(points)
+        total = np.full(len(rows), -np.inf)
+        left = np.flatnonzero(np.isfinite(rows).all(axis=1) & inside)
+        if len(left):
+            self._evaluations += len(left)
+            total[left] = self._evaluated(rows[left])
+        return total if points.ndim == 2 else float(total[0])
+
+    def _evaluated(self, rows: np.ndarray) -> np.ndarray:
+        """Values (n,) of rows (n, ndim); failures are counted."""
+        values, reasons = np.full(len(rows), -np.inf), [""] * len(rows)
+        for where in [slice(None)] if self.vectorize else range(len(rows)):
+            try:
+                values[where] = self.function(rows[where].copy())
+            except Exception as error:
+                raise_if_it_ends_the_run(error)
+                if self.vectorize:  # one of them failed: not known which
+                    raise
+                reasons[where] = str(reason_of(error))
+        for row in np.flatnonzero(np.isnan(values) | (values == np.inf)):
+            reasons[row], values[row] = f"the log-likelihood is {values[row]}", -np.inf
+        self._failures.count_outcomes(rows, reasons)
+        return values
+
+    def parts(self) -> list:
+        """No models."""
+        return []
+
+    def possible(self, rows: np.ndarray) -> np.ndarray:
+        """Whether each of the points (n, ndim) is finite."""
+        return np.isfinite(rows).all(axis=1)
+
+    def fault(self, x: Any) -> str:
+        """Empty: failures are answers of the function."""
+        return ""
+
+    def density_parts(self) -> list[str]:
+        """Texts that identify the density: names, and code and values of the function."""
+        items = items_of({"function": self.function})
+        return [*self.parameter_names, *(f"{name} {digest}" for name, digest in sorted(items.items()))]
+
+    def report(self) -> dict:
+        """Counts of evaluations and failures, see `Posterior.report`."""
+        log = self._failures
+        counts = dict.fromkeys(COUNTS, 0) | {
+            "simulations": self._evaluations,
+            "failure_count": log.count,
+            "seconds": 0.0,
+        }
+        return counts | {"failures": log.records, "failure_reasons": Counter(log.reasons)}
