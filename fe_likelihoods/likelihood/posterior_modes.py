@@ -29,9 +29,8 @@ __all__ = ["PosteriorMode", "PosteriorModes", "posterior_modes"]
 
 _DIFFERENCE = 0.1  # step of differences of responses, in standard deviations: 1 % of the curvature's effect on a fit
 _HESSIAN_STEP = 0.01  # of differences of gradients, in standard deviations
-_SETTLED = 0.01  # standard deviations by which the top of a mode that is found moves
-_MOST_ROUNDS = 8  # linear oscillators, modal data and columns took 2 to 4
-_SAME = 0.5  # standard deviations within which two refined modes are one
+_GAIN = 0.02  # of the log-probability, below which the next step is the last: 0.2 standard deviations before it
+_MOST_ROUNDS = 8  # oscillators, modal data and the bridges took 1 to 4
 
 
 class PosteriorMode(NamedTuple):
@@ -50,7 +49,8 @@ class PosteriorMode(NamedTuple):
     at_bounds : tuple of str
         Parameters that are at a bound of their prior.
     converged : bool
-        False if the top still moved at the last of the simulations made for it.
+        False if the log-probability could still rise by more than 0.02 before the last simulation, or the density has
+        no maximum there.
     """
 
     parameters: np.ndarray
@@ -92,6 +92,7 @@ class PosteriorModes(NamedTuple):
         rows.append(["log-probability", *(f"{mode.log_prob:.2f}" for mode in self.modes)])
         shares = np.exp([mode.log_evidence - self.log_evidence for mode in self.modes])
         rows.append(["share of the evidence", *(f"{share:.2g}" for share in shares)])
+        rows.append(["converged", *("yes" if mode.converged else "no" for mode in self.modes)])
         return text_table(rows)
 
 
@@ -121,16 +122,20 @@ def posterior_modes(
     refined: list[PosteriorMode] = []
     for mode in search.modes:
         found = _refined(posterior, mode)
-        if not any(_same(found, other) for other in refined):
-            refined.append(found)
-    refined.sort(key=lambda mode: -mode.log_evidence)
+        same = [k for k, other in enumerate(refined) if _no_valley_between(posterior, found, other)]
+        for k in reversed(same):
+            found = max(found, refined.pop(k), key=lambda each: each.log_prob)
+        refined.append(found)
+    refined.sort(key=lambda each: -each.log_evidence)
     names = tuple(posterior.parameter_names)
     return PosteriorModes(tuple(refined), names, posterior.likelihood.simulations - before, search.finished)
 
 
-def _same(one: PosteriorMode, other: PosteriorMode) -> bool:
-    sd = np.sqrt(np.diag(one.covariance) + np.diag(other.covariance))
-    return bool((np.abs(one.parameters - other.parameters) <= _SAME * sd + 1e-12 * np.abs(one.parameters)).all())
+def _no_valley_between(posterior: Any, one: PosteriorMode, other: PosteriorMode) -> bool:
+    """Whether the log-probability on the line between two modes stays above the lower one: then they are one."""
+    shares = np.array([0.25, 0.5, 0.75])[:, None]
+    between = posterior.log_prob(one.parameters + shares * (other.parameters - one.parameters))
+    return bool((between >= min(one.log_prob, other.log_prob)).all())
 
 
 def _refined(posterior: Any, mode: Mode) -> PosteriorMode:
@@ -141,25 +146,20 @@ def _refined(posterior: Any, mode: Mode) -> PosteriorMode:
     ends = [np.diag(prior.from_normal(z + sign * np.diag(widths))) for sign in (0.5, -0.5)]
     sd = np.maximum(ends[0] - ends[1], 1e-9 * np.abs(mode.parameters))
     x, tangents = np.clip(mode.parameters, *bounds.T), _tangents(posterior.likelihood, mode.parameters, sd)
-    best, moved = (posterior.log_prob(x), x), np.inf
+    value, gain = posterior.log_prob(x), np.inf
     for _ in range(_MOST_ROUNDS):
         linear = _linear_posterior(posterior, tangents)
         new = _top(linear, x, sd, bounds)
-        moved = np.abs((new - x) / sd).max()
-        value = posterior.log_prob(new)
-        while value == -np.inf or value < best[0] - 1.0:  # too far for the linear response
-            new = 0.5 * (new + x)
-            if np.abs((new - x) / sd).max() < _SETTLED:
-                break
-            value = posterior.log_prob(new)
-        x = new if value > -np.inf else best[1]
-        best = max(best, (value, x), key=lambda each: each[0])
-        tangents = _moved(posterior.likelihood, tangents, x)
-        if moved < _SETTLED:
+        gain = linear.log_prob(new) - value
+        shorter = (x + share * (new - x) for share in (1.0, 0.5, 0.25, 0.125))  # too far for the linear response?
+        reached = next(((y, each) for each in shorter if (y := posterior.log_prob(each)) > value), None)
+        if reached is None:
             break
-    value, x = best
-    linear = _linear_posterior(posterior, tangents)
-    return _laplace(linear, x, float(value), sd, bounds, mode.converged and moved < _SETTLED)
+        value, x = reached
+        if gain < _GAIN:
+            break
+        tangents = _moved(posterior.likelihood, tangents, x)
+    return _laplace(linear, x, float(value), sd, bounds, bool(mode.converged and gain < _GAIN))
 
 
 class _Tangent(NamedTuple):
