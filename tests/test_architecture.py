@@ -22,7 +22,7 @@ PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy", "umbridge"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-WORKERS = {"faults", "interrupts", "folder", "shared_files", "by_value", "user_code", "worker", "local_pool"} | {
+WORKERS = {"faults", "interrupts", "files", "folder", "by_value", "user_code", "worker", "local_pool"} | {
     "sandbox",
     "programs",
 }

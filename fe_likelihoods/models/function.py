@@ -18,7 +18,8 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import sample_window
 from ..simulation.faults import UnusableModel
-from ..simulation.opened import Observed, note
+from ..simulation.files import note
+from ..simulation.folder import Observed
 from ..simulation.sandbox import Sandbox
 from .user_model import UserModel
 from .validation import check_theta, positive_float

@@ -9,7 +9,7 @@ known label, many for an unknown label. So a label may be incomplete, and may ch
 * the source files of the user modules among them, without comments, and the versions of installed packages,
 * environment variables whose names occur in this code,
 * the source files of this library that simulations depend on,
-* what simulations of the model opened while they ran (`fe_likelihoods.simulation.opened`).
+* what simulations of the model opened while they ran (`fe_likelihoods.simulation.files`).
 
 Pickles by cloudpickle are not used, because their bytes differ between processes: they contain random class
 identifiers, sets in varying order, and file names of notebook cells.
@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from .opened import Opened, file_digest
+from .files import Opened, file_digest
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = [

@@ -24,10 +24,9 @@ from ..noise.statistics import Statistic, reduce_response, statistic_width, sums
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
-from .folder import Sender, run_in_folder
+from .files import note, refuse_shared
+from .folder import Observed, Sender, run_in_folder, unpack
 from .interrupts import raise_if_it_ends_the_run
-from .opened import Observed, note, unpack
-from .shared_files import warn_or_refuse
 
 __all__ = [
     "MisfitBatch",
@@ -387,7 +386,7 @@ def _run_each(
     """Run simulations one by one, in this process or in the pool's workers."""
     if pool is None:
         if is_worker():  # of the pool of a sampler
-            run = partial(_in_folder, run, Sender.of_this_worker())
+            run = partial(_in_folder, run, Sender.here()._replace(process=b""))
         outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
@@ -404,7 +403,7 @@ def _run_each(
 
 def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
     result, shared = run_in_folder(run, theta, sender)
-    warn_or_refuse(shared, None)
+    refuse_shared(shared, None)
     return result
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from .shared_files import of_this_library
+from .files import of_this_library
 
 __all__ = ["run_program"]
 

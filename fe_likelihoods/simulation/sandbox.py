@@ -19,7 +19,7 @@ class Sandbox:
     The process is kept for later calls. It is replaced after a call that did not end by itself, and after
     `runs_per_process` calls (default: never), which limits memory leaks. Concurrent calls from several threads use one
     process each. The function is sent by value, in its state at the call; ValueError if it cannot be sent. `time_limit`
-    [s] is for a call, without the start of the process and waiting for other simulations; `memory_limit` [bytes] for
+    [s] is for a call, without the start of the process; `memory_limit` [bytes] for
     the address space (0: none), and `max_output` [bytes] for a call.
     """
 

@@ -29,11 +29,10 @@ from typing import Any, NamedTuple
 
 from samplers.interrupts import become_worker
 
-from . import shared_files
 from .by_value import Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
+from .files import of_this_library
 from .folder import discard, working_folder
-from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
 __all__ = ["Answer", "LoadingFailed", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
 
@@ -41,7 +40,6 @@ _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
-_WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
@@ -129,15 +127,14 @@ class Worker:
     def call(self, item: Any, seconds: float) -> "Answer":
         """The answer of the function that was loaded last, for an item.
 
-        RunFailed if the process dies, prints too much or does not answer within `seconds`, without the time in which
-        its simulation waits for another one (`fe_likelihoods.simulation.shared_files`).
+        RunFailed if the process dies, prints too much or does not answer within `seconds`.
         """
         self.calls += 1
         self.keys.use(self._key)
         if self._output is not None:
             os.ftruncate(self._output.fileno(), 0)
             os.lseek(self._output.fileno(), 0, os.SEEK_SET)
-        message = self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5)
+        message = self._key + pickle.dumps(item, protocol=5)
         return self._ask(message, seconds, "stopped at the time limit of {:g} s")
 
     def _ask(self, message: bytes, seconds: float, slow: str) -> "Answer":
@@ -155,19 +152,14 @@ class Worker:
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
-        waits, pause = False, _CHECK if self._output is None else _CHECK_OUTPUT
+        pause = _CHECK if self._output is None else _CHECK_OUTPUT
         try:
             while True:
-                before = time.monotonic()
-                is_ready = self._poll(1000.0 * max(0.0, min(pause, stop - before)))
-                stop += time.monotonic() - before if waits else 0.0
+                is_ready = self._poll(1000.0 * max(0.0, min(pause, stop - time.monotonic())))
                 if is_ready:
-                    message = self._connection.recv_bytes()
-                    if message not in _WAITS:
-                        return Answer(*pickle.loads(message))
-                    waits = message == _WAITS[True]
+                    return Answer(*pickle.loads(self._connection.recv_bytes()))
                 # a program that the function has started may hold the connection open
-                elif _ended(self._process) and not self._poll(0):
+                if _ended(self._process) and not self._poll(0):
                     raise EOFError
                 if self._output is not None and os.fstat(self._output.fileno()).st_size > self._most:
                     raise RunFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
@@ -297,7 +289,6 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
     become_worker()
     functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
-        shared_files.when_waiting = lambda waits: connection.send_bytes(_WAITS[waits])
         while True:
             try:
                 message = memoryview(connection.recv_bytes())
@@ -311,8 +302,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
                 else:
                     function = functions.use(bytes(message[:16]))
                     function.prepare()
-                    sender_holds_lock(bool(message[16]))
-                    answer = _packed(function(pickle.loads(message[17:])))
+                    answer = _packed(function(pickle.loads(message[16:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well
