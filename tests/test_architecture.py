@@ -22,10 +22,7 @@ PLOTTING = {"arviz", "corner", "matplotlib"}
 CLIENTS = {"bilby", "pymc", "pytensor", "pints", "nautilus", "dask", "distributed", "mpi4py", "openseespy", "umbridge"}
 ADAPTED = {"bilby": {"bilby"}, "pymc": {"pymc", "pytensor"}}
 PRIVATE_EMCEE = {"_random", "_moves", "_weights", "_previous_state", "_FunctionWrapper"}
-WORKERS = {"faults", "interrupts", "files", "folder", "by_value", "user_code", "worker", "local_pool"} | {
-    "sandbox",
-    "programs",
-}
+WORKERS = {"faults", "interrupts", "files", "folder", "by_value", "user_code", "worker", "local_pool", "programs"}
 # a thing and its figure, section of the command, report or other package
 SAME_NAME = {"comparison", "damage", "events", "finding", "guide", "inputs", "isolated_bridge", "priors", "results"} | {
     "interrupts",

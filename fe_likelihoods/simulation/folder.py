@@ -207,15 +207,15 @@ def _is_only_thread_of_dask() -> bool:
         return False
 
 
-def keep_folder(place: Path, folder: str | Path, reason: str, most: int = _MOST_KEPT) -> Path | None:
+def keep_folder(place: Path, folder: str | Path, reason: str) -> Path | None:
     """Move what a failed simulation has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
 
-    None if `most` folders are there already, or it fails: a full disk must not hide the reason of the failure.
+    None if 20 folders are there already, or it fails: a full disk must not hide the reason of the failure.
     """
     folder = Path(folder)
     with contextlib.suppress(OSError), of_this_library():
         folder.mkdir(parents=True, exist_ok=True)
-        if len(list(folder.glob("failure_*"))) < most:
+        if len(list(folder.glob("failure_*"))) < _MOST_KEPT:
             for link in [path for path in place.rglob("*") if path.is_symlink()]:  # the links of a mirror end with it
                 target = os.path.realpath(link)
                 link.unlink()

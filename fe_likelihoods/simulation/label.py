@@ -16,6 +16,7 @@ identifiers, sets in varying order, and file names of notebook cells.
 """
 
 import ast
+import contextlib
 import functools
 import logging
 import os
@@ -162,10 +163,15 @@ def _has_user_code(model: Any) -> bool:
     return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
 
 
+@functools.cache
 def cpu_name() -> str:
-    """Name of the processor that simulations run on; on another processor, the last digits of results may differ."""
+    """Name and features of the processor; on another processor, the last digits of results may differ."""
+    import llvmlite.binding as llvm  # late, because it is slow
+
     asked = [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE")]
-    return " ".join(filter(None, [_processor(), *asked]))
+    with contextlib.suppress(RuntimeError):  # features are not known everywhere
+        asked.append(llvm.get_host_cpu_features().flatten())
+    return " ".join([llvm.get_host_cpu_name(), *filter(None, asked)])
 
 
 def value_digest(value: Any) -> str:
@@ -449,17 +455,3 @@ def _read_source(file: str) -> tuple[str, frozenset[str]]:
         text = content.decode("utf-8", "replace")
     words = frozenset(re.findall(r"\w+", content.decode("utf-8", "replace")))
     return blake2b(text.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest(), words
-
-
-@functools.cache
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    patterns = (rf"^(?:{key})\s*:\s*(.+)$" for key in ("model name|CPU part", "flags|Features"))
-    name, flags = (re.search(pattern, text, re.MULTILINE) for pattern in patterns)
-    if name is None:
-        return f"{platform.machine()} {platform.processor()}"
-    # virtual machines may give different processors the same name, so the flags are added
-    return name.group(1) + (f" {blake2b(flags.group(1).encode(), digest_size=4).hexdigest()}" if flags else "")

@@ -29,12 +29,12 @@ from typing import Any, NamedTuple
 
 from samplers.interrupts import become_worker
 
-from .by_value import Pickled, Recent, without_addresses
+from .by_value import CannotLoad, Pickled, Recent, without_addresses
 from .faults import RunFailed, TransientReason, is_transient
 from .files import of_this_library
 from .folder import discard, working_folder
 
-__all__ = ["Answer", "LoadingFailed", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
+__all__ = ["Answer", "LoadingFailed", "Sandbox", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
@@ -44,6 +44,8 @@ _LOAD = bytes(16)  # in place of a function's key: the message contains a functi
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
 _CHECK_OUTPUT = 0.1  # [s] the same for a process whose output is limited
+_START_LIMIT = 120.0  # [s] for starting the process of an isolated function and loading the function
+_MOST_OUTPUT = 2**24  # [bytes] that a call of an isolated function may print
 
 
 class LoadingFailed(RunFailed):
@@ -236,6 +238,41 @@ class Workers:
         """End the idle processes."""
         while self._idle:
             self._idle.pop().kill()
+
+
+class Sandbox:
+    """Callable that runs a function of one argument in another process, whose output is not shown.
+
+    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls (default:
+    never), which limits memory leaks. Concurrent calls from several threads use one process each. The function is sent
+    by value, in its state at the call; ValueError if it cannot be sent. `time_limit` [s] is for a call, without the
+    start of the process; `memory_limit` [bytes] for the address space (0: none).
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any], Any],
+        time_limit: float | None = None,
+        memory_limit: int = 0,
+        runs_per_process: int | None = None,
+    ) -> None:
+        self._arguments = function, time_limit, memory_limit, runs_per_process
+        options = {"memory_limit": memory_limit, "most_output": _MOST_OUTPUT}
+        self._workers = Workers(_START_LIMIT, runs_per_process or math.inf, **options)
+        Pickled.of(function)  # an error is raised here instead of in the first call
+
+    def __reduce__(self) -> tuple:
+        return Sandbox, self._arguments
+
+    def __call__(self, item: Any) -> Any:
+        """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
+        function, limit, *_ = self._arguments
+        answer = self._workers.run(Pickled.of(function), item, math.inf if limit is None else limit)
+        if isinstance(answer.error, CannotLoad):
+            raise RunFailed(TransientReason(str(answer.error))) from answer.error
+        if answer.error is not None:
+            raise answer.error
+        return answer.value
 
 
 def _ended(process: subprocess.Popen) -> bool:

@@ -5,7 +5,6 @@ import importlib.util
 import os
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import as_completed
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 
 from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.simulation import dask_executor, executors
+from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -151,88 +150,6 @@ def _interrupt():
 
 def _interrupts(item):
     return _Interrupt()
-
-
-class Cluster:
-    """A client of a cluster that has lost its workers, and the cluster: a map ends when it is asked for them."""
-
-    def __init__(self, restarts):
-        self.cluster, self.worker_spec, self.workers = self, {0: {}, 1: {}}, {1: {}}
-        self.restarts, self.asked, self.cancelled, self.ended = restarts, [], [], threading.Event()
-
-    def nthreads(self):
-        return dict.fromkeys(self.workers, 1)
-
-    def scale(self, n):
-        self.asked.append(n)
-        if self.restarts:
-            self.workers = dict.fromkeys(self.worker_spec)
-            self.ended.set()
-
-    def map(self, function, items, pure):
-        self.workers = {}
-        self.futures = [Waiting(function(item)) for item in items]
-        threading.Thread(target=self._end, daemon=True).start()
-        return self.futures
-
-    def _end(self):
-        assert self.ended.wait(10.0), "the map waits for ever"
-        for future in self.futures:
-            future.end("cancelled" if self.cancelled else "finished")
-
-    def gather(self, futures):
-        return [future.answer for future in futures]
-
-    def cancel(self, futures, force=False):
-        self.cancelled = futures
-        self.ended.set()
-
-
-class Waiting:
-    """A future of such a cluster."""
-
-    def __init__(self, answer):
-        self.answer, self.status, self.callbacks = answer, "pending", []
-
-    def add_done_callback(self, callback):
-        self.callbacks.append(callback)
-
-    def end(self, status):
-        self.status = status
-        for callback in self.callbacks:
-            callback(self)
-
-    def result(self):
-        raise OSError("cancelled")
-
-
-@pytest.mark.parametrize("restarts", [True, False])
-def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypatch):
-    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.01)
-    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
-    monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
-    client = Cluster(restarts)
-    pool = executors.DaskExecutor(client)
-    if restarts:
-        assert pool.map(lambda item: (item, ""), [1, 2, 3]) == [(1, ""), (2, ""), (3, "")]
-    else:
-        with pytest.raises(RuntimeError, match="the dask cluster has had no worker for 0.1 s: start workers"):
-            pool.map(lambda item: (item, ""), [1, 2, 3])
-        assert len(client.cancelled) == 3
-    assert client.asked == [2]  # once
-
-
-@pytest.mark.parametrize(("seconds", "asked"), [(0.0, [2, 2]), (60.0, [2])])
-def test_a_worker_that_dies_before_it_was_seen_again_is_started_once_more(seconds, asked, monkeypatch):
-    monkeypatch.setattr(dask_executor, "SECONDS_TO_RETURN", seconds)
-    cluster = Cluster(restarts=False)
-    cluster.workers = dict.fromkeys(cluster.worker_spec)
-    workers = dask_executor._Workers()
-    workers.start_lost(cluster)
-    cluster.workers = {}
-    for _ in range(2):
-        workers.start_lost(cluster)
-    assert cluster.asked == asked
 
 
 @pytest.mark.slow
@@ -401,6 +318,9 @@ def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
 @pytest.mark.parametrize("kind", ["smc", "emcee"])
 def test_too_many_failures_stop_the_run_and_keep_finished_simulations(kind, tmp_path, seed):
     """A third of the prior fails where 0.25 is allowed: the run stops with an error."""
+    for share in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match="max_failure_share must be in"):
+            third(max_failure_share=share)
     posterior = third(max_failure_share=0.25)
     if kind == "smc":
         backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
@@ -418,19 +338,6 @@ def test_too_many_failures_stop_the_run_and_keep_finished_simulations(kind, tmp_
     known = posterior.sample_prior(200, seed)
     if kind == "emcee":  # cached points can still be evaluated
         assert np.isfinite(posterior(known)).sum() == 200 - report["failure_count"]
-
-
-def test_allowed_share_of_failures_does_not_stop_the_run(seed):
-    posterior = third(max_failure_share=0.5)
-    for _ in range(3):
-        posterior(posterior.sample_prior(60, seed))
-    assert 0.2 < posterior.report()["failure_count"] / 60 < 0.5
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_invalid_share_is_refused(share):
-    with pytest.raises(ValueError, match="max_failure_share must be in"):
-        third(max_failure_share=share)
 
 
 @pytest.mark.slow

@@ -188,7 +188,10 @@ def test_failures_are_in_the_report_with_their_duration():
         ({"memory_limit": 0}, "memory_limit must be a positive number of bytes"),
         ({"runs_per_process": 0}, "runs_per_process must be None or a positive integer"),
         ({"function": 3}, "expected a function"),
-        ({"function": lambda theta, lock=threading.Lock(): line(theta), "isolated": True}, "cannot be sent to another"),
+        (
+            {"function": lambda theta, file=(i for i in ()): line(theta), "isolated": True},
+            "cannot be sent to another",
+        ),
         ({"parameter_names": ()}, "parameter_names must be a tuple of one or more str"),
         ({"parameter_names": "ab"}, "parameter_names"),
         ({"parameter_names": ("a", "a")}, "must differ"),

@@ -190,9 +190,6 @@ class Batch:
         rows = [wave(theta) if ok else np.full((2, 60), np.nan) for theta, ok in zip(thetas, good, strict=True)]
         return SimulationBatch(np.array(rows), ["" if ok else "too fast" for ok in good])
 
-    def misfit_batch(self, thetas, measured):
-        raise AssertionError("called with measurements that have gaps")
-
 
 @pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
 @pytest.mark.parametrize("own", [False, True])

@@ -9,7 +9,6 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
-import emcee
 import numpy as np
 import pytest
 
@@ -123,13 +122,6 @@ def test_invalid_pools_are_refused(pool):
         posterior_of(Treacherous(), pool=pool)
 
 
-def test_model_is_sent_once_to_each_process(shared_pool):
-    with shared_pool(2) as pool:
-        for _ in range(3):
-            batch = simulate_batch(Large(), np.tile([0.2, 0.3], (20, 1)), pool)
-            assert set(batch.response[:, 0, 0]) == {1.0}
-
-
 def test_a_worker_of_another_pool_loads_the_model_once():
     model, thetas = Large(), np.tile([0.2, 0.3], (20, 1))
     executor = as_executor(Recorder())
@@ -139,28 +131,15 @@ def test_a_worker_of_another_pool_loads_the_model_once():
         assert len(treacherous.LOADED) == loaded
 
 
-def test_a_worker_keeps_a_bounded_number_of_functions():
-    executor = as_executor(Recorder())
-    for ballast in range(20):
-        model = Treacherous()
-        model.ballast = ballast
-        simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(pool_executor.loaded_functions) == 8
-
-
 @pytest.mark.parametrize(
     "make", [lambda: 2, lambda: ProcessPoolExecutor(1), lambda: LocalPool(1)], ids=["2", "executor", "pool"]
 )
 def test_model_that_cannot_be_pickled_is_refused_with_the_attribute(make):
-    with pytest.raises(ValueError, match=r"the solver\.lock of Unpicklable, of type lock, cannot be sent") as error:
+    with pytest.raises(
+        ValueError, match=r"the solver\.output of Unpicklable, of type TextIOWrapper, cannot be sent"
+    ) as error:
         posterior_of(Unpicklable(), pool=make())
-    assert "must not contain open files, locks" in str(error.value) and " at 0x" not in str(error.value)
-
-
-def test_model_that_cannot_be_pickled_runs_in_threads():
-    with ThreadPoolExecutor(2) as pool:
-        posterior = posterior_of(Unpicklable(), pool=pool)
-        assert np.isfinite(posterior(posterior.sample_prior(5, 1))).all()
+    assert "must not contain open files" in str(error.value) and " at 0x" not in str(error.value)
 
 
 def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
@@ -172,21 +151,6 @@ def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
         with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
             posterior(posterior.sample_prior(5, 1))
     assert posterior.report()["simulations"] == 0
-
-
-def test_local_pool_maps_any_function_and_raises_its_exceptions(shared_pool):
-    with shared_pool(2) as pool:
-        assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
-        assert pool.map(abs, []) == []
-        with pytest.raises(TypeError, match="bad operand"):
-            pool.map(abs, [1, "two", 3])
-        assert pool.map(str, [1, 2]) == ["1", "2"]
-        assert pool.map(lambda x: 2 * x, [1]) == [2]
-        numbers = (number for number in (1, 2))
-        with pytest.raises(
-            ValueError, match=r"cannot be sent to another process \(TypeError: cannot pickle 'generator'"
-        ):
-            pool.map(lambda x: next(numbers), [1])
 
 
 def test_threads_in_workers_are_limited(monkeypatch):
@@ -208,71 +172,38 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
     posterior.likelihood.simulator.pool.close()
 
 
-def test_as_the_pool_of_a_sampler(seed, shared_pool):
-    """The chain equals that of a run without a pool."""
-    posterior = posterior_of(Treacherous())
-    start = posterior.sample_prior(10, seed)
-    chains = []
-    with shared_pool(2) as pool:
-        for workers in (None, pool):
-            sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, pool=workers)
-            sampler.random_state = np.random.RandomState(seed).get_state()
-            sampler.run_mcmc(start, 5)
-            chains.append(sampler.get_chain())
-    np.testing.assert_array_equal(*chains)
-
-
 SCRIPT = """
+import sys
 import numpy as np
+COUNT = int(sys.argv[1])
+print('run', end=' ')
+unused = (number for number in range(3))
 from fe_likelihoods.models.function import FunctionModel
 from tests.faults.treacherous import CHANNELS, line, posterior_of
 
 def mine(theta):
     return 2.0 * line(theta)
 
-def main():
-    x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
-    for limit in (None, 60.0):
-        model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
-        print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
-
+x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
+for limit in (None, 60.0):
+    model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
+    print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
 """
 
 
-@pytest.mark.parametrize(
-    "end",
-    [
-        pytest.param('if __name__ == "__main__":\n    main()\n', id="guarded", marks=pytest.mark.slow),
-        pytest.param("main()\n", id="not guarded"),
-    ],
-)
-def test_models_defined_in_a_script(end, tmp_path):
-    """Workers do not run the script, so it needs no guard."""
+def test_models_defined_in_a_script(tmp_path):
+    """Workers do not run the script, so it needs no guard; values that the functions do not use are not sent."""
     script = tmp_path / "script.py"
-    script.write_text("import sys\nCOUNT = int(sys.argv[1])\nprint('run', end=' ')\n" + SCRIPT + end)
+    script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     run = subprocess.run([sys.executable, script, "8"], env=environment, capture_output=True, text=True, timeout=120)
     assert " ".join(run.stdout.split()) == "run True True", run.stderr
 
 
-@pytest.mark.slow
-def test_models_of_a_prompt():
-    code = "import numpy as np\n" + SCRIPT + "main()\n"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
-    assert " ".join(run.stdout.split()) == "True True", run.stderr
-
-
-@pytest.mark.parametrize("system", ["column", pytest.param("bridge", marks=pytest.mark.slow)])
-def test_compiled_models_go_through_a_pool_to_the_same_bits(system, shared_pool):
+def test_compiled_models_go_through_a_pool_to_the_same_bits(shared_pool):
     """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
-    if system == "column":
-        posterior = problems.bridge_column(duration=2.0)
-        thetas = posterior.sample_prior(6, 1)[:, :5]
-    else:
-        record = problems.isolated_bridge_data().record.trim(0.0, 2.0)
-        posterior = problems.isolated_bridge(record=record, step=1e-3)
-        thetas = posterior.sample_prior(6, 1)[:, :10]
+    posterior = problems.bridge_column(duration=2.0)
+    thetas = posterior.sample_prior(6, 1)[:, :5]
     likelihood = posterior.likelihood
     with shared_pool(2) as pool:
         pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
-from fe_likelihoods.simulation.model import sent_simulation, simulate_batch
-from tests.faults import treacherous as bad
+from fe_likelihoods.simulation.model import sent_simulation
 from tests.faults.treacherous import (
     Absent,
-    DiesOnce,
     Gated,
     Large,
     Treacherous,
@@ -55,19 +53,6 @@ def check_order_of_arrival(executor, function, tmp_path):
         response, reason = future.result()
         np.testing.assert_array_equal(response, line(theta))
         assert reason == ""
-
-
-@pytest.mark.slow
-def test_items_that_kill_their_process_end_as_with_map(tmp_path, shared_pool):
-    thetas = [np.array([what + 0.5, 0.1]) for what in (bad.FINE, bad.CRASHES, bad.FINE, bad.LEAVES, bad.RAISES)]
-    with shared_pool(2) as pool:
-        expected = simulate_batch(Treacherous(), np.array(thetas), pool)
-        outcomes = [future.result() for future in pool.submit_all(sent_simulation(Treacherous()), thetas)]
-        assert [reason for _, reason in outcomes] == expected.reasons
-        assert type(outcomes[1][1]) is type(expected.reasons[1])  # a transient reason
-        np.testing.assert_array_equal(outcomes[2][0], expected.response[2])
-        again = sent_simulation(DiesOnce(tmp_path))
-        assert pool.submit(again, np.array([bad.KILLED + 0.5, 0.1])).result()[1] == ""
 
 
 def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(shared_pool):
@@ -137,12 +122,6 @@ def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
         go.set()
         assert first.result()[1] == "True"
         assert isinstance(first, Future)
-
-
-def test_several_threads_share_a_pool(shared_pool):
-    with shared_pool(2) as pool, ThreadPoolExecutor(3) as threads:
-        results = list(threads.map(lambda k: pool.map(abs, range(-5 * k, 0)), range(1, 4)))
-    assert results == [list(range(5 * k, 0, -1)) for k in range(1, 4)]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
