@@ -138,6 +138,7 @@ class RunningSimulation:
         self.place, self.base, self._hop, self._thread = place, base, hop, thread
         self.shared, self.has_programs = "", False
         self._made: list[str] = []  # files and folders
+        self._databases: list[str] = []  # that may only be read
         self._start = time.time_ns()
 
     def run(self, function: Callable[[Any], Any], item: Any) -> Any:
@@ -148,6 +149,8 @@ class RunningSimulation:
             return function(item)
         finally:
             del _running[self._thread]
+            for path in self._databases:
+                self._reads(path)
 
     def shown(self, path: str) -> str | None:
         """The file that a link in the own folder shows; None for the simulation's own file, else `path`."""
@@ -194,6 +197,11 @@ class RunningSimulation:
         if (path := _full(path)) is not None and not os.path.lexists(path):
             self._made.append(path)
 
+    def connects(self, path: Any) -> None:
+        """A database is looked at when the simulation has ended."""
+        if path not in ("", ":memory:") and (path := _full(path)) is not None:
+            self._databases.append(path)
+
     def removes(self, path: Any, folder: int | None) -> None:
         if folder in (None, -1):  # else within a folder, whose removal has an event of its own
             self.writes(path)
@@ -209,7 +217,7 @@ class RunningSimulation:
 
     def writes(self, path: Any) -> None:
         """Note a file that does not belong to this simulation alone."""
-        if self.shared or path in ("", ":memory:") or (path := _full(path)) is None:  # or a database
+        if self.shared or (path := _full(path)) is None:
             return
         if self._is_own(path) or _is_cache(path) or self._has_made(path):
             return
@@ -260,9 +268,10 @@ _EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
     "os.system": lambda simulation, _: simulation.starts("."),
     "subprocess.Popen": lambda simulation, arguments: simulation.starts(arguments[2] or "."),
     "tempfile.mkdtemp": lambda simulation, arguments: simulation.makes(arguments[0]),
+    "sqlite3.connect": lambda simulation, arguments: simulation.connects(arguments[0]),
     "ctypes.dlopen": lambda simulation, _: None,
 }
-for _event in ("os.mkdir", "os.truncate", "shutil.rmtree", "sqlite3.connect"):
+for _event in ("os.mkdir", "os.truncate", "shutil.rmtree"):
     _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[0])
 for _event in ("os.link", "os.rename", "os.symlink"):
     _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[1])

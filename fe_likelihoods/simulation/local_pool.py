@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
 from concurrent.futures import wait as wait_for
+from numbers import Integral
 from typing import Any
 
 from .by_value import Pickled
@@ -20,7 +21,6 @@ from .worker import LoadingFailed, Worker, Workers
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
 MAX_ATTEMPTS = 3
-_LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
@@ -48,13 +48,6 @@ class _Job(Future):
         self.given_up = False
 
 
-def _is_positive_whole(value: Any) -> bool:
-    try:
-        return not isinstance(value, bool) and int(value) == value and value >= 1
-    except (TypeError, ValueError, OverflowError):
-        return False
-
-
 class LocalPool:
     """Pool of local processes.
 
@@ -79,7 +72,7 @@ class LocalPool:
     submits = True
 
     def __init__(self, workers: int) -> None:
-        if not _is_positive_whole(workers):
+        if not isinstance(workers, Integral) or isinstance(workers, bool) or workers < 1:
             raise ValueError(
                 "pool must be None, a positive number of processes, or an object with map(function, items); "
                 f"got {workers!r}"
@@ -91,11 +84,10 @@ class LocalPool:
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner, self._changed = os.getpid(), threading.Condition(threading.RLock())
+        self._owner, self._lock = os.getpid(), threading.RLock()
         self._waiting: deque[_Job] = deque()
         self._running: set[_Job] = set()
         self._threads: set[threading.Thread] = set()
-        self._n_idle = 0  # threads that wait for an item
         self._workers = Workers(environment=self._environment)
 
     def __enter__(self) -> "LocalPool":
@@ -115,7 +107,7 @@ class LocalPool:
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
-        with self._changed:
+        with self._lock:
             left = [*self._waiting, *self._running]
         self.give_up(left)
         self._workers.close()
@@ -152,7 +144,7 @@ class LocalPool:
         self._notice_fork()
         started = [job for job in futures if not job.cancel() and running and not job.done()]
         for job in started:
-            with self._changed:
+            with self._lock:
                 job.given_up, worker = True, job.worker
             if worker is not None:
                 worker.kill()
@@ -168,13 +160,12 @@ class LocalPool:
         self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        with self._changed:
+        with self._lock:
             if first:
                 self._waiting.extendleft(reversed(jobs))
             else:
                 self._waiting.extend(jobs)
-            self._changed.notify_all()
-            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._n_idle)):
+            for _ in range(min(self.workers - len(self._threads), len(self._waiting))):
                 thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
                 self._threads.add(thread)
                 thread.start()
@@ -184,12 +175,20 @@ class LocalPool:
 
     def _work(self) -> None:
         """Run items one after the other, until none is waiting."""
-        while (job := self._next()) is not None:
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    self._threads.discard(threading.current_thread())
+                    return
+                job = self._waiting.popleft()
+                if not job.set_running_or_notify_cancel():
+                    continue
+                self._running.add(job)
             try:
                 result, error = self._result(job), None
             except BaseException as raised:
                 result, error = None, raised
-            with self._changed:
+            with self._lock:
                 self._running.discard(job)
                 job.worker = None
             if error is None:
@@ -197,26 +196,11 @@ class LocalPool:
             else:
                 job.set_exception(error)
 
-    def _next(self) -> _Job | None:
-        """The next item; None if the thread ends."""
-        with self._changed:
-            while True:
-                self._n_idle += 1
-                self._changed.wait_for(lambda: self._waiting, _LINGER)
-                self._n_idle -= 1
-                if not self._waiting:
-                    self._threads.discard(threading.current_thread())
-                    return None
-                job = self._waiting.popleft()
-                if job.set_running_or_notify_cancel():
-                    self._running.add(job)
-                    return job
-
     def _result(self, job: _Job) -> Any:
         """Result of an item, from another process if its process dies."""
 
         def watch(worker: Worker | None) -> None:
-            with self._changed:
+            with self._lock:
                 job.worker = worker
             if job.given_up:
                 raise CancelledError

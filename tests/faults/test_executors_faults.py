@@ -27,7 +27,6 @@ from tests.faults.treacherous import (
     N_STEPS,
     DiesLoading,
     DiesOnce,
-    Gated,
     LoadsOnce,
     Treacherous,
     descendants,
@@ -208,29 +207,6 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         values = posterior(many)
         assert np.isneginf(values[3])
         np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
-        # points that are collected as they end
-        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=client, cache=tmp_path / "cache.sqlite")
-        client.wait_for_workers(2)  # the killed one is replaced
-        with posterior.evaluation_queue() as queue:
-            assert queue.workers == 2
-            tickets, done = queue.submit(many), {}
-            while len(done) < len(many):
-                done.update(queue.collect())
-            np.testing.assert_array_equal([done[ticket] for ticket in tickets], values)
-            (long,) = queue.submit([[0.95, 0.1, 0.5]])
-            short = queue.submit(many[:3] * [1.0, 0.5, 1.0])
-            done = {}
-            while len(done) < 3:
-                done.update(queue.collect())
-            assert set(done) == set(short)
-            waiting = queue.submit([[0.96, 0.1, 0.5], [0.97, 0.1, 0.5], [0.98, 0.1, 0.5], [0.99, 0.1, 0.5]])
-        stored, key = posterior.likelihood.simulator.cache, posterior.likelihood.simulator.simulation_key
-        (tmp_path / "go").touch()  # the queue is closed: what runs is cached, what waits is cancelled
-        stop = time.monotonic() + 60.0
-        while not stored.are_stored(key, np.array([[0.95, 0.1]]))[0]:
-            assert time.monotonic() < stop
-            time.sleep(0.05)
-        assert posterior.likelihood.simulations < len(many) + 3 + 1 + len(waiting)
 
 
 @needs("mpi4py")

@@ -174,22 +174,6 @@ def test_a_simulation_stopped_at_a_time_limit(tmp_path):
     assert runs(Faulty(time_limit=5.0)) == (0, False)
 
 
-def test_a_damaged_or_evicted_time_limit_is_simulated_again(tmp_path):
-    path = tmp_path / "cache.sqlite"
-    for _ in range(2):
-        likelihood_of(stopped(5.0), path).misfit(THETAS)
-    cache = SimulationCache(path)
-    assert stored_outcomes(cache, stopped(5.0), THETAS)[1] == "stopped at the time limit of 5 s"
-    cache.file.connection().execute("UPDATE rows SET time_limit = 500.0")
-    assert stored_outcomes(cache, stopped(5.0), THETAS) == [None] * 3
-    assert cache.damaged == 1
-    small = SimulationCache(path, max_rows=2)
-    store_outcomes(small, Faulty(), THETAS, ["a", "b", "c"])
-    assert stored_outcomes(small, Faulty(), THETAS) == [None, "b", "c"]
-    small.clear()
-    assert stored_outcomes(small, Faulty(), THETAS) == [None] * 3
-
-
 # real faults ---------------------------------------------------------------------------------------------------------
 
 
@@ -357,11 +341,6 @@ class ComplexModel(Treacherous):
         return complex_line(theta)
 
 
-class ComplexBatch(ComplexModel):
-    def simulate_batch(self, thetas):
-        return np.array([self.simulate(theta) for theta in thetas]), [""] * len(thetas)
-
-
 class ComplexOscillator(LinearOscillator):
     """A model on threads."""
 
@@ -376,11 +355,10 @@ class ComplexOscillator(LinearOscillator):
     "model",
     [
         ComplexModel(),
-        ComplexBatch(),
         FunctionModel(complex_line, NAMES, CHANNELS, DT, N_STEPS),
         ComplexOscillator(Record("r", DT, np.ones(N_STEPS))),
     ],
-    ids=["model", "batch", "function", "threads"],
+    ids=["model", "function", "threads"],
 )
 def test_a_complex_response_is_refused(model):
     for batch in (simulate_batch(model, THETAS), misfit_batch(model, THETAS, line(THETAS[0]))):

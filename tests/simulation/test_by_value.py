@@ -62,6 +62,9 @@ class Private:
         return self.__k
 def through_private_slots(x):
     return Private().stiffness * x
+class Named:  # is pickled by its name, as compiled functions are
+    def __reduce__(self):
+        return "bad"
 def through_a_cache(x):
     return cached(x) + Cached().force(x) - K * x
 def through_numpy(x):
@@ -237,20 +240,13 @@ def test_a_module_is_one_namespace_in_the_worker(user, pool):
     assert user.law.K == 3.0
 
 
-class Named:
-    """Is pickled by its name, as compiled functions are."""
-
-    def __reduce__(self):
-        return "bad"
-
-
 def test_locks_are_new_and_values_that_cannot_be_sent_are_refused_with_their_name(user, pool):
     assert pool.map(user.law.with_a_lock, [1.0]) == [3.0]
     user.law.bad = (number for number in (1, 2))
     for function, name in ((user.law.direct, "bad"), (user.by_name, "law.bad")):
         with pytest.raises(ValueError, match=f"the {name} of {function.__name__}, of type generator, cannot be sent"):
             pool.map(function, [1.0])
-    user.law.bad = Named()
+    user.law.bad = user.law.Named()
     with pytest.raises(ValueError, match="cannot be loaded in a worker process: AttributeError.*'bad'"):
         pool.map(user.law.direct, [1.0])
 

@@ -17,12 +17,12 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import pool_executor
-from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
 from tests.faults import treacherous
 from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
 
-SLOW = ("one process", "executor", "multiprocessing")  # kinds of pools
+SLOW = ("executor", "multiprocessing")  # kinds of pools
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -52,31 +52,23 @@ def thetas(rng):
     return thetas
 
 
-def pools():
-    yield "None", lambda: None
-    yield "one process", lambda: LocalPool(1)
-    yield "three processes", lambda: LocalPool(3)
-    yield "threads", lambda: ThreadPoolExecutor(3)
-    yield "ThreadPool", lambda: ThreadPool(2)
-    yield "executor", lambda: ProcessPoolExecutor(2, mp_context=SPAWN)
-    yield "multiprocessing", lambda: SPAWN.Pool(2)
-    yield "another object", Recorder
+POOLS = {
+    "None": lambda: None,
+    "three processes": lambda: LocalPool(3),
+    "threads": lambda: ThreadPoolExecutor(3),
+    "ThreadPool": lambda: ThreadPool(2),
+    "executor": lambda: ProcessPoolExecutor(2, mp_context=SPAWN),
+    "multiprocessing": lambda: SPAWN.Pool(2),
+    "another object": Recorder,
+}
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        pytest.param(
-            make, id=name, marks=pytest.mark.slow if name in ("one process", "executor", "multiprocessing") else ()
-        )
-        for name, make in pools()
-    ],
-)
-def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in POOLS])
+def test_same_bits_on_every_executor(name, oscillator, thetas, rng):
     measured = rng.normal(size=(2, 300))
     expected = misfit_batch(oscillator, thetas, measured)
     assert [bool(reason) for reason in expected.reasons] == [row == 5 for row in range(23)]
-    pool = make()
+    pool = POOLS[name]()
     executor = as_executor(pool, oscillator)
     for n in (23, 3, 1):
         result = misfit_batch(oscillator, thetas[:n], measured, executor)
@@ -97,19 +89,6 @@ def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
         if hasattr(pool, end):
             getattr(pool, end)()
             break
-
-
-def test_kind_of_executor():
-    class Client(Recorder):
-        def gather(self, futures): ...
-
-    with LocalPool(2) as pool:
-        assert as_executor(pool) is pool
-        assert as_executor(as_executor(pool)) is pool
-    assert as_executor(None) is None
-    assert as_executor(3).workers == as_executor(np.int64(3)).workers == 3
-    assert type(as_executor(Client())) is DaskExecutor
-    assert type(as_executor(Recorder())) is PoolExecutor
 
 
 @pytest.mark.parametrize(

@@ -357,6 +357,8 @@ def test_threads_that_write_files_of_fixed_names_are_refused(options, start, tmp
 
 def test_files_that_no_other_simulation_writes_are_no_reason_to_refuse(start, pool, tmp_path_factory):
     def harmless(theta):
+        with contextlib.closing(sqlite3.connect(table)) as file:
+            assert file.execute("select * from x").fetchone() == (1,)
         with tempfile.TemporaryDirectory() as place, tempfile.NamedTemporaryFile("w") as file, open(os.devnull, "w"):
             file.write("text")
             subprocess.run(["true"], cwd=place, check=True)
@@ -368,7 +370,10 @@ def test_files_that_no_other_simulation_writes_are_no_reason_to_refuse(start, po
                 text.write("x")
             return write_and_read(f"{place}/in.txt", theta)
 
-    log = str(tmp_path_factory.mktemp("place") / "log.txt")
+    log, table = (str(tmp_path_factory.mktemp("place") / name) for name in ("log.txt", "table.db"))
+    with contextlib.closing(sqlite3.connect(table)) as file:
+        file.execute("create table x as select 1")
+        file.commit()
     with ThreadPoolExecutor(2) as threads:
         assert_right(harmless, pool)
         assert_right(harmless, threads)
