@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .by_value import process_name
-from .faults import RunFailed, TransientReason, UnusableModel, reason_of
+from .faults import RunFailed, TransientReason, UnusableModel, reason_of, reworded
 from .files import (
     Opened,
     RunningSimulation,
@@ -181,7 +181,7 @@ def _run_in_mirror(
     kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
     mirror.clean(anew=kept is not None or simulation.has_programs)  # which may still write
     if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
-        reason = _with(reason, f" (its folder is {kept})")
+        reason = reworded(reason, f"{reason} (its folder is {kept})")
         error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
     return result, error, simulation.shared
 
@@ -189,12 +189,6 @@ def _run_in_mirror(
 def _is_failure(result: Any) -> bool:
     """Whether a result is an `Outcome` with a reason."""
     return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
-
-
-def _with(reason: str, more: str) -> str:
-    """A longer reason of the same kind."""
-    text = reason + more
-    return reason.with_text(text) if isinstance(reason, TransientReason) else type(reason)(text)
 
 
 def _is_only_thread_of_dask() -> bool:

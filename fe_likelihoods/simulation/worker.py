@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 from samplers.interrupts import become_worker
 
 from .by_value import CannotLoad, Pickled, Recent, without_addresses
-from .faults import RunFailed, TransientReason, is_transient
+from .faults import RunFailed, TransientReason, is_transient, reworded
 from .files import of_this_library
 from .folder import discard, working_folder
 
@@ -150,7 +150,7 @@ class Worker:
             reason = TransientReason(slow.format(seconds), time_limit=seconds)
         except RunFailed as error:
             reason = error.reason
-        raise RunFailed(reason.with_text(reason + self.kill(reason)), time.monotonic() - start)
+        raise RunFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""

@@ -74,8 +74,7 @@ def guided(path, log):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [60, 120])
-def test_a_guide_that_is_killed_repeats_no_stored_simulation(tmp_path, stop):
+def test_a_guide_that_is_killed_repeats_no_stored_simulation(tmp_path, stop=120):
     """Started again from scratch: ``cache="path"`` has the responses, of short parts of the record as well.
 
     Only the few rows of every part are simulated again by which a new program verifies what is stored.
