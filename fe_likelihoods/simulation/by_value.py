@@ -43,6 +43,7 @@ __all__ = [
     "Recent",
     "dumps",
     "is_arriving",
+    "names_in",
     "process_name",
     "without_addresses",
 ]
@@ -269,7 +270,7 @@ class _Pickler(cloudpickle.Pickler):
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; a user function gets the namespace of its module."""
-        module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
+        module, names = self._module(function.__globals__.get("__name__")), names_in(function.__code__)
         if module is None or vars(module) is not function.__globals__:
             self._module(function.__module__)
             return super().reducer_override(function)
@@ -290,14 +291,15 @@ class _Pickler(cloudpickle.Pickler):
 
 
 class _Names(NamedTuple):
-    """Names in the code of a function and of the functions inside it."""
+    """Names in code, and what it imports."""
 
     all: frozenset[str]
     imported: frozenset[str]  # modules (with a dot per level of a relative import) and names imported from them
 
 
 @functools.lru_cache(maxsize=4096)
-def _names_in(code: types.CodeType) -> _Names:
+def names_in(code: types.CodeType) -> _Names:
+    """Names in a code object and in the code objects inside it."""
     imported: set[str] = set()
     before: list[Any] = [0, None]
     for step in dis.get_instructions(code):
@@ -306,7 +308,7 @@ def _names_in(code: types.CodeType) -> _Names:
             module = "." * level + step.argval
             imported |= {module, *(f"{module}{'.' if step.argval else ''}{item}" for item in items or ())}
         before.append(step.argval)
-    inner = [_names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return _Names(
         frozenset(code.co_names).union(*(names.all for names in inner)),
         frozenset(imported).union(*(names.imported for names in inner)),

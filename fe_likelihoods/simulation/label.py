@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from .by_value import names_in
 from .files import Opened, file_digest
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
@@ -72,7 +73,6 @@ _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simul
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
 _first: dict[str, str] = {}  # first digests of values that running code changes
 _opened: dict[str, Opened] = {}  # by code, in this process
-_sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
 
 class ModelLabel:
@@ -333,7 +333,7 @@ class _Walk:
             self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
             self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
             self._add(_attribute(function, "__wrapped__"))
-            for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
+            for name in sorted(names_in(function.__code__).all & function.__globals__.keys()):
                 self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
 
     def _add_class(self, cls: type) -> None:
@@ -423,27 +423,14 @@ def _attribute(value: Any, name: str) -> Any:
         return None
 
 
-def _global_names(code: types.CodeType) -> set[str]:
-    """Names in a code object and in the code objects inside it."""
-    names = set(code.co_names)
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            names |= _global_names(constant)
-    return names
-
-
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
     """Digest of a module's source file when it was first read, and the words in it."""
     file = getattr(module, "__file__", None)
-    if file is None:
-        return "", frozenset()
-    known = _sources.get((file, id(module)))
-    if known is None:
-        known = _sources[file, id(module)] = _read_source(file)
-    return known
+    return ("", frozenset()) if file is None else _read_source(file, id(module))
 
 
-def _read_source(file: str) -> tuple[str, frozenset[str]]:
+@functools.cache
+def _read_source(file: str, module: int) -> tuple[str, frozenset[str]]:
     try:
         content = Path(file).read_bytes()
         if not file.endswith(".py"):

@@ -21,6 +21,7 @@ from .worker import LoadingFailed, Worker, Workers
 __all__ = ["LocalPool", "Outcome", "results_of"]
 
 MAX_ATTEMPTS = 3
+_LINGER = 0.1  # [s] that a thread waits for another item before it ends; a new thread costs as much as a short item
 _THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA")
 
 Outcome = tuple[Any, str]
@@ -84,10 +85,11 @@ class LocalPool:
         self._set_up()
 
     def _set_up(self) -> None:
-        self._owner, self._lock = os.getpid(), threading.RLock()
+        self._owner, self._changed = os.getpid(), threading.Condition(threading.RLock())
         self._waiting: deque[_Job] = deque()
         self._running: set[_Job] = set()
         self._threads: set[threading.Thread] = set()
+        self._n_idle = 0  # threads that wait for an item
         self._workers = Workers(environment=self._environment)
 
     def __enter__(self) -> "LocalPool":
@@ -107,7 +109,7 @@ class LocalPool:
     def close(self) -> None:
         """Give up all items and end the processes; a later item starts new processes."""
         self._notice_fork()
-        with self._lock:
+        with self._changed:
             left = [*self._waiting, *self._running]
         self.give_up(left)
         self._workers.close()
@@ -144,7 +146,7 @@ class LocalPool:
         self._notice_fork()
         started = [job for job in futures if not job.cancel() and running and not job.done()]
         for job in started:
-            with self._lock:
+            with self._changed:
                 job.given_up, worker = True, job.worker
             if worker is not None:
                 worker.kill()
@@ -160,12 +162,13 @@ class LocalPool:
         self._notice_fork()
         pickled = Pickled.of(function)  # each time: the values that it uses may have changed
         jobs = [_Job(pickled, item) for item in items]
-        with self._lock:
+        with self._changed:
             if first:
                 self._waiting.extendleft(reversed(jobs))
             else:
                 self._waiting.extend(jobs)
-            for _ in range(min(self.workers - len(self._threads), len(self._waiting))):
+            self._changed.notify_all()
+            for _ in range(min(self.workers - len(self._threads), len(self._waiting) - self._n_idle)):
                 thread = threading.Thread(target=self._work, name="LocalPool", daemon=True)
                 self._threads.add(thread)
                 thread.start()
@@ -175,20 +178,12 @@ class LocalPool:
 
     def _work(self) -> None:
         """Run items one after the other, until none is waiting."""
-        while True:
-            with self._lock:
-                if not self._waiting:
-                    self._threads.discard(threading.current_thread())
-                    return
-                job = self._waiting.popleft()
-                if not job.set_running_or_notify_cancel():
-                    continue
-                self._running.add(job)
+        while (job := self._next()) is not None:
             try:
                 result, error = self._result(job), None
             except BaseException as raised:
                 result, error = None, raised
-            with self._lock:
+            with self._changed:
                 self._running.discard(job)
                 job.worker = None
             if error is None:
@@ -196,11 +191,26 @@ class LocalPool:
             else:
                 job.set_exception(error)
 
+    def _next(self) -> _Job | None:
+        """The next item; None if the thread ends."""
+        with self._changed:
+            while True:
+                self._n_idle += 1
+                self._changed.wait_for(lambda: self._waiting, _LINGER)
+                self._n_idle -= 1
+                if not self._waiting:
+                    self._threads.discard(threading.current_thread())
+                    return None
+                job = self._waiting.popleft()
+                if job.set_running_or_notify_cancel():
+                    self._running.add(job)
+                    return job
+
     def _result(self, job: _Job) -> Any:
         """Result of an item, from another process if its process dies."""
 
         def watch(worker: Worker | None) -> None:
-            with self._lock:
+            with self._changed:
                 job.worker = worker
             if job.given_up:
                 raise CancelledError
