@@ -254,9 +254,9 @@ def refuse_shared(path: str, n_workers: int | None) -> None:
     if path and n_workers != 1:
         raise UnusableModel(
             f"The simulations write to {path}, or read there what is written while they run, and simulations in other "
-            "workers may do the same at that moment, so that results would be mixed up. Use a pool of processes and a "
-            "relative file name, which is private to each simulation, or a folder from tempfile (docs/parallel.rst); "
-            "or use one worker, pool=1"
+            "workers may do the same at that moment, so that results would be mixed up. Use a pool of processes (dask: "
+            "workers with one thread) and a relative file name, which is private to each simulation, or a folder from "
+            "tempfile (docs/parallel.rst); or use one worker, pool=1"
         )
 
 
