@@ -30,7 +30,6 @@ from tests.faults.treacherous import (
     Treacherous,
     descendants,
     gone,
-    line,
     posterior_of,
 )
 
@@ -70,24 +69,6 @@ def theta(what, n=1):
 
 
 # workers that die ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_an_item_that_kills_its_worker_fails_alone(workers):
-    thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
-    with LocalPool(workers) as pool:
-        batch = simulate_batch(Treacherous(), thetas, pool)
-        fine = [row for row in range(18) if row not in (8, 17)]
-        np.testing.assert_array_equal(batch.response[fine], [line(thetas[row]) for row in fine])
-        assert np.isnan(batch.response[[8, 17]]).all()
-        assert [batch.reasons[row] for row in (8, 17)] == [
-            "the worker process died (signal 11)",
-            "the worker process ended with exit code 3",
-        ]
-        assert [batch.reasons[row] for row in fine] == [""] * 16
-        again = simulate_batch(Treacherous(), thetas[fine], pool)  # the pool still works
-        np.testing.assert_array_equal(again.response, batch.response[fine])
 
 
 def test_processes_may_die_while_they_load_the_function(tmp_path):
@@ -274,9 +255,8 @@ def third(**options):
     return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
 
 
-@pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
-def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
-    posterior = third(pool=pool)
+def test_sampler_with_nan_in_a_third_of_the_prior(seed):
+    posterior = third()
     sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)
     sampler.run_mcmc(None, 2)
     assert np.isfinite(sampler.get_log_prob()).all()
@@ -304,19 +284,3 @@ def test_too_many_failures_stop_the_run_and_keep_finished_simulations(tmp_path, 
     report = posterior.report()
     assert report["simulations"] >= 200
     assert report["failure_count"] == len(report["failures"]) > 0.25 * report["simulations"]
-
-
-@pytest.mark.slow
-def test_sampler_with_a_sandboxed_model_that_crashes_and_hangs(seed):
-    """Parts of the prior crash or hang: the run ends, and the report has both reasons."""
-    posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))
-    sampler = SMCSampler(
-        20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0, ess_ratio=0.2, max_moves=2
-    )
-    start = posterior.sample_prior(20, seed)
-    start[:2, 0] = 0.01, 0.03
-    sampler.run_mcmc(start, 1)
-    assert np.isfinite(sampler.get_log_prob()).all()
-    reasons = posterior.report()["failure_reasons"]
-    assert set(reasons) == {"the worker process died (signal 11)", "stopped at the time limit of 0.3 s"}
-    assert sum(reasons.values()) == posterior.report()["failure_count"]

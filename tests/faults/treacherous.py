@@ -208,15 +208,6 @@ def third(theta: np.ndarray) -> np.ndarray:
     return line(theta) * (np.nan if theta[0] < 1.0 / 3.0 else 1.0)
 
 
-def deadly(theta: np.ndarray) -> np.ndarray:
-    """Crashes below 0.02, hangs up to 0.04."""
-    if theta[0] < 0.02:
-        return treacherous(np.array([CRASHES + 0.5, 0.0]))
-    if theta[0] < 0.04:
-        return treacherous(np.array([HANGS + 0.5, 0.0]))
-    return line(theta)
-
-
 def posterior_of(model, top: float = 1.0, **options):
     """Posterior of a model of two parameters, whose offset is between 0 and `top`."""
     from fe_likelihoods.likelihood.likelihood import (

@@ -12,9 +12,8 @@ import pytest
 from fe_likelihoods import ExecutableModel, SimulationFailed
 from fe_likelihoods.simulation import folder as folder_of_simulation
 from fe_likelihoods.simulation.label import ModelLabel
-from fe_likelihoods.simulation.local_pool import LocalPool
-from fe_likelihoods.simulation.model import simulate_batch, split_seconds
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
+from fe_likelihoods.simulation.model import split_seconds
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line
 
 PROGRAM = Path(__file__).with_name("program.py")
 NAMES = ("offset", "slope")
@@ -97,13 +96,6 @@ def _read_everything(folder):
     return row
 
 
-def test_same_bits_on_two_processes():
-    thetas = np.random.default_rng(2).uniform(-1.0, 1.0, size=(6, 2))
-    with LocalPool(2) as pool:
-        batch = simulate_batch(model_of(), thetas, pool)
-    np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])
-
-
 def test_runs_leave_no_files(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     model_of().simulate(THETA)
@@ -171,14 +163,6 @@ def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path, monkeypatch):
         assert "matrix is singular" in (folder / "stderr.txt").read_text()
         assert "matrix is singular" in (folder / "reason.txt").read_text()
         assert f"slope = {float(THETA[1])!r}" in (folder / "reason.txt").read_text()
-
-
-def test_failures_are_counted_by_the_posterior():
-    posterior = posterior_of(model_of("fail"))
-    assert np.isneginf(posterior([0.3, 0.1, 0.5]))
-    report = posterior.report()
-    assert report["failure_reasons"] == {CASES["fail"]: 1}
-    assert report["failures"][0]["seconds"] > 0.0
 
 
 # settings and fingerprint -------------------------------------------------------------------------------------------

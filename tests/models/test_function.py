@@ -18,7 +18,6 @@ import pytest
 from fe_likelihoods import (
     Channel,
     FunctionModel,
-    LinearOscillator,
     Record,
     SimulationFailed,
 )
@@ -57,19 +56,6 @@ def test_same_bits_in_process_and_isolated(guarded):
     for theta in np.random.default_rng(0).uniform(0.0, 1.0, size=(5, 2)):
         np.testing.assert_array_equal(guarded.simulate(theta), line(theta))
         np.testing.assert_array_equal(model_of().simulate(theta), line(theta))
-
-
-def test_an_oscillator_as_a_function(rng):
-    """A wrapped model gives the response of the model itself."""
-    oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=200)), period=0.5)
-    wrapped = FunctionModel(
-        oscillator.simulate, oscillator.parameter_names, oscillator.channels, oscillator.dt, oscillator.n_steps
-    )
-    np.testing.assert_array_equal(wrapped.simulate([1.1, 0.9]), oscillator.simulate([1.1, 0.9]))
-    other = LinearOscillator(oscillator.record, period=0.6)
-    again = FunctionModel(other.simulate, other.parameter_names, other.channels, other.dt, other.n_steps)
-    assert wrapped.fingerprint == again.fingerprint  # the code is in the label
-    assert ModelLabel(wrapped).code != ModelLabel(again).code
 
 
 def test_theta_of_the_caller_is_not_changed():
