@@ -92,6 +92,8 @@ class Observed:
 
     def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
         self.function, self._sender = function, sender
+        if sender is not None:
+            _get_ready(sender)
         self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
         self._known: Opened | None = None
 
@@ -146,6 +148,14 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
     if error is not None:
         raise error
     return result, shared
+
+
+def _get_ready(sender: Sender) -> None:
+    """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if sender.process != process_name() and running_simulation() is None and is_main:
+        with contextlib.suppress(OSError):
+            _mirror_for(sender)
 
 
 def _mirror_for(sender: Sender) -> "_Mirror":
