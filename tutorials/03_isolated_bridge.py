@@ -253,7 +253,7 @@ four = four if args.data == "twin" else ("mean_Ub", "mean_shear", "mean_acc_p", 
 figure = plot_bands(response, measured, four)
 figure.suptitle("Figure 7: predicted response and synthetic data (assumed nominal values)", fontsize="small")
 figure.savefig(args.out / "fig7_predictions.png", dpi=150)
-errors, scores = response.rrmse(measured), prediction.score(measured)
+errors, scores = response.score(measured).rrmse, prediction.score(measured)
 covered = scores.coverage
 print(scores)
 

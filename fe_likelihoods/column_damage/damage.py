@@ -319,8 +319,6 @@ def damage(
             "the noise of sensors does no damage, and errors that are drawn do work and leave residual values: "
             "propagate the measures with noise=False, and give ratios= for the error of the model"
         )
-    if prediction.values is None:
-        raise ValueError("damage needs the values of the samples: propagate with memory_bytes=None")
     states = limit_states(measures) if limits is None else _checked_states(limits)
     names = [state.name for state in states]
     if len(set(names)) != len(names):

@@ -121,8 +121,6 @@ def propagate_few(
     drawn = propagate(
         posterior_or_model, sample.coords[chosen], quantity=quantity, quantiles=quantiles, seed=seed, **options
     )
-    if drawn.values is None:
-        raise ValueError("expected fewer numbers: the simulated values do not fit into memory_bytes")
     succeeded = np.delete(np.arange(simulations), drawn.failed)
     if len(succeeded) < least:
         raise ValueError(f"expected at least {least} simulations that succeed; got {len(succeeded)} of {simulations}")

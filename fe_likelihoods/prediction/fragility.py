@@ -282,7 +282,7 @@ def fragility(
     The probabilities contain the uncertainty of the parameters and the error of the model, from the ratios of 4
     events.
     """
-    if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
+    if taken := {"record", "quantiles"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
     predictor, rows, noise, weights = _chosen(posterior_or_model, samples, part, ratios, noise, n, seed)
     source = read_source(predictor)

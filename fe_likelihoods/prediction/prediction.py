@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,15 +11,10 @@ from ..checks.transfer import check_interval_samples
 from ..events.spread import EventSpread
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_with
-from ..signals.error_measures import rrmse
 from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
-
-if TYPE_CHECKING:
-    pass
-
 
 __all__ = ["Prediction"]
 
@@ -50,12 +44,9 @@ class Prediction:
     quantile_error : ndarray, shape (n_probabilities, ...)
         Monte Carlo errors of the quantiles.
     values : ndarray, shape (n_samples, ...), or None
-        The quantity of every sample that did not fail, in their order. None for histories, and for arrays that exceed
-        the limit of memory.
+        The quantity of every sample that did not fail, in their order. None for histories.
     n_samples : int
-        Number of samples used for mean and variance.
-    n_quantile : int
-        Number of samples used for the quantiles, smaller if not all of them fitted into the limit of memory.
+        Number of samples that did not fail.
     effective_sample_size : float
         Effective number of independent samples, for the Monte Carlo errors.
     failed : ndarray of int, shape (n_failed,)
@@ -93,7 +84,6 @@ class Prediction:
     quantile_error: np.ndarray
     values: np.ndarray | None
     n_samples: int
-    n_quantile: int
     effective_sample_size: float
     failed: np.ndarray
     failure_reasons: dict[str, int]
@@ -143,86 +133,6 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def rrmse(
-        self,
-        measurements: Measurements,
-        part: slice = slice(None),
-    ) -> np.ndarray:
-        """Compute the relative root mean square error of the mean.
-
-        Parameters
-        ----------
-        measurements : Measurements
-            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
-            has times of its own, the histories are interpolated there.
-        part : slice
-            The samples of the history to compare. Default: all.
-
-        Returns
-        -------
-        ndarray, shape (n_channels,)
-            The errors [-] in the order of `channels`, see `fe_likelihoods.signals.error_measures.rrmse`.
-
-        Raises
-        ------
-        ValueError
-            If the prediction has no histories, the measurements lack a channel or have samples outside the histories,
-            or a measured channel is zero, or has no sample, in the part.
-        """
-        compared = self._compared(measurements)
-        measured, mean = _values_of(compared), _at_samples(compared, self.mean)
-        return rrmse(mean[:, part], measured[:, part], [channel.name for channel in self.channels])
-
-    def coverage(
-        self,
-        measurements: Measurements,
-        lower: float = 0.05,
-        upper: float = 0.95,
-        part: slice = slice(None),
-    ) -> np.ndarray:
-        """Compute the fraction of the measured samples between two quantiles.
-
-        Parameters
-        ----------
-        measurements : Measurements
-            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
-            has times of its own, the histories are interpolated there.
-        lower, upper : float
-            Probabilities of the two quantiles.
-        part : slice
-            The samples of the history to compare. Default: all.
-
-        Returns
-        -------
-        ndarray, shape (n_channels,)
-            The fractions [-] in the order of `channels`. A prediction with noise should have about ``upper - lower``.
-            A prediction without noise is a band of the response, not of the measurements, and covers fewer of them.
-
-        Raises
-        ------
-        ValueError
-            As `rrmse`, and if the prediction lacks one of the quantiles or `lower` is not below `upper`.
-
-        Notes
-        -----
-        Between the samples of the histories, the quantiles are interpolated, which is approximate.
-
-        Examples
-        --------
-        >>> prediction.coverage(measurements).round(2)  # doctest: +SAMPLED
-        array([0.91, 0.9 ])
-        """
-        if not lower < upper:
-            raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
-        compared = self._compared(measurements)
-        measured = _values_of(compared)[:, part]
-        below, above = _band_at_samples(compared, self.quantile(lower), self.quantile(upper))[..., part]
-        samples = np.isfinite(measured).sum(axis=1)
-        if not samples.all():
-            empty = [c.name for c, n in zip(self.channels, samples, strict=True) if not n]
-            raise ValueError(f"channels {', '.join(empty)} have no sample in this part; choose another one")
-        return ((below <= measured) & (measured <= above)).sum(axis=1) / samples
-
     def score(
         self,
         measured: Measurements | ArrayLike,
@@ -234,9 +144,10 @@ class Prediction:
         Parameters
         ----------
         measured : Measurements or array_like
-            Measurements of all channels, as for `rrmse`. For quantities other than histories also the measured values
-            themselves [SI], in the shape of the quantity. From `Measurements` the quantity, such as a peak, is computed
-            as it was from the responses.
+            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
+            has times of its own, the histories are interpolated there (quantiles too, which is approximate). For
+            quantities other than histories also the measured values themselves [SI], in the shape of the quantity. From
+            `Measurements` the quantity, such as a peak, is computed as it was from the responses.
         level : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
             with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
@@ -251,21 +162,21 @@ class Prediction:
         Raises
         ------
         ValueError
-            As `rrmse`. For histories from one sample. For other quantities: if the values of the samples are not kept
-            or are fewer than three, the measured values have another shape, samples of the channel are missing, or
-            measurements are given for a function of the whole response.
+            If the measurements lack a channel or have samples outside the histories, a measured channel is zero or has
+            no sample in the part, or the histories are from one sample or have no such quantiles. For other quantities:
+            if the samples are fewer than three, the measured values have another shape, samples of the channel are
+            missing, or measurements are given for a function of the whole response.
 
         Warns
         -----
         UserWarning
             If less than one sample is expected on each side of the intervals, which then have another level: with
-            fewer than 20 samples for 0.9. If the predicted standard deviation of measured samples of histories is zero;
-            they are left out of the PIT.
+            fewer than 20 samples for 0.9.
 
         Notes
         -----
-        Measurements contain the model error and sensor noise: score a prediction with ``noise=True``, unless the
-        quantity is known to be free of them. For histories, CRPS and PIT are computed for normal
+        Measurements contain the model error and sensor noise: score a prediction with ``noise=True``. A band of the
+        response alone covers fewer of them. For histories, CRPS and PIT are computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
 
         Examples
@@ -289,15 +200,11 @@ class Prediction:
         lower, upper = _band_at_samples(compared, *ends)
         scored = (each[:, part] for each in (values, mean, sd, lower, upper, around))
         values, mean, sd, lower, upper, around = scored
-        _check_number(self.n_quantile, 2, level)
+        _check_number(self.n_samples, 2, level)
         return score_histories(self.channels, values, (mean, sd), (lower, upper), around, level)
 
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
-        if self.values is None:
-            raise ValueError(
-                "score: this prediction has kept no values of the samples; propagate with more memory_bytes"
-            )
         _check_number(len(self.values), 3, level)
         observed = measured_quantity(self.quantity, measured) if isinstance(measured, Measurements) else measured
         observed = np.asarray(observed, dtype=float)

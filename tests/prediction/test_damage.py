@@ -249,8 +249,6 @@ def test_what_the_outputs_do_not_show_is_refused_with_the_output_that_is_needed(
         damage_measures(RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.1]), parameters=("Ec",)))
     with pytest.raises(ValueError, match="propagate"):
         damage(replace(prediction, quantity=None))
-    with pytest.raises(ValueError, match="memory_bytes=None"):
-        damage(replace(prediction, values=None))
     with pytest.raises(ValueError, match="different names"):
         damage(prediction, [LimitState("a", "peak drift", 1.0)] * 2)
     other = Record("short", column.dt, np.zeros(20))

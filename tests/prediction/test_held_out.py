@@ -82,8 +82,7 @@ def test_each_event_is_scored_by_the_others(events):
 
 def test_histories_are_scored_too(events):
     _, posteriors, left_out = events
-    with pytest.warns(UserWarning, match="standard deviation of measured samples is zero"):  # the first one, no noise
-        found = left_out.scores(posteriors, n=100)["EQ0"]
+    found = left_out.scores(posteriors, n=100)["EQ0"]
     assert found.scores.rrmse[0] < 0.4 and found.prediction.dt == 0.02
 
 
