@@ -39,7 +39,6 @@ import numpy as np
 
 from fe_likelihoods import (
     exceedance,
-    fit_measures,
     fragility,
     peak,
     plot_bands,
@@ -176,8 +175,11 @@ plot_run(sampler).savefig(args.out / "run.png", dpi=150)
 
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 rng = np.random.default_rng(args.seed)
-fit = fit_measures(posterior, samples)
-nominal_fit = fit_measures(posterior, np.ones((1, n_structural)))[0]
+power = np.nansum(np.square(measured.values), axis=1)
+fit, nominal_fit = (
+    posterior.likelihood.misfit(each) / power for each in (samples[:, :n_structural], np.ones((1, n_structural)))
+)
+nominal_fit = nominal_fit[0]
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.6), layout="constrained")
 few = samples[rng.choice(len(samples), min(500, len(samples)), replace=False)]

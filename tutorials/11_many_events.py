@@ -344,7 +344,7 @@ curves = {
     "one event, as usual": fragility(
         posteriors[strongest], chain[:: max(1, len(chain) // DRAWS)], records, noise=False, **options
     ),
-    "population of events": fragility(posteriors[strongest], hierarchy, records, ratios=ratios, n=DRAWS, **options),
+    "population of events": fragility(posteriors[strongest], hierarchy, records, ratios=ratios, **options),
 }
 fig, axes = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
 summary["fragility"] = {}

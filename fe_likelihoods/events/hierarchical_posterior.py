@@ -182,16 +182,6 @@ class HierarchicalPosterior:
             "hyper-parameters>"
         )
 
-    def __str__(self) -> str:
-        varying = ", ".join(f"{name} ({each.scale})" for name, each in self.varying.items())
-        return "\n".join(
-            [
-                f"Hierarchical posterior of {len(self.tests)} tests: {', '.join(self.tests)}",
-                f"varying: {varying}; common: {', '.join(self.common) or 'none'}",
-                f"{self.ndim} hyper-parameters: {', '.join(self.parameter_names)}",
-            ]
-        )
-
     def without(self, test: str) -> "HierarchicalPosterior":
         """The same posterior density without the data of one test; ValueError for the only test, or an unknown one."""
         if test not in self.tests or len(self.tests) < 2:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..checks.finding import Finding, labelled, warn
 from ..checks.transfer import check_interval_samples
-from ..events.spread import EventSpread
+from ..events.ratios import EventRatios
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..text_tables import number, text_table
@@ -67,9 +67,10 @@ class Prediction:
         which the model was made.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
-    spread : EventSpread or None
-        Uncertainty of ratios and event population, for the intervals of `fe_likelihoods.exceedance`; None unless a new
-        event is predicted (`fe_likelihoods.predict_new_event`).
+    ratios : EventRatios or None
+        Ratios by which the values predict measurements of a new event (`fe_likelihoods.predict_new_event`), else None.
+    predicted : ndarray, shape (...), or None
+        The value in the new event that the ratios multiply.
     findings : tuple of Finding
         What speaks against the prediction, each with what to do; the warnings of `fe_likelihoods.propagate`.
     data : Measurements or None
@@ -92,7 +93,8 @@ class Prediction:
     noise: bool = False
     from_state: str = "virgin"
     quantity: object = None
-    spread: EventSpread | None = None
+    ratios: EventRatios | None = None
+    predicted: np.ndarray | None = None
     findings: tuple[Finding, ...] = ()
     collapsed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     data: Measurements | None = None
@@ -101,11 +103,6 @@ class Prediction:
     def sd(self) -> np.ndarray:
         """Standard deviation, shape (...)."""
         return np.sqrt(self.variance)
-
-    @property
-    def has_ratios(self) -> bool:
-        """Whether the values predict measurements, by ratios of measured to simulated values in other events."""
-        return self.spread is not None and self.spread.ratios is not None
 
     @property
     def n_failed(self) -> int:
@@ -238,11 +235,11 @@ class Prediction:
     def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
         """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
         noise = "with measurement noise" if self.noise else "without measurement noise"
-        if self.has_ratios:
-            noise = f"of measured values, by the ratios of {len(self.spread.ratios.values)} events"
+        if self.ratios is not None:
+            noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
         lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
-        if self.has_ratios:
-            share = np.mean(self.spread.ratios.prior_share)
+        if self.ratios is not None:
+            share = np.mean(self.ratios.prior_share)
             lines.append(f"the ratio of a new event has no mean: use the quantiles; {share:.0%} of their squared width")
             lines[-1] += " is due to the prior of the scatter between events"
         if self.n_failed:

@@ -34,7 +34,6 @@ from ..checks.screening import check_gaps
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks, check_same_response
 from ..noise.protocol import noise_under
 from ..signals.channels import Measurements
-from ..signals.error_measures import sum_of_squares
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
@@ -52,7 +51,7 @@ from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
 
-__all__ = ["AllFailed", "check_effective_sample_size", "fit_measures", "propagate"]
+__all__ = ["AllFailed", "check_effective_sample_size", "propagate"]
 
 logger = logging.getLogger(__name__)
 
@@ -265,47 +264,6 @@ def propagate(
         for name, each in found.items()
     }
     return predictions if isinstance(quantity, Mapping) else predictions[""]
-
-
-def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:
-    """Compute the squared relative error of each sample's response.
-
-    The error is sum (simulated - measured)^2 / sum measured^2, the square of the RRMSE. It needs misfits only, so that
-    no response is stored and simulations cached by the likelihood are not repeated.
-
-    Parameters
-    ----------
-    posterior : Posterior, FELikelihood or JointLikelihood
-        The likelihood with the measurements.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        All parameters, or the structural parameters alone.
-    part : str, optional
-        As for `propagate`.
-
-    Returns
-    -------
-    ndarray, shape (n, n_channels)
-        The errors [-] in the order of the model's channels. Failed simulations have rows of NaN.
-
-    Raises
-    ------
-    ValueError
-        As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
-
-    Examples
-    --------
-    >>> fit_measures(posterior, samples).shape
-    (300, 2)
-    """
-    posterior, samples = part_of(posterior, samples, part, False)
-    source = read_source(posterior)
-    if source.likelihood is None:
-        raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
-    likelihood = source.likelihood
-    compared = getattr(likelihood.measured, "values", likelihood.measured)
-    power = sum_of_squares(compared, [channel.name for channel in likelihood.measurements.channels])
-    thetas, _ = split_samples(source, samples, False)
-    return likelihood.misfit(thetas) / power
 
 
 def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:

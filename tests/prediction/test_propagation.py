@@ -10,16 +10,15 @@ from scipy import stats
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
-from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.prediction import accumulator
 from fe_likelihoods.prediction.accumulator import RunningMoments
 from fe_likelihoods.prediction.averaging import average_predictions
-from fe_likelihoods.prediction.propagation import fit_measures, propagate
+from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.prediction.quantities import ChannelQuantity, peak
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.records import DisplacementHistory, Record
+from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed
 
 NAMES = ("offset", "slope")
@@ -222,25 +221,6 @@ def test_coverage_of_measurements(oscillator, rng):
         noisy.score(measurements.trim(0.0, 199 * 0.02))
 
 
-def test_fit_measures(oscillator, rng):
-    measured = oscillator.simulate([1.0, 1.0])
-    posterior = with_noise(oscillator, measured)
-    samples = rng.uniform(0.8, 1.2, size=(6, 4))
-    expected = [
-        np.square(oscillator.simulate(t[:2]) - measured).sum(axis=1) / np.square(measured).sum(axis=1) for t in samples
-    ]
-    assert np.allclose(fit_measures(posterior, samples), expected)
-    assert posterior.likelihood.simulations == 6
-    assert np.array_equal(fit_measures(posterior, samples[:, :2]), fit_measures(posterior, samples))
-    assert posterior.likelihood.simulations == 6  # cached
-    samples[2, 0] = -1.0
-    assert np.isnan(fit_measures(posterior, samples)).all(axis=1).tolist() == [False, False, True, False, False, False]
-    with pytest.raises(ValueError, match="not zero"):
-        fit_measures(with_noise(oscillator, measured * [[1.0], [0.0]]), samples)
-    with pytest.raises(ValueError, match="with measurements"):
-        fit_measures(oscillator, samples)
-
-
 def test_another_record(oscillator, rng):
     samples = rng.normal(1.0, 0.05, size=(30, 2))
     longer = Record("other", 0.01, rng.normal(size=700))
@@ -249,20 +229,6 @@ def test_another_record(oscillator, rng):
     assert np.array_equal(p.mean, same.mean) and p.dt == 0.01 and len(p.time) == 700
     double = quiet(oscillator, samples, record=oscillator.record.scale(2.0), quantity=peak("displacement"))
     assert np.allclose(double.values, 2.0 * quiet(oscillator, samples, quantity=peak("displacement")).values)
-
-
-def test_with_record_of_the_column(rng):
-    column = RCColumn.lhpost(Record("short", 0.01, rng.normal(size=20)), mesh=20, outputs=("displacement",))
-    other = Record("other", 0.005, rng.normal(size=30))
-    moved = column.with_record(other)
-    assert moved.loading is other and moved.channels == column.channels and moved.mesh == 20 and moved.dt == 0.005
-    assert column.loading.name == "short" and moved.fingerprint != column.fingerprint
-    with pytest.raises(ValueError, match="a Record, the type of this column's loading"):
-        column.with_record(DisplacementHistory("push", [0.0, 0.01]))
-    push = RCColumn.lhpost(DisplacementHistory("push", [0.0, 0.01]), parameters=("Ec",))
-    assert push.with_record(DisplacementHistory("more", [0.0, 0.01, 0.02])).n_steps == 3
-    with pytest.raises(ValueError, match="a DisplacementHistory"):
-        push.with_record(other)
 
 
 def test_failures_are_counted_and_left_out(rng, caplog):
@@ -285,17 +251,6 @@ def test_failures_are_counted_and_left_out(rng, caplog):
     assert endless.failure_reasons == {"the quantity is not finite": p.n_failed} and len(endless.values) == good.sum()
     noisy = np.hstack([samples, np.tile(NOISE, (300, 1))])
     assert np.array_equal(quiet(with_noise(Line(fails=True)), noisy, noise=True).failed, p.failed)
-
-
-def test_failures_that_differ_in_their_duration_only_have_one_reason():
-    class Slow(Line):
-        def simulate(self, theta):
-            if theta[0] < 0.9:
-                raise SimulationFailed(f"the offset is too small after {theta[0]:.3g} s")
-            return super().simulate(theta)
-
-    samples = np.column_stack([np.linspace(0.5, 1.5, 11), np.zeros(11)])
-    assert quiet(Slow(), samples).failure_reasons == {"the offset is too small": 4}
 
 
 def test_all_failed():

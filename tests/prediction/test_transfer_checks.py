@@ -203,18 +203,6 @@ def test_peaks_are_named_in_few_of_100_runs_that_are_right_and_in_most_of_strong
     assert least <= named <= most
 
 
-def test_the_prediction_keeps_what_was_said(rng):
-    posterior, samples = calibrated(rng)
-    options = {"record": excitation(rng, 0.1), "quantity": {"a": None, "b": peak("top")}, "noise": True}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = propagate(posterior, samples, **options, progress=False)
-    assert all(each.filename == __file__ for each in caught)
-    (kept,) = found["a"].findings
-    assert found["b"].findings == (kept,) and [str(each.message) for each in caught] == [kept.message]
-    assert kept.kind == "Beyond the calibrated amplitude" and 0.0 < kept.numbers["top"] < 0.5
-
-
 def test_a_motion_that_is_read_is_compared_by_one_simulation_that_is_counted(rng):
     for check, expected in ((True, 1), (False, 0)):
         posterior, samples = calibrated(np.random.default_rng(3))

@@ -80,9 +80,7 @@ class _Scaled(FunctionModel):
         return _Scaled(record)
 
 
-def fragility_twin(
-    events: int, seed: int, ratio_sd: float = 0.2, n: int = 20
-) -> tuple[bool, np.ndarray, np.ndarray, list[float]]:
+def fragility_twin(events: int, seed: int, ratio_sd: float = 0.2) -> tuple[bool, np.ndarray, np.ndarray, list[float]]:
     """Whether the band holds the curve, and the intervals its points; those of one posterior without error; scores."""
     rng = np.random.default_rng([seed, events])
     center, spread = MEDIAN_SD * rng.standard_normal(), abs(SPREAD_SD * rng.standard_normal())
@@ -111,7 +109,7 @@ def fragility_twin(
         for name, value in zip(stored, peaks, strict=True)
     }
     ratios = event_ratios(hierarchy, likelihoods, peak("top"), prior_events=0)
-    found = fragility(model, hierarchy, records, peak("top"), 1.0, ratios=ratios, n=n, **options)
+    found = fragility(model, hierarchy, records, peak("top"), 1.0, ratios=ratios, **options)
     lower, upper = found.band(0.9)
     alone = fragility(model, stored["EQ0"].samples, records, peak("top"), 1.0, noise=False, **options)
     return (
