@@ -278,7 +278,13 @@ def damage(
             "the noise of sensors does no damage, and errors that are drawn do work and leave residual values: "
             "propagate the measures with noise=False, and give ratios= for the error of the model"
         )
-    states = limit_states(measures) if limits is None else _checked_states(limits)
+    listed = not isinstance(limits, str | LimitState) and np.iterable(limits)
+    states = limit_states(measures) if limits is None else tuple(limits) if listed else ()
+    if limits is not None and not (listed and all(isinstance(state, LimitState) for state in states)):
+        raise ValueError(
+            'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
+            f"{limits!r}"
+        )
     names = [state.name for state in states]
     if len(set(names)) != len(names):
         raise ValueError(f"limit states need different names; got {', '.join(names)}")
@@ -315,17 +321,6 @@ def _stated(probability: float, error: float, lower: float, upper: float) -> str
     if probability in (0.0, 1.0):
         return f"{probability:.0f} (< {upper:.3f})" if probability == 0.0 else f"{probability:.0f} (> {lower:.3f})"
     return f"{probability:.3f} +- {error:.3f}"
-
-
-def _checked_states(limits: Sequence[LimitState]) -> tuple[LimitState, ...]:
-    alone = isinstance(limits, str | LimitState) or not np.iterable(limits)
-    states = () if alone else tuple(limits)
-    if alone or not all(isinstance(state, LimitState) for state in states):
-        raise ValueError(
-            'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
-            f"{limits!r}"
-        )
-    return states
 
 
 def _limit_per_sample(state: LimitState, prediction: Prediction, rng: np.random.Generator) -> np.ndarray:

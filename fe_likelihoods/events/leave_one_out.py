@@ -10,10 +10,9 @@ likelihood of test k:
 
 the expectation over :math:`p(\varphi \mid D)`. The hyper-samples are weighted with :math:`1 / m_k` where these weights
 are nearly even. Otherwise the population without the test may be where no hyper-sample is, which weights cannot show:
-it is sampled anew, and the predictive density is the ratio of both normalising constants, by bridge sampling. If a
-test's prior of a common parameter is narrower than the other priors, the population is always sampled anew: beyond the
-bounds of this prior :math:`m_k` is zero, so that no hyper-sample is there. No model is simulated in either case. See
-``docs/theory/hierarchy.rst``.
+it is sampled anew, and the predictive density is the ratio of both normalising constants, by bridge sampling. With
+common parameters it is always sampled anew: beyond the bounds of a test's prior :math:`m_k` is zero, so that no
+hyper-sample is there. No model is simulated in either case. See ``docs/theory/hierarchy.rst``.
 
 References
 ----------
@@ -33,7 +32,6 @@ from samplers.resampling import systematic
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
 from .hierarchy_result import Hierarchy
-from .reweighting import ends_within
 
 __all__ = ["LeftOut", "without_each"]
 
@@ -44,11 +42,11 @@ _WALKERS = 500  # of a new run
 class LeftOut(NamedTuple):
     """The population without one test.
 
-    It was sampled anew if the shape is 0.7 or more, less than half of the hyper-samples are effective, or the prior of
-    the test leaves out values of a common parameter that the others permit. The log predictive density of all the
-    test's data given the other tests is a proper score: larger is better. It is NaN if its `StoredPosterior` has no
-    `log_evidence`, and where no sample of the population without the test is within the test's prior. Its error is from
-    the number of hyper-samples (taken as independent), the number of new samples, and the error of the evidence.
+    It was sampled anew if the shape is 0.7 or more, less than half of the hyper-samples are effective, or parameters
+    are common to all tests. The log predictive density of all the test's data given the other tests is a proper score:
+    larger is better. It is NaN if its `StoredPosterior` has no `log_evidence`, and where no sample of the population
+    without the test is within the test's prior. Its error is from the number of hyper-samples (taken as independent),
+    the number of new samples, and the error of the evidence.
     """
 
     hierarchy: Hierarchy  # population of the other tests
@@ -98,8 +96,7 @@ def without_each(hierarchy: Hierarchy, seed: int) -> dict[str, LeftOut]:
         weights, shape = smoothed_weights(own.min() - own)
         effective = float(1.0 / np.square(weights).sum())
         even = shape < LARGEST_SHAPE and effective >= _SMALLEST_SHARE * len(own)
-        cut_off = ends_within(posterior, name, others=rest.tests)
-        sampled = not even or bool(cut_off)
+        sampled = not even or bool(posterior.common)
         if not sampled:
             samples = hierarchy.samples[rng.permutation(systematic(weights, rng))]
             log_density, error = _log_mean(own, weights)
@@ -109,8 +106,8 @@ def without_each(hierarchy: Hierarchy, seed: int) -> dict[str, LeftOut]:
         if np.isnan(log_density):
             warnings.warn(
                 f"leave_one_out: no sample of the population without test {name!r} is possible under this test, whose "
-                f"prior of {', '.join(cut_off)} ends beside that population: its predictive density is not known. "
-                "Sample this test again with the prior of the hierarchical model",
+                f"prior of {', '.join(posterior.common)} ends beside that population: its predictive density is not "
+                "known. Sample this test again with the prior of the hierarchical model",
                 stacklevel=2,
             )
         stored = posterior.tests[name]

@@ -1,6 +1,5 @@
-"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors."""
+"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails and errors."""
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,13 +15,12 @@ from .stored_posterior import resampled_description
 if TYPE_CHECKING:
     from .hierarchical_posterior import HierarchicalPosterior
 
-__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "ends_within"]
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy"]
 
 _HYPER_SAMPLES = 100
 _RESAMPLINGS = 12
 _DRAWS = 500
 _QUANTILE = 0.9  # of the Pareto shapes over the hyper-samples
-_ROUND_OFF = 1e-9  # of the width of a prior, by which equal bounds may differ
 
 
 class ReweightingCheck(NamedTuple):
@@ -114,28 +112,3 @@ def _mean_errors(samples: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, f
     means = (weights / weights.sum(axis=1, keepdims=True)) @ samples
     deviations = samples.std(axis=0)
     return np.std(means, axis=0, ddof=1) / np.where(deviations > 0.0, deviations, 1.0), float(np.std(evidence, ddof=1))
-
-
-def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
-    """Prior bounds of a test that leave out values of common parameters which the other tests' priors permit.
-
-    Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
-    """
-    first = posterior.ndim - len(posterior.common)
-    permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]
-    low, high = np.max(permitted, axis=0)[:, 0], np.min(permitted, axis=0)[:, 1]
-    own = _common_bounds(posterior, name)
-    widths = np.diff(own)
-    # of the width, and of the bound itself where the other one is infinite
-    round_off = _ROUND_OFF * np.where(np.isfinite(widths), widths, np.where(np.isfinite(own), np.abs(own), 0.0))
-    left_out = np.stack([own[:, 0] - round_off[:, 0] > low, own[:, 1] + round_off[:, 1] < high], axis=1)
-    return {
-        common: bounds[is_within].tolist()
-        for common, bounds, is_within in zip(posterior.common, own, left_out, strict=True)
-        if is_within.any()
-    }
-
-
-def _common_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Prior bounds (n_common, 2) of the common parameters in a test."""
-    return posterior.described[name].prior.bounds[len(posterior.varying) :]

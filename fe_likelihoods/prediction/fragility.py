@@ -25,7 +25,7 @@ from ..units import DIMENSIONS
 from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
-from .new_event import under_motion
+from .new_event import at_parameters, under_motion
 from .propagation import AllFailed, check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import (
@@ -189,7 +189,6 @@ def fragility(
     failures_exceed: bool = False,
     from_state: str | None = None,
     rest: float = 10.0,
-    effective_sample_size: float | None = None,
     level: float = 0.95,
     seed: int | None = None,
     **settings: Any,
@@ -229,15 +228,12 @@ def fragility(
     from_state, rest
         State of the structure at the beginning of each record, as in `propagate`. With "end" every record follows the
         excitation of the model, not the other records.
-    effective_sample_size : float, optional
-        Effective number of independent samples. Default: the number of samples.
     level : float
         Probability of the intervals, between 0 and 1.
     seed : int, optional
-        Seed for the noise, for drawing new events and ratio distributions, and for the resampling that gives the errors
-        of the curve.
+        Seed of the noise, of ratio distributions, and of the resampling for the errors of the curve.
     **settings
-        Further arguments of `propagate`: batch, pool, progress.
+        Further arguments of `propagate`: cache, effective_sample_size, pool, progress.
 
     Returns
     -------
@@ -304,7 +300,7 @@ def fragility(
         measured = [each.measurements for each in samples.posterior.tests.values() if each.measurements is not None]
         settings = {"calibrated": measured, "check": False} | settings
     n = len(thetas)
-    effective = check_effective_sample_size(effective_sample_size, n)
+    effective = check_effective_sample_size(settings.get("effective_sample_size"), n)
     check_level(level)
 
     values = np.full((n, len(records)), np.nan)
@@ -381,7 +377,7 @@ def _chosen(
                 "posteriors, quantity), which contain the spread of the parameters"
             )
         names = read_source(posterior_or_model).model.parameter_names
-        return posterior_or_model, {name: [ratios.at[name]] for name in names}, False
+        return posterior_or_model, [at_parameters(ratios.at, names)], False
     predictor, rows = part_of(posterior_or_model, samples, part, bool(noise))
     source = read_source(predictor)
     if noise is None and ratios is None:

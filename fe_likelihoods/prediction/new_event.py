@@ -33,7 +33,7 @@ from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
 
-__all__ = ["event_ratios", "predict_new_event", "under_motion"]
+__all__ = ["at_parameters", "event_ratios", "predict_new_event", "under_motion"]
 
 
 def event_ratios(
@@ -242,7 +242,7 @@ def predict_new_event(
 def _event(likelihood: FELikelihood, at: Mapping[str, float], quantity: Any, spread: Mapping[str, float]) -> tuple:
     """Ratio of measured to predicted value of one event, the predicted one, and the variances of the log ratio."""
     model, measured = likelihood.model, measured_quantity(quantity, likelihood.measurements)
-    rows = spread_rows(_at_parameters(at, model.parameter_names), model.parameter_names, spread)
+    rows = spread_rows(at_parameters(at, model.parameter_names), model.parameter_names, spread)
     responses, reasons = likelihood.simulate(rows)
     if reasons[0]:
         raise SimulationFailed(reasons[0])
@@ -269,7 +269,7 @@ def _is_number(quantity: Any) -> bool:
     return callable(quantity) or (is_list and any(isinstance(each, ChannelQuantity) for each in several))
 
 
-def _at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list[float]:
+def at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list[float]:
     """Values of a model's parameters; ValueError for parameters without a value."""
     if missing := [name for name in names if name not in parameters]:
         raise ValueError(
@@ -287,7 +287,7 @@ def under_motion(
     The ratios have the scatter of the parameters that this motion makes of the number.
     """
     names = read_source(predictor).model.parameter_names
-    rows = spread_rows(_at_parameters(ratios.at, names), names, ratios.spread or {})
+    rows = spread_rows(at_parameters(ratios.at, names), names, ratios.spread or {})
     prediction = propagate(predictor, rows, record=record, quantity=quantity, quantiles=(), **settings)
     values = np.full((len(rows), *prediction.mean.shape), np.nan)
     values[np.setdiff1d(np.arange(len(rows)), prediction.failed)] = prediction.values

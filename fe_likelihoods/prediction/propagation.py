@@ -44,7 +44,6 @@ from .inputs import (
     part_of,
     read_source,
     samples_of_rows,
-    simulates_in_batches,
     split_samples,
 )
 from .other_channels import predict_channels_of
@@ -223,7 +222,7 @@ def propagate(
         name: Accumulator(evaluate, members, sample_noise, bool(probabilities), entropy, n_steps)
         for name, evaluate in evaluators.items()
     }
-    together = source.executor is not None or simulates_in_batches(model)
+    together = source.executor is not None or hasattr(model, "simulate_batch")
     batch = _BATCH_VALUES // (len(model.channels) * model.n_steps)
     batch = max(1, min(batch, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     stored = None

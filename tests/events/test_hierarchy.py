@@ -24,7 +24,6 @@ from fe_likelihoods import (
     propagate,
 )
 from fe_likelihoods.events.scales import scales_of
-from tests.events.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance
@@ -274,23 +273,6 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
     weights = np.exp(change - change.max())
     shift = abs((weights @ points[:, 0] / weights.sum() - points[:, 0].mean()) / points[:, 0].std())
     assert (shift > 0.3) == is_named and (checks.mean_errors["mean_a"] > 0.2) == is_named
-
-
-# the seeds of problems of study `hierarchy_warnings` of docs/results.rst
-@pytest.mark.parametrize("seed", [328, 359, 415])
-def test_right_results_have_no_warning(seed):
-    """Weighted samples, a chain, many samples: the population is narrow, and the result right all the same."""
-    found = solve(problem(seed), seed)
-    assert found.error < RIGHT
-    assert min(each.effective_samples for each in found.checks.tests.values()) < 20
-    assert found.kinds == ()
-
-
-@pytest.mark.parametrize("seed", [366, 382, 401])
-def test_wrong_results_have_a_warning(seed):
-    found = solve(problem(seed), seed)
-    assert found.error > WRONG
-    assert found.kinds
 
 
 # ------------------------------------------------------------------ interface

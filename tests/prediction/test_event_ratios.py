@@ -8,7 +8,6 @@ from scipy import stats
 
 from fe_likelihoods.events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from fe_likelihoods.prediction.reliability import exceedance
-from tests.prediction.twins import ratio_twin
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 
@@ -84,21 +83,6 @@ def test_draws_populations_and_probabilities_belong_together(events, slope_sd):
         assert abs(above.mean() - 0.2) < 4.0 * above.std() / np.sqrt(4000)
 
 
-@pytest.mark.parametrize("n_events", (2, 5, 10))
-def test_intervals_of_ratios_cover_new_events_and_normal_quantiles_do_not(n_events, rng):
-    sets = 4000
-    ratios = EventRatios(np.exp(0.1 + 0.2 * rng.standard_normal((n_events, sets))), prior_events=0)
-    new = np.exp(0.1 + 0.2 * rng.standard_normal(sets))
-    error = 4.0 * np.sqrt(0.25 / sets)
-    for level in (0.5, 0.9):
-        inside = np.abs(np.log(new / ratios.quantile(0.5))) < np.log(
-            ratios.quantile(0.5 + 0.5 * level) / ratios.quantile(0.5)
-        )
-        assert abs(inside.mean() - level) < error
-    narrow = np.abs(np.log(new / ratios.quantile(0.5))) < stats.norm.ppf(0.95) * np.log(ratios.values).std(axis=0)
-    assert narrow.mean() < 0.9 - error
-
-
 @pytest.mark.parametrize("n_events", (1, 4))
 def test_the_prior_covers_where_scatters_differ_as_it_states_and_helps_the_worst(n_events, rng):
     """Structures with scatters drawn from the prior: covered with few events; and fewer narrow intervals by chance."""
@@ -114,22 +98,6 @@ def test_the_prior_covers_where_scatters_differ_as_it_states_and_helps_the_worst
         widths = [np.log(each.quantile(0.95) / each.quantile(0.5)) for each in (ratios, alone)]
         assert np.quantile(widths[0] / spread, 0.05) > 1.2 * np.quantile(widths[1] / spread, 0.05)
         assert np.mean(widths[0]) < np.mean(widths[1])
-
-
-@pytest.mark.parametrize("truth", ("slope 0", "slope 0.2"))
-def test_lines_cover_new_events_and_constant_ratios_miss_far_ones(truth):
-    found = [ratio_twin(truth, 10, 1.0, seed) for seed in range(40)]
-    inside, far, score = (np.array(each) for each in zip(*found, strict=True))
-    for k, level in enumerate((0.5, 0.9)):
-        assert abs(inside[:, k].mean() - level) < 4.0 * inside[:, k].std() / np.sqrt(40)
-    found = [ratio_twin(truth, 10, 0.0, seed) for seed in range(40)]
-    _, far_constant, score_constant = (np.array(each) for each in zip(*found, strict=True))
-    shares = [each[:, 1].sum() / each[:, 2].sum() for each in (far, far_constant)]
-    assert shares[0] > 0.8
-    if truth == "slope 0":
-        assert shares[1] > 0.8 and score.mean() < 1.1 * score_constant.mean()
-    else:  # control
-        assert shares[1] < 0.65 and score.mean() < 0.85 * score_constant.mean()
 
 
 def test_what_cannot_be_used_is_refused():

@@ -176,25 +176,6 @@ def test_intervals_cover_new_events_whose_ratio_goes_with_their_parameters(n_eve
         assert abs((np.abs(together - 0.5) <= 0.5 * level).mean() - level) < 0.03
 
 
-@pytest.mark.parametrize("scatter, lowest", ((0.3, 0.88), (0.6, 0.86)))
-@pytest.mark.parametrize("correlation", (0.0, -0.8))
-def test_intervals_are_nearly_right_where_sensitivities_differ(correlation, scatter, lowest):
-    """Three parameters, whose derivatives of the log peak scatter between events; closed form of the prediction."""
-    rng = np.random.default_rng(1)
-    sd, slope, events, sets = np.array([0.05, 0.4, 0.15]), np.array([1.0, -0.3, 0.5]), 10, 4000
-    direction = slope * sd / np.linalg.norm(slope * sd)
-    slopes = slope * (1.0 + scatter * rng.standard_normal((sets, events + 1, 3)))
-    z = rng.standard_normal((sets, events + 1, 3))
-    independent = np.sqrt(1.0 - correlation**2) * rng.standard_normal((sets, events + 1))
-    log_ratios = 0.1 * (correlation * z @ direction + independent)
-    fitted = sd * z[:, :-1] + 0.05 * rng.standard_normal((sets, events, 3))
-    logs = log_ratios + ((sd * z - fitted.mean(axis=1, keepdims=True)) * slopes).sum(axis=2)
-    ratios = EventRatios(np.exp(logs[:, :-1].T), prior_events=0)
-    pit = 1.0 - ratios.probability_above(np.exp(logs[:, -1]), np.zeros(sets))
-    assert abs((np.abs(pit - 0.5) < 0.25).mean() - 0.5) < 0.03
-    assert lowest < (np.abs(pit - 0.5) < 0.45).mean() < 0.9
-
-
 def test_histories_of_a_new_event_have_noise_of_its_own_level(hierarchy, posterior):
     prediction = predict_new_event(hierarchy, {"EQ0": posterior}, 0.1, noise=True, n=2000, seed=1)
     squared = MEDIAN**2 * np.exp(2.0 * SPREAD**2)  # mean square of a log-normal gain

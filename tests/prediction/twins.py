@@ -1,7 +1,4 @@
-"""Synthetic twins of events whose spread is known: ratios of measured to predicted peaks, and fragility curves.
-
-`ratio_twin`: the logarithms of the ratios of K events have a standard deviation of 0.1 around a constant, a line or a
-curve of the log level; the log levels are normal with a standard deviation of 0.8. There are 40 new events.
+"""Synthetic twins of events whose spread is known, and their fragility curves.
 
 `fragility_twin`: the peak in an event is a gain times the intensity, measured peaks are this times a ratio; logarithms
 of gains and ratios are normal between events. The hyper-parameters of the gain are drawn from the priors that the
@@ -14,7 +11,6 @@ import numpy as np
 from scipy import special, stats
 
 from fe_likelihoods import (
-    EventRatios,
     FELikelihood,
     HalfNormal,
     HierarchicalPosterior,
@@ -33,37 +29,12 @@ from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.signals.channels import Channel
 from fe_likelihoods.signals.records import Record
 
-__all__ = ["ERROR", "MEDIAN_SD", "SPREAD_SD", "TRUTHS", "fragility_twin", "hyper_samples", "ratio_twin"]
+__all__ = ["fragility_twin", "hyper_samples"]
 
 ERROR = 0.05  # of a measured log gain
 MEDIAN_SD, SPREAD_SD = 0.5, 0.3  # of the priors of the population's median and spread
-_NEW, _SD, _LEVEL_SD = 40, 0.1, 0.8
-TRUTHS = {
-    "slope 0": lambda x: 0.0 * x,
-    "slope 0.1": lambda x: 0.1 * x,
-    "slope 0.2": lambda x: 0.2 * x,
-    "curve": lambda x: 0.25 * np.tanh(2.0 * x),
-}
 _PROBABILITIES = np.linspace(0.05, 0.95, 9)  # of the true curve at the intensities
 _GRID = np.meshgrid(np.linspace(-2.0, 2.0, 161), np.linspace(0.0025, 1.2, 120), indexing="ij")
-
-
-def ratio_twin(truth: str, events: int, slope_sd: float, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Shares of new events within intervals of 50 and 90 %, the counts of far ones (and their number), and the score.
-
-    The ratios have no prior of their scatter.
-    """
-    rng = np.random.default_rng([seed, events])
-    x = _LEVEL_SD * rng.standard_normal(events + _NEW)
-    logs = TRUTHS[truth](x) + _SD * rng.standard_normal(len(x))
-    ratios = EventRatios(np.exp(logs[:events]), prior_events=0, levels=np.exp(x[:events]), slope_sd=slope_sd)
-    new, at = logs[events:], x[events:]
-    above = ratios.probability_above(np.exp(new), at)
-    inside = np.stack([np.abs(above - 0.5) <= 0.5 * level for level in (0.5, 0.9)])
-    far = np.abs(at - x[:events].mean()) > 1.5 * _LEVEL_SD
-    low, high = (np.log(ratios.quantile(p, np.exp(at))) for p in (0.05, 0.95))
-    score = high - low + 20.0 * (np.maximum(low - new, 0.0) + np.maximum(new - high, 0.0))
-    return inside.mean(axis=1), np.array([*inside[:, far].sum(axis=1), far.sum()]), float(score.mean())
 
 
 class _Scaled(FunctionModel):
