@@ -256,9 +256,9 @@ class HierarchicalPosterior:
         -------
         (n, n_tests) float
         """
-        center, factor = self.population(x)
+        center, sd = self.population(x)
         columns = [
-            population_marginal(each, center, factor).log_value + (self.tests[name].log_evidence or 0.0)
+            population_marginal(each, center, sd).log_value + (self.tests[name].log_evidence or 0.0)
             for name, each in self.described.items()
         ]
         return np.stack(columns, axis=1)
@@ -275,15 +275,15 @@ class HierarchicalPosterior:
         -------
         center : (n, n_varying + n_common) float
             Means of the varying parameters on their scales, then the common parameters.
-        factor : (n, n_varying, n_varying) float
-            Cholesky factors of the varying parameters' covariances.
+        sd : (n, n_varying) float
+            Standard deviations of the varying parameters on their scales.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
         center = self.scales.to_scale(center)
         deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
-        return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * np.eye(n)
+        return np.clip(center, -_LARGEST, _LARGEST), deviations
 
     def from_scale(self, values: np.ndarray) -> np.ndarray:
         """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""

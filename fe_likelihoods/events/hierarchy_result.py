@@ -175,9 +175,9 @@ class Hierarchy:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
         generator, posterior = _generator(rng), self.posterior
         rows = generator.permutation(np.resize(generator.permutation(len(self.samples)), n))
-        center, factor = posterior.population(self.samples[rows])
+        center, sd = posterior.population(self.samples[rows])
         varying = len(posterior.varying)
-        center[:, :varying] += np.einsum("nij,nj->ni", factor, generator.standard_normal((n, varying)))
+        center[:, :varying] += sd * generator.standard_normal((n, varying))
         draws = posterior.from_scale(center)
         own = [*posterior.varying, *posterior.common]
         outside = np.zeros(draws.shape, dtype=bool)
@@ -230,8 +230,8 @@ class Hierarchy:
         if test not in self.posterior.tests:
             known = ", ".join(map(repr, self.posterior.tests))
             raise ValueError(f"there is no test {test!r}; the tests are {known}")
-        center, factor = self.posterior.population(self.samples)
-        draws = draw_parameters(self.posterior.described[test], center, factor, _generator(rng))
+        center, sd = self.posterior.population(self.samples)
+        draws = draw_parameters(self.posterior.described[test], center, sd, _generator(rng))
         names = [*self.posterior.varying, *self.posterior.common]
         return dict(zip(names, self.posterior.from_scale(draws).T, strict=True))
 

@@ -223,6 +223,7 @@ class EventRatios:
             levels=None if self.levels is None else np.asarray(self.levels)[:, k],
             prior_sd=np.broadcast_to(self.prior_sd, self.values.shape)[:, k],
             new_sd=np.broadcast_to(self.new_sd, self.shape)[k],
+            remainder=np.broadcast_to(self.remainder, self.shape)[k],
         )
 
     def quantile(self, probability: ArrayLike, predicted: ArrayLike = 1.0) -> np.ndarray:

@@ -65,22 +65,22 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
     """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""
     rng = np.random.default_rng(seed)
     used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
-    center, factor = posterior.population(used)
+    center, sd = posterior.population(used)
     weighted = not posterior.common
     found, changes = {}, []
     for name, described in posterior.described.items():
-        marginal = population_marginal(described, center, factor)
+        marginal = population_marginal(described, center, sd)
         change = np.empty((_RESAMPLINGS, len(used)))
         for row in change:
-            row[:] = population_marginal(resampled_description(described, rng), center, factor).log_value
+            row[:] = population_marginal(resampled_description(described, rng), center, sd).log_value
         change -= marginal.log_value
         changes.append(change)
         sizes = np.full(2, np.nan)
-        drawn = draw_products(described, center, factor, _DRAWS, rng)
+        drawn = draw_products(described, center, sd, _DRAWS, rng)
         with np.errstate(divide="ignore"):
             shapes = [pareto_shape(row) for row in np.log(inverse_prior(described, drawn))]
         if weighted:
-            weights = sample_weights(described, center, factor)
+            weights = sample_weights(described, center, sd)
             square = np.square(weights).sum(axis=1)
             independent = described.effective_sample_size * np.exp(2.0 * described.log_weights).sum()
             sizes = np.where(square > 0.0, min(independent, 1.0) / np.where(square > 0.0, square, 1.0), 0.0)

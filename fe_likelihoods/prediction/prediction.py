@@ -18,7 +18,7 @@ from .score_tables import HistoryScores, QuantityScores, envelope, score_histori
 
 __all__ = ["Prediction"]
 
-_MOST_ROWS = 50  # of a table in a notebook
+_MOST_ROWS = 50  # of a printed table
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,8 @@ class Prediction:
     @property
     def time(self) -> np.ndarray:
         """Times of the histories, from zero, shape (n_steps,) [s]; ValueError for other quantities."""
-        self._need_histories()
+        if self.dt is None:
+            raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
         return np.arange(self.mean.shape[1]) * self.dt
 
     def quantile(self, probability: float) -> np.ndarray:
@@ -229,17 +230,12 @@ class Prediction:
         return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}{state}>"
 
     def __str__(self) -> str:
-        title, lines, header, rows = self._table()
-        cells = [[each if isinstance(each, str) else number(each) for each in row] for row in rows]
-        table = [text_table([header, *cells])] if rows else []
-        return "\n".join([f"{title}: {lines[0]}", *lines[1:], *table])
-
-    def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
-        """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
         noise = "with measurement noise" if self.noise else "without measurement noise"
         if self.ratios is not None:
             noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
-        lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
+        title = "Prediction" if self.dt is None else "Prediction of histories"
+        size = f"effective sample size {self.effective_sample_size:.0f}"
+        lines = [f"{title}: {self.n_samples} samples, {noise}; {size}"]
         if self.ratios is not None:
             share = np.mean(self.ratios.prior_share)
             lines.append(f"the ratio of a new event has no mean: use the quantiles; {share:.0%} of their squared width")
@@ -248,37 +244,27 @@ class Prediction:
             collapse = f" (the structure collapsed in {len(self.collapsed)})" if len(self.collapsed) else ""
             lines.append(f"{self.n_failed} samples failed{collapse} and are left out")
         lines += labelled(self.findings)
-        units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
+        known = [(c.name, c.unit, find_unit(c.unit, c.dimension).factor) for c in self.channels]
         if self.dt is not None:
-            header = ("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")
-            rows = []
-            for channel, (unit, factor), mean, sd in zip(self.channels, units, self.mean, self.sd, strict=True):
+            rows = [("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")]
+            for (name, unit, factor), mean, sd in zip(known, self.mean, self.sd, strict=True):
                 at = int(np.argmax(np.abs(mean)))
                 numbers = mean[at] / factor, at * self.dt, sd[at] / factor, sd.mean() / factor
-                rows.append((channel.name, unit, *map(float, numbers)))
-            return "Prediction of histories", lines, header, rows
-        if self.mean.size > _MOST_ROWS:
+                rows.append((name, unit, *map(number, numbers)))
+        elif self.mean.size > _MOST_ROWS:
             lines.append(f"{self.mean.size} values of shape {self.mean.shape}: mean, sd and quantiles are attributes")
-            return "Prediction", lines, (), []
-        of_channels = len(self.channels) == self.mean.size
-        names = [channel.name for channel in self.channels] if of_channels else [f"{i}" for i in range(self.mean.size)]
-        header = ("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))
-        table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
-        rows = [
-            (name, unit, *(column / factor).tolist())
-            for name, (unit, factor), column in zip(
-                names, units if of_channels else [("SI", 1.0)] * self.mean.size, table.T, strict=True
-            )
-        ]
-        return "Prediction", lines, header, rows
-
-    def _need_histories(self) -> None:
-        if self.dt is None:
-            raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
+            return "\n".join(lines)
+        else:
+            if len(known) != self.mean.size:
+                known = [(f"{k}", "SI", 1.0) for k in range(self.mean.size)]
+            rows = [("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))]
+            table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
+            for (name, unit, factor), column in zip(known, table.T, strict=True):
+                rows.append((name, unit, *map(number, column / factor)))
+        return "\n".join([*lines, text_table(rows)])
 
     def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
         """Return what the histories are compared with, in the order of `channels`."""
-        self._need_histories()
         chosen = measurements.select([channel.name for channel in self.channels])
         for predicted, measured in zip(self.channels, chosen.channels, strict=True):
             if predicted.dimension != measured.dimension:
