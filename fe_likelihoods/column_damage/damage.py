@@ -239,9 +239,8 @@ def damage(
     Raises
     ------
     ValueError
-        If the prediction is of another quantity, contains noise or has no values of the samples, or a limit has an
-        unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample; if
-        ratios are for an unknown measure or for several quantities; and for ``noise=True``.
+        If the prediction is of another quantity or contains noise, a limit is not positive, has an unknown measure or
+        does not have one value or one for each sample, or ratios are for an unknown measure or several quantities.
 
     Warns
     -----

@@ -177,9 +177,8 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `propagate` for peaks outside the range of all events, and for harmonics. For histories also as
-        `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. Residuals of the single
-        calibrations are not checked.
+        As `propagate`, for peaks outside the range of all events; for histories also as `Hierarchy.new_test`, and if
+        more than 1 % of the draws have an impossible noise.
 
     Notes
     -----

@@ -160,22 +160,17 @@ def propagate(
     Raises
     ------
     ValueError
-        Before any simulation: for samples of another shape, without rows, or not finite; unknown channels; noise of a
-        bare model, or impossible noise parameters; a model with one excitation only, or one that cannot continue from
-        the end of its excitation; settings out of range; a `model` with other parameters, or with a channel whose
-        quantity was not measured and whose noise is wanted.
-        Later: for a function that returns arrays of different shapes.
+        Before any simulation, for samples of another shape or not finite, unknown channels, noise of a bare model,
+        impossible noise parameters, a model with one excitation or without a state at the end, other settings out of
+        range, and channels of `model` whose noise is not known. Later, for a function that returns arrays of different
+        shapes.
     SimulationFailed
         If every simulation fails.
 
     Warns
     -----
     UserWarning
-        For each finding in `Prediction.findings` that is more than a note: channels of `model` have the mean noise of
-        others; a `final_value` is taken while the structure moves; the median of the predicted peak of a channel, under
-        another record or of another `model`, is more than twice the largest measured peak of the calibration, or less
-        than half of the smallest one; the power of another record is in a band of less than a fifth of the width in
-        the calibration; the response to another record is the response to the calibration record.
+        For each finding in `Prediction.findings` that is more than a note (``docs/predictions.rst``).
 
     Examples
     --------

@@ -147,9 +147,8 @@ def exceedance(
     Raises
     ------
     ValueError
-        If the threshold has the wrong shape or unit, is not finite, or is not positive where there are ratios; the
-        values are missing or not finite; the ratios are for another number of quantities, or are given for a prediction
-        that contains errors already; or the prediction has noise and ``noise=False``.
+        If the threshold has the wrong shape or unit, or is not positive where there are ratios; the values are missing
+        or not finite; or ratios or ``noise=False`` contradict the prediction.
 
     Warns
     -----
