@@ -34,7 +34,6 @@ class ReweightingCheck(NamedTuple):
     effective_samples: float  # of the weights, median over the hyper-samples
     sample_share: float  # of the marginal likelihood, mean; the rest is from the fitted mixture
     pareto_shape: float  # 90 % quantile over the hyper-samples
-    error: float  # standard, of the log marginal likelihood: root mean square, from resampled samples
     shift: float  # largest standard error that this test causes in a hyper-parameter's mean [posterior sd]
 
 
@@ -47,10 +46,10 @@ class HierarchyChecks(NamedTuple):
     findings: tuple[Finding, ...]  # what is not reliable and what to do
 
     def __str__(self) -> str:
-        rows = [("test", "effective", "of samples", "Pareto", "error", "shift")]
+        rows = [("test", "effective", "of samples", "Pareto", "shift")]
         for name, each in self.tests.items():
             effective, share = number(each.effective_samples, 4), f"{each.sample_share:.0%}"
-            others = f"{each.pareto_shape:.2f}", f"{each.error:.2f}", f"{each.shift:.2f}"
+            others = f"{each.pareto_shape:.2f}", f"{each.shift:.2f}"
             rows.append((name, effective, share, *others))
         lines = [text_table(rows)]
         worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
@@ -88,7 +87,6 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
             float(np.median(sizes)),
             float(marginal.sample_share.mean()),
             float(np.sort(shapes)[int(_QUANTILE * (len(shapes) - 1))]),
-            float(np.sqrt(np.mean(np.var(change, axis=0, ddof=1)))),
             float(_mean_errors(used, change)[0].max()),
         )
     errors, evidence = _mean_errors(used, np.sum(changes, axis=0))

@@ -23,7 +23,6 @@ from fe_likelihoods import (
     Varying,
     propagate,
 )
-from fe_likelihoods.events.scales import scales_of
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance
@@ -153,13 +152,6 @@ def test_extreme_hyper_parameters_have_a_density(two):
     assert np.isfinite(found).all()
 
 
-def test_scales_have_their_inverse_and_their_derivative(rng):
-    scales, points, h = scales_of(["log", "linear"]), 2.0 * rng.standard_normal((50, 2)), 1e-5
-    np.testing.assert_allclose(scales.to_scale(scales.from_scale(points)), points, atol=1e-12)
-    slope = (scales.from_scale(points + h) - scales.from_scale(points - h)) / (2.0 * h)
-    np.testing.assert_allclose(scales.log_jacobian(points), np.log(slope), atol=1e-8)
-
-
 def test_values_of_a_common_parameter_beyond_the_bounds_of_a_test_are_impossible(rng):
     prior = Prior({"a": normal(3.0), "b": Uniform(0.0, 1.0)})
     tests = {"T": StoredPosterior(np.column_stack([rng.standard_normal(300), rng.random(300)]), prior)}
@@ -214,22 +206,6 @@ def test_draws_of_a_new_test_beyond_the_bounds_are_a_warning(rng):
 
 
 # ------------------------------------------------------------------ checks
-
-
-@pytest.mark.slow
-def test_stated_errors_are_those_of_other_samples():
-    """Standard errors from resampling against the scatter over independent stored samples."""
-    points = np.random.default_rng(1).normal([1.1, 0.3], [0.1, 0.05], (60, 2))
-    values, stated = [], []
-    for seed in range(10):
-        tests = {f"T{k}": stored(DATA[k, :1], ERRORS[:1, :1], 150, 100 * seed + k) for k in range(1)}
-        posterior = HierarchicalPosterior(tests, {"a": LINEAR})
-        values.append(posterior.log_marginals(points))
-        if seed < 4:
-            checks = Hierarchy(posterior, points).checks
-            stated += [each.error for each in checks.tests.values()]
-    scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)))
-    assert 0.5 < np.mean(stated) / scatter < 2.0
 
 
 def test_test_beside_the_population_is_a_warning(one):

@@ -28,7 +28,6 @@ from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
 from tests.prediction.flexible import DISPERSION, MEDIAN, Flexible
 from tests.prediction.test_new_event import Amplified, hierarchy  # noqa: F401  a fixture
-from tests.prediction.twins import fragility_twin
 
 LOGS = np.array([0.1, -0.05, 0.2, 0.0])
 RATIOS = EventRatios(np.exp(LOGS), prior_events=0)
@@ -352,13 +351,3 @@ def test_failures_and_what_cannot_be_used(record, rng):
     prediction = propagate(Flexible(record), samples, quantity=peak("displacement"), progress=False)
     with pytest.raises(ValueError, match="the prediction contains one"):
         exceedance(replace(prediction, noise=True), 0.1, noise=False)
-
-
-@pytest.mark.slow
-def test_fragility_of_new_events_holds_the_true_curve_and_without_the_error_it_does_not():
-    found = [fragility_twin(5, seed) for seed in range(30)]
-    whole, points, control, scores = (np.array(each) for each in zip(*found, strict=True))
-    assert whole.mean() > 0.9 - 4.0 * np.sqrt(0.09 / 30)
-    assert points.mean() > 0.75
-    assert control.mean() < 0.3 and not control.all(axis=1).any()
-    assert scores[:, 0].mean() < 0.5 * scores[:, 1].mean()
