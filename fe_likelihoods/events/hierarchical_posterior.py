@@ -102,8 +102,6 @@ class HierarchicalPosterior:
     common : mapping of str to Distribution, optional
         Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
         belong to each test alone, with the prior of its stored posterior.
-    max_samples : int
-        Largest number of samples per test. More are thinned; the time of an evaluation is proportional to it.
 
     Attributes
     ----------
@@ -149,10 +147,9 @@ class HierarchicalPosterior:
         varying: Mapping[str, Varying],
         *,
         common: Mapping[str, Distribution] | None = None,
-        max_samples: int = 1000,
     ) -> None:
         common = {} if common is None else common
-        _check(tests, varying, common, max_samples)
+        _check(tests, varying, common)
         self.tests, self.varying, self.common = dict(tests), dict(varying), tuple(common)
         distributions: dict[str, Any] = {}
         for name, each in varying.items():
@@ -163,7 +160,7 @@ class HierarchicalPosterior:
         self.described = {}
         for name, test in self.tests.items():
             try:
-                self.described[name] = describe(test, [*varying, *common], self.scales, max_samples)
+                self.described[name] = describe(test, [*varying, *common], self.scales)
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
         self._set_smallest_sd()
@@ -290,7 +287,7 @@ class HierarchicalPosterior:
         return self.scales.from_scale(values)
 
 
-def _check(tests: Any, varying: Any, common: Any, max_samples: Any) -> None:
+def _check(tests: Any, varying: Any, common: Any) -> None:
     """Raise ValueError for arguments of `HierarchicalPosterior` that cannot be used."""
     for what, values, kind in (("tests", tests, StoredPosterior), ("varying", varying, Varying)):
         if (
@@ -305,5 +302,3 @@ def _check(tests: Any, varying: Any, common: Any, max_samples: Any) -> None:
         raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
     if both := sorted(set(varying) & set(common)):
         raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")
-    if not isinstance(max_samples, int | np.integer) or max_samples < 100:
-        raise ValueError(f"HierarchicalPosterior: max_samples must be a whole number, 100 or more; got {max_samples!r}")

@@ -296,7 +296,6 @@ def test_stored_posterior_refuses(arguments, message):
         ({"common": ["b"]}, "common must be a mapping"),
         ({"varying": {"c": LINEAR}}, "test 'T': the stored samples have no parameters c; they have a, b"),
         ({"varying": {"a": Varying(HalfNormal(1.0), HalfNormal(1.0))}}, "needs positive samples of a; use scale"),
-        ({"max_samples": 10}, "100 or more"),
     ],
 )
 def test_hierarchical_posterior_refuses(arguments, message, rng):
