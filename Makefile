@@ -39,7 +39,7 @@ test-slow: $(READY) ## run the slow tests on all cores, in random order
 	$(BIN)/python -m tests.compile_kernels
 	$(BIN)/python -m pytest -m slow -n auto --dist worksteal --timeout 3600 --randomly-dont-reset-seed
 
-clients:         ## run every client on one posterior and compare with quadrature (makes two environments, 3 GB)
+clients:         ## run every client on one posterior and compare with quadrature (makes an environment)
 	PYTHON=$(PYTHON) .ci/clients
 
 tutorials: $(READY) ## run every tutorial that needs no other data than the bundled ones
@@ -74,4 +74,4 @@ data: $(READY)   ## make the bundled synthetic data again
 	$(BIN)/python data/make_isolated_bridge.py
 
 clean:           ## remove the environments, the built documentation and the results
-	rm -rf $(VENV) .venv-newer .venv-clients .venv-uqpy docs/_build results results-*
+	rm -rf $(VENV) .venv-newer .venv-clients docs/_build results results-*

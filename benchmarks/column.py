@@ -77,7 +77,7 @@ def batch(repeats: int) -> list[Row]:
         for n in counts:
             numba.set_num_threads(n)
             start = time.perf_counter()
-            model.misfit_batch(thetas, np.zeros((2, model.n_steps)))
+            misfit_batch(model, thetas, np.zeros((2, model.n_steps)))
             seconds[n].append(time.perf_counter() - start)
     rows = [
         Row("batch of 64, wall time", f"{n} thread" + "s" * (n > 1), median(times), "s", _speedup(seconds, n))

@@ -49,11 +49,10 @@ from .plots.scores import plot_scores
 from .plots.sensors import plot_ranking
 from .plots.structures import plot_hysteresis, plot_section, plot_sensors
 from .prediction.averaging import average_predictions
-from .prediction.few_runs import propagate_few
 from .prediction.fragility import fragility
 from .prediction.held_out import leave_one_out
 from .prediction.new_event import event_ratios, predict_new_event
-from .prediction.propagation import fit_measures, propagate
+from .prediction.propagation import propagate
 from .prediction.quantities import final_value, peak, rms
 from .prediction.reliability import exceedance
 from .prediction.scores import interval_score, share_within
@@ -136,7 +135,6 @@ __all__ = [
     "event_ratios",
     "exceedance",
     "final_value",
-    "fit_measures",
     "fit_mixture",
     "fragility",
     "from_si",
@@ -168,7 +166,6 @@ __all__ = [
     "predict_new_event",
     "problems",
     "propagate",
-    "propagate_few",
     "rank_sensors",
     "read_columns",
     "read_imposed_test",

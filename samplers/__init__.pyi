@@ -7,7 +7,7 @@ from .reporting.arviz_data import to_arviz
 from .reporting.figures import plot_corner, plot_marginals
 from .reporting.model_comparison import compare_models
 from .reporting.run_figure import plot_run
-from .reporting.summary import comparison_table, ladder_table, summary
+from .reporting.summary import ladder_table, summary
 from .reports import SamplingWarning, Stage
 from .smc import SMCSampler
 from .tempered import TemperedSampler
@@ -25,7 +25,6 @@ __all__ = [
     "TemperedSampler",
     "Verdict",
     "compare_models",
-    "comparison_table",
     "estimate_cost",
     "ladder_table",
     "plot_corner",

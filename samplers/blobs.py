@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["converted", "joined", "stacked"]
+__all__ = ["converted", "joined", "leaves", "stacked"]
 
 NUMBERS, LARGEST_EXACT = "biufc", 2.0**53  # integers above are rounded in a float
 
@@ -52,7 +52,7 @@ def converted(blobs: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], declar
     found = _as_type(blobs, dtype)
     value = _lost(blobs, found, declared) if found is not None else []
     if found is None:  # the first value that cannot become the type alone, or else the first of all
-        value = [each for each in _leaves(blobs) if _as_type(np.array(each), dtype) is None] or list(_leaves(blobs))
+        value = [each for each in leaves(blobs) if _as_type(np.array(each), dtype) is None] or list(leaves(blobs))
     if value:
         numbers = {blobs.dtype.kind, dtype.kind} <= set(NUMBERS)
         wider = np.result_type(blobs.dtype, dtype) if numbers else "object, or for text in a file blobs_dtype='S50'"
@@ -103,19 +103,19 @@ def _declared(blobs: list, dtype: np.dtype, name: str) -> np.ndarray:
     return found
 
 
-def _leaves(values: Iterable) -> Iterator:
+def leaves(values: Iterable) -> Iterator:
     """The single values of nested sequences and arrays in order, as values of Python, whose comparisons are exact."""
     for value in values.reshape(-1) if isinstance(values, np.ndarray) else values:
         plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         if isinstance(plain, list | tuple):
-            yield from _leaves(plain)
+            yield from leaves(plain)
         else:
             yield plain
 
 
 def _lost(given: Iterable, found: np.ndarray, declared: bool = False) -> list:
     """The first of the values that an array of them, of a type `declared` or not, has not kept, in a list."""
-    for value, kept in zip(_leaves(given), _leaves(found), strict=False):
+    for value, kept in zip(leaves(given), leaves(found), strict=False):
         both = value.encode() if isinstance(value, str) and isinstance(kept, bytes) else value
         if declared and isinstance(value, float | complex) and isinstance(kept, float | complex):
             same = np.isfinite(kept) or not np.isfinite(value)  # the user may want fewer digits

@@ -11,7 +11,7 @@ The wall time is the number of evaluations times the mean duration, divided by t
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,22 +21,14 @@ from .smc import SMCSampler
 from .tempered import TemperedSampler
 from .tempering.recycling import DRAWS_PER_TARGET, POINTS_PER_DIMENSION, TARGET_SHARE, search_draws
 
-__all__ = ["CostEstimate", "Expected", "as_duration", "estimate_cost", "expected_evaluations", "first_beta"]
+__all__ = ["CostEstimate", "as_duration", "estimate_cost", "expected_evaluations"]
 
 # Recycling: draws per stage, and evaluations at beta = 1 per walker, which include repeated checks and final moves.
 DRAWS_PER_STAGE = DRAWS_PER_TARGET * 1.15
-AT_THE_END = (0.6, 1.8, 8.0)
+AT_THE_END = (0.6, 8.0)
 # Annealing by moves: sweeps per stage with 100 walkers per dimension, and the increase with fewer walkers.
 SWEEPS_AT_100 = 3.0
 MORE_SWEEPS = 2.2
-
-
-class Expected(NamedTuple):
-    """A range and a likely value, for numbers of evaluations or times [s]."""
-
-    low: float
-    likely: float
-    high: float
 
 
 class CostEstimate(NamedTuple):
@@ -53,12 +45,9 @@ class CostEstimate(NamedTuple):
     evaluated, failures, cached : int
         Evaluations made for the estimate, evaluations that returned -inf, and evaluations that needed no simulation (0
         for a posterior whose ``report()`` has no number of simulations).
-    evaluations : Expected
-        Evaluations of the posterior, without sweeps over fast parameters, which need no simulation. Each step at
-        beta = 1 needs one more per walker.
-    wall_time : Expected
-        Wall time [s] with all workers busy. Without ``asynchronous=True``, a run also waits for the longest evaluation
-        of every batch.
+    fewest, most : float
+        Range of the evaluations of the posterior, without sweeps over fast parameters, which need no simulation. Each
+        step at beta = 1 needs one more per walker.
     """
 
     title: str
@@ -67,27 +56,27 @@ class CostEstimate(NamedTuple):
     evaluated: int
     failures: int
     cached: int
-    evaluations: Expected
-    wall_time: Expected
+    fewest: float
+    most: float
 
-    def time_of(self, evaluations: int) -> str:
-        """Wall time for a number of evaluations, as text."""
-        seconds = evaluations * float(self.seconds.mean()) / self.workers
-        return as_duration(seconds, seconds)
+    def time_of(self, *evaluations: float) -> str:
+        """Wall time of one or two numbers of evaluations with all workers busy, as text.
+
+        Without ``asynchronous=True``, a run also waits for the longest evaluation of every batch.
+        """
+        return as_duration(*(n * float(self.seconds.mean()) / self.workers for n in evaluations))
 
     def __repr__(self) -> str:
         return str(self)
 
     def __str__(self) -> str:
-        low, high = (int(float(f"{n:.2g}")) for n in (self.evaluations.low, self.evaluations.high))
+        low, high = (int(float(f"{n:.2g}")) for n in (self.fewest, self.most))
         seconds = f"mean {self.seconds.mean():.3g} s, {self.seconds.min():.3g} to {self.seconds.max():.3g} s"
         rows = {
             self.title: "",
             f"one evaluation ({self.evaluated} made, {len(self.seconds)} timed)": seconds,
             "evaluations": f"about {low} to {high}",
-            f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}": as_duration(
-                self.wall_time.low, self.wall_time.high
-            ),
+            f"wall time, {self.workers} worker{'s' if self.workers > 1 else ''}": self.time_of(self.fewest, self.most),
         }
         rows |= {"failed evaluations": str(self.failures)} if self.failures else {}
         rows |= {"note": f"{self.cached} points were cached; the times include them"} if self.cached else {}
@@ -95,13 +84,12 @@ class CostEstimate(NamedTuple):
         return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
 
 
-def as_duration(low: float, high: float) -> str:
-    """Two durations [s] as text, in a unit that suits the larger duration: "about 2.1 to 3.4 h"."""
-    size, unit = next(
-        ((s, u) for s, u in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")) if high >= 2.0 * s), (1.0, "s")
-    )
-    first, last = (f"{value / size:.2g}" if value < 99.5 * size else f"{value / size:.0f}" for value in (low, high))
-    return f"about {first} {unit}" if first == last else f"about {first} to {last} {unit}"
+def as_duration(*seconds: float) -> str:
+    """One or two durations as text, in a unit that suits the larger one: "about 2.1 to 3.4 h"."""
+    units = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+    size, unit = next(((size, unit) for size, unit in units if seconds[-1] >= 2.0 * size), (1.0, "s"))
+    texts = [f"{value / size:.2g}" if value < 99.5 * size else f"{value / size:.0f}" for value in seconds]
+    return f"about {' to '.join(dict.fromkeys(texts))} {unit}"
 
 
 def estimate_cost(
@@ -115,16 +103,15 @@ def estimate_cost(
 ) -> CostEstimate:
     """Time a few evaluations, and estimate the cost of a run.
 
-    First, one point per worker is evaluated without timing, because the first evaluations may include a job queue, the
-    start of processes, or a compilation. Then `runs` points are timed. All points are draws of the prior. A sampler
-    with the same `seed` starts from them, so a posterior with a cache does not repeat them. The range is too low for
-    many posteriors with heavy tails (``docs/accuracy``), and for models that take longer near the posterior.
+    One point is evaluated without timing, because the first evaluation may include a job queue, the start of processes,
+    or a compilation. Then `runs` points are timed, one after another. All are draws of the prior. A sampler with the
+    same `seed` starts from them, so a posterior with a cache does not repeat them. The range is too low for many
+    posteriors with heavy tails (``docs/accuracy``), and for models that take longer near the posterior.
 
     Parameters
     ----------
     posterior : callable
-        Log-posterior of a point (ndim,), with ``ndim``, ``log_prior`` and ``sample_prior``. If it has a method
-        ``evaluation_queue``, the points are sent to its pool.
+        Log-posterior of a point (ndim,), with ``ndim``, ``log_prior`` and ``sample_prior``.
     nwalkers : int
         Number of walkers.
     sampler : type
@@ -132,7 +119,7 @@ def estimate_cost(
     workers : int, optional
         Number of simultaneous evaluations in the run. Default: the workers of the posterior's pool, or 1.
     runs : int
-        Number of timed evaluations, at least 2. They are made in groups as large as the posterior's pool.
+        Number of timed evaluations, at least 2.
     seed : int, optional
         Seed of the run. By default the draws differ from call to call.
     **settings
@@ -146,7 +133,7 @@ def estimate_cost(
     Examples
     --------
     >>> cost = estimate_cost(posterior, workers=4, seed=1)
-    >>> bool(0 < cost.evaluations.low < cost.evaluations.likely < cost.evaluations.high)
+    >>> bool(0 < cost.fewest < cost.most)
     True
     """
     runs = as_whole_number("runs", runs)
@@ -162,64 +149,49 @@ def estimate_cost(
     draws = np.asarray(posterior.sample_prior(max(nwalkers, runs + 1), random), dtype=float)  # as the sampler's draws
     report = getattr(posterior, "report", dict)
     before = report().get("simulations")
-    queue = posterior.evaluation_queue() if callable(getattr(posterior, "evaluation_queue", None)) else None
-    try:
-        at_once = (queue.workers if queue is not None else None) or 1
-        untimed = max(min(at_once, len(draws) - runs), 1)
-        draws = draws[: untimed + runs]
-        batches = np.split(draws, range(untimed, len(draws), at_once))
-        found = [each for batch in batches for each in _evaluate(posterior, batch, queue)]
-        workers = int(workers or (queue.workers if queue is not None else None) or 1)
-    finally:
-        if queue is not None:
-            queue.close()
-    values, seconds = np.array(found).T
-    seconds, finite = seconds[untimed:], np.isfinite(values)
+    values, seconds = np.empty(runs + 1), np.empty(runs + 1)
+    for i, point in enumerate(draws[: runs + 1]):
+        start = time.perf_counter()
+        values[i], seconds[i] = float(np.ravel(posterior(point))[0]), time.perf_counter() - start
+    finite = np.isfinite(values)
     if finite.sum() < 2:
         raise ValueError(
             f"{len(finite) - finite.sum()} of {len(finite)} draws of the prior have a log-probability of -inf, and the "
             "estimate needs two finite ones: check the model at these points, or time more with runs="
         )
-    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws])
-    beta = first_beta(values[finite] - log_prior[finite], bool(chosen.recycle))
-    evaluations = Expected(*(nwalkers + n for n in expected_evaluations(chosen, nwalkers, ndim, beta)))
+    log_prior = np.array([float(np.ravel(posterior.log_prior(x))[0]) for x in draws[: runs + 1]])
+    workers = int(workers or _workers_of(posterior))
+    spread = float(np.std(values[finite] - log_prior[finite], ddof=1))
+    beta = min(1.0, (3.5 if chosen.recycle else 1.3) / max(spread, 1e-9))
     return CostEstimate(
         f"{sampler.__name__}, {nwalkers} walkers, {ndim} parameters",
         workers,
-        seconds,
+        seconds[1:],
         len(values),
         int((~finite).sum()),
         0 if before is None else max(len(values) - (report()["simulations"] - before), 0),
-        evaluations,
-        Expected(*(float(np.mean(seconds)) / workers * n for n in evaluations)),
+        *expected_evaluations(chosen, nwalkers, ndim, beta),
     )
 
 
-def _evaluate(posterior: Callable, points: np.ndarray, queue: Any) -> list[tuple[float, float]]:
-    """Log-probability and duration [s] of each point (n, ndim), evaluated at the same time with a queue."""
-    start = time.perf_counter()
-    if queue is None:  # one point
-        return [(float(np.ravel(posterior(points[0]))[0]), time.perf_counter() - start)]
-    tickets, found = queue.submit(points), {}
-    while len(found) < len(tickets):
-        found |= {ticket: (float(value), time.perf_counter() - start) for ticket, value in queue.collect()}
-    return [found[ticket] for ticket in tickets]
+def _workers_of(posterior: Any) -> int:
+    """Number of points that the pool of a posterior evaluates at once."""
+    if not callable(getattr(posterior, "evaluation_queue", None)):
+        return 1
+    queue = posterior.evaluation_queue()
+    workers = queue.workers or 1
+    queue.close()
+    return workers
 
 
-def first_beta(log_likelihoods: Sequence[float], recycling: bool) -> float:
-    """Expected beta of the first stage, from finite log-likelihoods of a few draws of the prior."""
-    spread = float(np.std(log_likelihoods, ddof=1))
-    return min(1.0, (3.5 if recycling else 1.3) / spread) if spread > 0.0 else 1.0
-
-
-def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: float) -> Expected:
-    """Number of evaluations that the annealing needs after a stage with exponent `beta` > 0."""
+def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: float) -> tuple[float, float]:
+    """Fewest and most evaluations of a run whose first stage has the exponent `beta` > 0."""
     if settings.recycle:
         left = -np.log(beta) / min(1.7, 2.9 * ndim**-0.55)
         per_stage = DRAWS_PER_STAGE * max(TARGET_SHARE * nwalkers, POINTS_PER_DIMENSION * (ndim + 1.0))
         stages = left * (per_stage + search_draws(nwalkers) / max(left, 1.0))
-        low, likely, high = ((1.0 + end) * nwalkers for end in AT_THE_END)
-        return Expected(0.65 * stages + low, stages + likely, 1.4 * stages + high)
+        low, high = ((2.0 + end) * nwalkers for end in AT_THE_END)
+        return 0.65 * stages + low, 1.4 * stages + high
     kept = min(max(settings.target(float(nwalkers), nwalkers) / nwalkers, 0.01), 0.99)
     per_dimension = kept ** (2.0 / ndim)  # per_dimension g^2 - 2 g + 1 = 0
     growth = np.log((1.0 + np.sqrt(1.0 - per_dimension)) / per_dimension)
@@ -228,4 +200,4 @@ def expected_evaluations(settings: Settings, nwalkers: int, ndim: int, beta: flo
     if settings.chains == "leaders":
         sweeps = settings.burn_in + 1.0
     stages = np.ceil(-np.log(beta) / max(growth, 0.01)) * nwalkers * sweeps
-    return Expected(0.65 * stages + nwalkers, stages + nwalkers, 1.8 * stages + 2.0 * nwalkers)
+    return 0.65 * stages + 2.0 * nwalkers, 1.8 * stages + 3.0 * nwalkers

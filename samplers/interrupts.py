@@ -58,10 +58,8 @@ def raise_if_interrupted(before: int) -> None:
 def interrupts_end_the_run() -> Iterator[None]:
     """Context in which Ctrl-C raises KeyboardInterrupt in the main thread, whichever handler of SIGINT is set.
 
-    A library may have set a handler that raises something else: `dask_jobqueue` calls ``sys.exit``. In this context
-    such a handler is still called, but KeyboardInterrupt is raised in place of its exception. A handler that returns
-    has dealt with Ctrl-C, as one that notes it and lets the present step end: the run goes on. SIGINT that is ignored
-    stays ignored. The handler that was set before is put back at the end.
+    A handler that raises something else, as `dask_jobqueue` sets one, is still called. One that returns has dealt with
+    Ctrl-C: the run goes on. SIGINT that is ignored stays ignored. The handler is put back at the end.
     """
     handler = signal.getsignal(signal.SIGINT)
     is_ours = isinstance(handler, _RaisesKeyboardInterrupt)

@@ -37,11 +37,10 @@ STEPS_AT_ONCE = 200  # steps that are read at once for their checksum
 
 
 class Output:
-    """Data stored with the chain of an initialised backend.
+    """Data stored with the chain of an initialised backend: `result` and `verdict` (empty, None: nothing).
 
-    `result` and `verdict` are what is stored (empty, None: nothing). `first_step` steps were stored before the last
-    annealing. `provisional` says whether the last step is the estimate of a run that the limit of simulations ended,
-    and is replaced when the run continues.
+    `first_step` steps were stored before the last annealing. `provisional`: the last step is the estimate of a run that
+    the limit of simulations ended, and is replaced when the run continues.
     """
 
     def __init__(self, backend: Backend):

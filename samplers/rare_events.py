@@ -10,12 +10,10 @@ the likelihood of stage l, so that the same parts do the work as in tempering: p
 the evidence, which counts points with a common ancestor as dependent (`samplers.estimates.weights.EvidenceError`).
 Only the choice of the next stage differs: a quantile of g in place of an exponent.
 
-The parameters are standard normal by default, for priors mapped from standard normal coordinates. Moves are then the
-conditional sampling of Papaioannou et al. (2015), whose acceptance does not fall with the number of parameters, in
-chains of ten steps from each point that a level keeps. For another density, such as a posterior, the points make a
-random walk with the covariance of the initial draws until they are nearly uncorrelated with their start, as in
-`samplers.tmcmc`, which takes about six times as many simulations. No move is fitted to the points of a level: with a
-mixture fitted to a hundred points, a probability of 1e-5 came out five times too small.
+The parameters are standard normal; a prior is mapped. Moves are the conditional sampling of Papaioannou et al. (2015),
+whose acceptance does not fall with the number of parameters, in chains of ten steps from each point that a level keeps.
+No move is fitted to the points of a level: with a mixture fitted to a hundred points, a probability of 1e-5 came out
+five times too small.
 
 References
 ----------
@@ -25,14 +23,16 @@ I. Papaioannou, W. Betz, K. Zwirglmaier, D. Straub (2015), MCMC algorithms for s
 Engineering Mechanics 41, 89-103, doi:10.1016/j.probengmech.2015.06.006.
 """
 
+import math
 from collections.abc import Callable, Generator
 from typing import NamedTuple
 
 import numpy as np
+from emcee import State
+from emcee.moves import MHMove
 from scipy.special import ndtri
 
 from .estimates.weights import EvidenceError
-from .moves.population_moves import ConditionalMove, RandomWalkMove
 from .resampling import systematic
 from .settings import Settings, as_whole_number
 from .tempering.mutation import MoveSchedule, Mutated
@@ -43,7 +43,7 @@ __all__ = ["RareEvent", "subset_simulation"]
 
 FEWEST = 10  # points that a level keeps, and groups of points for the error
 LEAST_PROBABILITY = 1e-15
-BURN_IN = 4  # steps of a chain before its points count, and sweeps follow; for other densities than the normal
+FIRST_SCALE, TARGET_ACCEPTANCE = 0.6, 0.44  # of the moves; the target is that of Papaioannou et al. (2015)
 MOST_EQUAL = 0.75  # share of points of one value above which levels make no progress
 
 
@@ -95,52 +95,54 @@ class RareEvent(NamedTuple):
     __repr__ = __str__
 
 
+class ConditionalMove(MHMove):
+    """Steps u' = sqrt(1 - s^2) u + s e, e normal, which leave the standard normal distribution unchanged."""
+
+    def __init__(self):
+        super().__init__(self._draw)
+        self.scale = FIRST_SCALE
+
+    def _draw(self, coords, random):
+        proposed = math.sqrt(1.0 - self.scale**2) * coords + self.scale * random.standard_normal(coords.shape)
+        return proposed, 0.5 * np.sum(proposed**2 - coords**2, axis=1)
+
+    def tune(self, state: State, accepted: np.ndarray) -> None:
+        """Increase the scale s when the acceptance exceeds the target, and decrease it otherwise."""
+        self.scale = min(self.scale * math.exp(float(np.mean(accepted)) - TARGET_ACCEPTANCE), 1.0)
+
+
 class _Level:
-    """The density of the parameters, restricted to values of the quantity of at least `bound`, as moves evaluate it."""
+    """The standard normal density, restricted to values of the quantity of at least `bound`, as moves evaluate it."""
 
     map = staticmethod(map)
 
-    def __init__(self, function: Callable, log_density: Callable, failures_exceed: bool):
-        self._function, self._log_density, self._failures_exceed = function, log_density, failures_exceed
-        self.bound = -np.inf
+    def __init__(self, function: Callable, failures_exceed: bool):
+        self._function, self._failures_exceed, self.bound = function, failures_exceed, -np.inf
         self.evaluations = self.failed = 0
 
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points: the log-density as log_prior and log_prob (-inf below the bound), values as blobs."""
         records = np.zeros(len(coords), [("log_prob", float), ("log_prior", float), ("blobs", float)])
-        log_density = _checked(self._log_density(coords.copy()), len(coords), "log_prob_fn")
-        records["log_prior"] = np.where(np.isnan(log_density), -np.inf, log_density)
-        inside = records["log_prior"] > -np.inf
-        records["blobs"] = -np.inf
-        if inside.any():
-            values = _checked(self._function(coords[inside]), int(inside.sum()), "function")
-            failed = np.isnan(values)
-            self.evaluations, self.failed = self.evaluations + len(values), self.failed + int(failed.sum())
-            records["blobs"][inside] = np.where(failed, np.inf if self._failures_exceed else -np.inf, values)
-        above = inside & (records["blobs"] >= self.bound) & (records["blobs"] > -np.inf)
+        records["log_prior"] = -0.5 * np.sum(coords**2, axis=1)  # up to a constant
+        values = np.asarray(self._function(coords.copy()), dtype=float)
+        if values.shape != (len(coords),):
+            raise ValueError(
+                f"function must return one number per point, shape ({len(coords)},) for {len(coords)} points; got "
+                f"{values.shape}"
+            )
+        failed = np.isnan(values)
+        self.evaluations, self.failed = self.evaluations + len(values), self.failed + int(failed.sum())
+        records["blobs"] = np.where(failed, np.inf if self._failures_exceed else -np.inf, values)
+        above = (records["blobs"] >= self.bound) & (records["blobs"] > -np.inf)
         records["log_prob"] = np.where(above, records["log_prior"], -np.inf)
         return records
-
-
-def _checked(values: object, n: int, name: str) -> np.ndarray:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (n,):
-        raise ValueError(f"{name} must return one number per point, shape ({n},) for {n} points; got {found.shape}")
-    return found
-
-
-def _standard_normal(coords: np.ndarray) -> np.ndarray:
-    """Log-density, up to a constant."""
-    return -0.5 * np.sum(coords**2, axis=1)
 
 
 def subset_simulation(
     function: Callable[[np.ndarray], np.ndarray],
     threshold: float,
-    ndim: int | None = None,
+    ndim: int,
     *,
-    log_prob_fn: Callable[[np.ndarray], np.ndarray] | None = None,
-    initial: np.ndarray | None = None,
     n: int = 1000,
     level_probability: float = 0.1,
     failures_exceed: bool = False,
@@ -156,14 +158,8 @@ def subset_simulation(
         collapse.
     threshold : float
         The threshold, in the unit of the quantity.
-    ndim : int, optional
+    ndim : int
         Number of standard normal parameters: map them in the function, ``prior.from_normal(points)``.
-    log_prob_fn : callable, optional
-        Another density of the parameters, such as a posterior: takes points (k, ndim), and returns the logarithms (k,)
-        of the density, up to a constant. It is called at every point, before the function.
-    initial : (n, ndim) array_like, optional
-        Independent draws of this density, such as ``sampler.get_chain(flat=True)`` after thinning. If they are
-        correlated, the stated error is too small.
     n : int
         Points per level. The coefficient of variation falls with its square root.
     level_probability : float
@@ -185,9 +181,9 @@ def subset_simulation(
 
     Notes
     -----
-    A level makes n simulations (about 6 n for another density), a probability of 10^-k takes k levels. The estimate has
-    a bias of order 1/n, because thresholds are quantiles of the points (study `rare_events` of docs/results.rst has its
-    size). A region that no point of the first levels is near is missed, without a sign in the stated error.
+    A level makes n simulations, a probability of 10^-k takes k levels. The estimate has a bias of order 1/n, because
+    thresholds are quantiles of the points (study `rare_events` of docs/results.rst has its size). A region that no
+    point of the first levels is near is missed, without a sign in the stated error.
 
     Examples
     --------
@@ -205,23 +201,8 @@ def subset_simulation(
         )
     if not np.isfinite(threshold):
         raise ValueError(f"threshold must be a finite number; got {threshold!r}")
-    if (log_prob_fn is None) != (initial is None) or (ndim is None) != (log_prob_fn is not None):
-        raise ValueError(
-            "give ndim for standard normal parameters, or log_prob_fn with initial draws of it for another density; "
-            f"got ndim={ndim!r}, log_prob_fn={log_prob_fn!r} and initial={'None' if initial is None else 'draws'}"
-        )
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
-    burn_in = 0 if initial is None else BURN_IN
-    if initial is None:
-        level, moves = _Level(function, _standard_normal, failures_exceed), ConditionalMove()
-        coords = random.standard_normal((n, as_whole_number("ndim", ndim)))
-    else:
-        coords = np.array(initial, dtype=float)
-        if coords.ndim != 2 or len(coords) != n or not np.isfinite(coords).all():
-            raise ValueError(f"initial must be n={n} finite points, shape ({n}, ndim); got shape {coords.shape}")
-        level = _Level(function, log_prob_fn, failures_exceed)
-        moves = RandomWalkMove(adapt=True, target=None)
-        moves.calibrate(coords, np.full(n, 1.0 / n))
+    level, coords = _Level(function, failures_exceed), random.standard_normal((n, as_whole_number("ndim", ndim)))
     records = level.evaluate(coords)
     known = records["log_prob"] > -np.inf
     n, kept = int(known.sum()), int(np.ceil(level_probability * known.sum()))
@@ -232,7 +213,7 @@ def subset_simulation(
         )
     population = Population(1.0, coords[known], records[known], float(n))
     # chains of Au & Beck (2001): from each of the points that a level keeps, one step per copy
-    schedule, settings = MoveSchedule([moves], np.ones(1)), Settings(chains="leaders", burn_in=burn_in)
+    schedule, settings = MoveSchedule([ConditionalMove()], np.ones(1)), Settings(chains="leaders")
     error = EvidenceError(n, FEWEST / n)
     levels, shares, acceptance = [], [], []
     while True:

@@ -99,9 +99,8 @@ class RunStart(NamedTuple):
 class Record:
     """Evaluations and remembered arrays of a run, in a file that is written and locked from `begin` or `open` on.
 
-    `slow` are indices of the parameters that a simulation depends on, all by default. `start` belongs to the last
-    annealing, None before it. `count` is the number of evaluated points; `failed` are points that failed, with reasons,
-    in the order of evaluation. `is_complete`: the run reached beta = 1 before, so nothing new may be asked for.
+    `slow` are indices of the parameters that a simulation depends on. `start` belongs to the last annealing; `failed`
+    are points with reasons, in order. `is_complete`: the run reached beta = 1 before, so nothing new may be asked for.
     """
 
     def __init__(self, path: Path | None = None, slow: Sequence[int] | None = None):

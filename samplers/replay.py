@@ -19,6 +19,7 @@ from emcee import State
 from emcee.backends import Backend, HDFBackend
 from emcee.moves import Move
 
+from .blobs import leaves
 from .moves.population_moves import describe
 from .output import DAMAGED, make_group, run_of_file
 from .output_file import open_file, patient_open
@@ -148,14 +149,12 @@ def changes(
     return []
 
 
-def _same_blobs(before: np.ndarray, after: np.ndarray) -> bool:
+def _same_blobs(before: Any, after: Any) -> bool:
     """Whether the blobs of a point agree: numbers up to rounding, and everything else exactly."""
-    before, after = np.asarray(before), np.asarray(after)
-    if before.dtype.names is not None:
-        same_names = before.dtype.names == after.dtype.names
-        return same_names and all(_same_blobs(before[name], after[name]) for name in before.dtype.names)
-    if before.shape != after.shape:
-        return False
-    if before.dtype.kind in "fc" and after.dtype.kind in "fc":
-        return bool(np.allclose(before, after, **CLOSE, equal_nan=True))
-    return bool(np.all(before == after))
+    ours, theirs = list(leaves([before])), list(leaves([after]))
+
+    def same(one: Any, other: Any) -> bool:
+        numbers = isinstance(one, float | complex) and isinstance(other, float | complex)
+        return bool(np.isclose(one, other, **CLOSE, equal_nan=True)) if numbers else one == other
+
+    return len(ours) == len(theirs) and all(map(same, ours, theirs))

@@ -1,9 +1,8 @@
 """Resampling: from weighted points to equally weighted points.
 
-All schemes are unbiased: point i is copied n w_i times on average. They differ in the noise that they add. Multinomial
-resampling draws independently. Residual resampling keeps the integer part of n w_i and draws the rest. Stratified and
-systematic resampling divide the cumulative weights into n equal parts and place one uniform number in each part;
-systematic resampling uses the same number in all parts and adds the least noise.
+Both schemes are unbiased: point i is copied n w_i times on average. Multinomial resampling draws independently, as the
+papers do. Systematic resampling divides the cumulative weights into n equal parts, places the same uniform number in
+each, and adds the least noise.
 
 Reference: Douc, Cappé & Moulines (2005), Comparison of resampling schemes for particle filtering, ISPA,
 doi:10.1109/ISPA.2005.195385.
@@ -13,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["RESAMPLING", "locate", "multinomial", "residual", "stratified", "systematic"]
+__all__ = ["RESAMPLING", "locate", "multinomial", "systematic"]
 
 Random = np.random.RandomState | np.random.Generator
 
@@ -39,28 +38,7 @@ def multinomial(weights: np.ndarray, random: Random) -> np.ndarray:
     return locate(weights, np.sort(random.uniform(size=len(weights))))
 
 
-def stratified(weights: np.ndarray, random: Random) -> np.ndarray:
-    """One independent uniform number in each of n equal parts of the cumulative weights."""
-    n = len(weights)
-    return locate(weights, (np.arange(n) + random.uniform(size=n)) / n)
-
-
-def residual(weights: np.ndarray, random: Random) -> np.ndarray:
-    """floor(n w_i) copies of each point; the rest is drawn independently from the remaining weights."""
-    n = len(weights)
-    expected = n * weights
-    copies = np.floor(expected).astype(int)
-    remainder = expected - copies
-    missing = n - copies.sum()
-    if missing > 0:
-        drawn = locate(remainder, random.uniform(size=missing))
-        copies += np.bincount(drawn, minlength=n)
-    return np.repeat(np.arange(n), copies)
-
-
 RESAMPLING: dict[str, Callable[[np.ndarray, Random], np.ndarray]] = {
     "multinomial": multinomial,
-    "residual": residual,
-    "stratified": stratified,
     "systematic": systematic,
 }

@@ -180,12 +180,6 @@ class RunResults:
         errors = standard_error_of_mean(values, self.founders)
         return errors if len(shares) == 1 else errors * student_factor(1.0 / np.sum(shares**2) - 1.0)
 
-    def _repr_html_(self) -> str:
-        """In notebooks: summary of the run, or how to start it."""
-        from .reporting.summary import describe_sampler
-
-        return describe_sampler(self)
-
     @property
     def guide(self) -> Guide | None:
         """A copy of the given guide that learns from this run; None before the run or without a guide."""
@@ -241,8 +235,8 @@ class RunResults:
     def verdict(self) -> Verdict:
         """Verdict on the result, with reasons; ``print(sampler.verdict)`` gives sentences.
 
-        Its attributes `modes`, `evidences`, `worst_effective_sample_size` and `unknown` are computed on first use, from
-        the present chain.
+        Its attributes `modes`, `worst_effective_sample_size` and `unknown` are computed on first use, from the present
+        chain.
         """
         if self._verdict is None:
             raise ValueError("there is no verdict before a run: call run_mcmc first")

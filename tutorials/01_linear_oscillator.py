@@ -47,7 +47,7 @@ from fe_likelihoods import (
     propagate,
     to_si,
 )
-from samplers import SMCSampler, TMCMCSampler, comparison_table, plot_corner, to_arviz
+from samplers import SMCSampler, TMCMCSampler, plot_corner, to_arviz
 
 FAST = bool(os.environ.get("FAST"))  # a shorter chain of emcee, fewer walkers of TMCMC, no progress bars
 parser = argparse.ArgumentParser(description="Ten-minute introduction; writes figures and summary.json to a folder.")
@@ -160,7 +160,10 @@ for Sampler in (emcee.EnsembleSampler, SMCSampler, TMCMCSampler):
     sampler.run_mcmc(ball if is_emcee else None, SWEEPS[Sampler], progress=not FAST)
     seconds[name], simulations[name] = time.perf_counter() - start, posterior.report()["simulations"] - before
     runs[name], samples[name] = sampler, sampler.get_chain(flat=True, discard=discard if is_emcee else 0)
-print(comparison_table(runs, {"emcee": seconds["emcee"]}, discard=discard))
+for name, sampler in runs.items():
+    print(f"{name}: {simulations[name]} simulations, {seconds[name]:.3g} s")
+    if name != "emcee":
+        print(f"  log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2g}")
 print(arviz.summary(to_arviz(runs["SMC"]), kind="stats"))  # r_hat needs two runs: to_arviz([run_1, run_2])
 
 # %%

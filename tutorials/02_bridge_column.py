@@ -361,13 +361,12 @@ if args.classes:
     print(comparison.table())
     (args.out / "classes.txt").write_text(comparison.table() + "\n")
     predictions_of = {
-        name: propagate(posteriors[name], run.get_chain(flat=True)[-20:], quantiles=(), progress=False)
-        for name, run in runs.items()
+        name: propagate(posteriors[name], run.get_chain(flat=True)[-20:], progress=False) for name, run in runs.items()
     }
     averaged = average_predictions(predictions_of, comparison.probabilities)
     predictions_of["averaged"] = replace(predictions_of["as updated"], mean=averaged.mean)
     for name, predicted in predictions_of.items():
-        print(error_line(name, predicted.rrmse(measured)))
+        print(error_line(name, predicted.score(measured).rrmse))
     classes = {name: [float(run.log_evidence), float(run.log_evidence_error)] for name, run in runs.items()}
 
 # %%

@@ -39,7 +39,6 @@ import numpy as np
 
 from fe_likelihoods import (
     exceedance,
-    fit_measures,
     fragility,
     peak,
     plot_bands,
@@ -176,8 +175,11 @@ plot_run(sampler).savefig(args.out / "run.png", dpi=150)
 
 BLUE, ORANGE, GREY = "#1f5a8c", "#d9822b", "#8a8f98"
 rng = np.random.default_rng(args.seed)
-fit = fit_measures(posterior, samples)
-nominal_fit = fit_measures(posterior, np.ones((1, n_structural)))[0]
+power = np.nansum(np.square(measured.values), axis=1)
+fit, nominal_fit = (
+    posterior.likelihood.misfit(each) / power for each in (samples[:, :n_structural], np.ones((1, n_structural)))
+)
+nominal_fit = nominal_fit[0]
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.6), layout="constrained")
 few = samples[rng.choice(len(samples), min(500, len(samples)), replace=False)]
@@ -253,7 +255,7 @@ four = four if args.data == "twin" else ("mean_Ub", "mean_shear", "mean_acc_p", 
 figure = plot_bands(response, measured, four)
 figure.suptitle("Figure 7: predicted response and synthetic data (assumed nominal values)", fontsize="small")
 figure.savefig(args.out / "fig7_predictions.png", dpi=150)
-errors, scores = response.rrmse(measured), prediction.score(measured)
+errors, scores = response.score(measured).rrmse, prediction.score(measured)
 covered = scores.coverage
 print(scores)
 

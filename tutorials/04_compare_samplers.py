@@ -48,7 +48,7 @@ import numpy as np
 
 from fe_likelihoods import Posterior, StoredPosterior, check_result, problems
 from fe_likelihoods.emulation.modes import find_modes
-from samplers import SamplingWarning, SMCSampler, TMCMCSampler, comparison_table, plot_corner, presets
+from samplers import SamplingWarning, SMCSampler, TMCMCSampler, plot_corner, presets
 
 FAST = bool(os.environ.get("FAST"))
 parser = argparse.ArgumentParser(description="Compare SMC, TMCMC and emcee; write tables and figures to a folder.")
@@ -193,6 +193,14 @@ def draws(label: str, sampler) -> np.ndarray:
     return sampler.get_chain(flat=True, discard=args.steps // 3 if label.startswith("emcee") else 0)
 
 
+def effective_size(label: str, sampler) -> float:
+    """Effective sample size of the worst parameter, from the errors of the means or the autocorrelation of emcee."""
+    x = draws(label, sampler)
+    if label.startswith("emcee"):
+        return len(x) / np.max(sampler.get_autocorr_time(discard=args.steps // 3, tol=0))
+    return float(np.min((x.std(axis=0) / sampler.mean_error()) ** 2))
+
+
 def size_by_error(label: str, runs: dict[str, Run]) -> float:
     """Effective sample size by the errors of the means: as many independent draws have such errors.
 
@@ -262,8 +270,7 @@ def plot_failures(name: str, problem: Problem, posterior: Posterior, runs: dict[
 # For every problem: tables of the samplers and of their posteriors, the warnings and verdicts, a corner plot of the
 # samplers whose result is reliable, and one panel per sampler that shows where samplers fail.
 #
-# Evaluations in the first table contain changes of the noise levels, which need no simulation, and do not contain the
-# search of the guide. Simulations in the second table are what a slow model costs; the search of the guide is included.
+# Simulations are what a slow model costs; the search of the guide is included.
 # emcee has no verdict; the warnings of its runs are what `check_result` finds against their chains. Its effective
 # sample size does not count what is missed: the runs from the mode and from the prior can have the same effective
 # sample size, although the second one is far from the posterior. The last column counts it: the effective sample size
@@ -275,13 +282,13 @@ for name in args.problem or PROBLEMS:
     posterior, runs = sample(problem)
     print(f"\n=== {name}: {posterior.likelihood.measurements.description}")
     samplers = {label: run.sampler for label, run in runs.items()}
-    emcee_seconds = {label: run.seconds for label, run in runs.items() if label.startswith("emcee")}
-    cost = comparison_table(samplers, emcee_seconds, discard=args.steps // 3)
-    print(cost)
-    print(f"\n{'':<20}{'simulations':>12}{'per effective sample':>22}{'size by errors':>16}")
-    for (label, run), size in zip(runs.items(), cost.effective_sample_size, strict=True):
-        by_error = size_by_error(label, runs)
-        print(f"{label:<20}{run.needed:12.0f}{run.needed / max(size, 1.0):22.1f}{by_error:16.2g}")
+    sizes = {label: effective_size(label, sampler) for label, sampler in samplers.items()}
+    names = f"{'simulations':>12}{'per effective sample':>22}{'size by errors':>16}"
+    print(f"{'':<20}{'seconds':>8}{'log-evidence':>14}{names}")
+    for label, run in runs.items():
+        evidence = f"{getattr(run.sampler, 'log_evidence', np.nan):14.2f}{run.needed:12.0f}"
+        each, by_error = run.needed / max(sizes[label], 1.0), size_by_error(label, runs)
+        print(f"{label:<20}{run.seconds:8.3g}{evidence}{each:22.1f}{by_error:16.2g}")
     print()
     lines = [f"{'':<20}" + "".join(f"{n[:11]:>12}" for n in posterior.parameter_names)]
     lines.append(f"{'truth':<20}" + "".join(f"{value:12.4g}" for value in problem.truth))

@@ -84,7 +84,6 @@ def models(out: Path) -> dict:
             output="response.txt",
             columns=(1, 2),
             time_limit=20.0,
-            keep_failures=out / "failures",
             **common,
         ),
     }

@@ -292,18 +292,16 @@ def prediction_rows(
             start = bridge.stop if name == "rest of the record" else 0.0
             end = nearest_end(bridge, records, channel.name).trim(start).acceleration[: measured.n_steps]
             values = measured.values[k]
-            strong = real_data.strong_motion(values)
             row = {"noise": noise, "case": name, "channel": channel.name}
             row["rrmse_of_the_end"] = float(rrmse(end, values))
             row["delay"] = delay(values, response.mean[k], measured.dt)
-            row["rrmse"] = float(response.rrmse(measured)[k])
-            row["coverage"] = float(total.coverage(measured)[k])
-            row["coverage_strong"] = float(total.coverage(measured, part=strong)[k])
-            scores = total.score(measured)
+            scores, alone = total.score(measured), response.score(measured)
+            row["rrmse"] = float(alone.rrmse[k])
+            row["coverage"], row["coverage_strong"] = float(scores.coverage[k]), float(scores.coverage_strong[k])
             row["interval_score"], row["crps"], row["width"] = (
                 float(getattr(scores, what)[k] / scores.rms[k]) for what in ("interval_score", "crps", "width")
             )
-            row["coverage_response"] = float(response.coverage(measured)[k])
+            row["coverage_response"] = float(alone.coverage[k])
             rows.append(row)
     return rows
 

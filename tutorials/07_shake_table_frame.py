@@ -251,7 +251,7 @@ for noise, run in runs.items():
         total = propagate(run.posterior, samples, noise=True, **settings)
         response = propagate(run.posterior, samples, **settings)
         shown[noise, shaking] = total, measured
-        scores = total.score(measured)
+        scores, alone = total.score(measured), response.score(measured)
         for k, name in enumerate(FLOORS):
             calibration = shaking == "shaking 1" and name in USED
             rows.append(
@@ -260,12 +260,12 @@ for noise, run in runs.items():
                     "shaking": shaking,
                     "channel": name,
                     "kind": "calibration" if calibration else "prediction",
-                    "rrmse": float(response.rrmse(measured)[k]),
+                    "rrmse": float(alone.rrmse[k]),
                     "coverage": float(scores.coverage[k]),
                     "interval_score": float(scores.interval_score[k] / scores.rms[k]),
                     "crps": float(scores.crps[k] / scores.rms[k]),
                     "width": float(scores.width[k] / scores.rms[k]),
-                    "coverage_response": float(response.coverage(measured)[k]),
+                    "coverage_response": float(alone.coverage[k]),
                 }
             )
 heads = f"{'RRMSE':>8}{'in 90 % band':>14}{'of the response alone':>24}{'score, CRPS, width [RMS]':>28}"

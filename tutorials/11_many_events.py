@@ -239,7 +239,7 @@ def population(tests: dict[str, StoredPosterior]) -> Hierarchy:
     """The population of some events."""
     names = next(iter(tests.values())).prior.names
     varying = {name: each for name, each in POPULATION.items() if name in names}
-    hierarchical = HierarchicalPosterior(tests, varying, max_samples=200)
+    hierarchical = HierarchicalPosterior(tests, varying)
     moves = {} if fast else {"min_moves": 10, "max_moves": 30}  # they cost no simulation
     sampler = SMCSampler(
         max(WALKERS // 2, 60), hierarchical.ndim, hierarchical, vectorize=True, seed=args.seed, **moves
@@ -344,7 +344,7 @@ curves = {
     "one event, as usual": fragility(
         posteriors[strongest], chain[:: max(1, len(chain) // DRAWS)], records, noise=False, **options
     ),
-    "population of events": fragility(posteriors[strongest], hierarchy, records, ratios=ratios, n=DRAWS, **options),
+    "population of events": fragility(posteriors[strongest], hierarchy, records, ratios=ratios, **options),
 }
 fig, axes = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
 summary["fragility"] = {}

@@ -247,9 +247,8 @@ def prediction_row(
     row, numbers = {"RRMSE nominal": f"{100 * before:.1f} %"}, {"nominal": before}
     for name, (alone, noisy) in predictions.items():
         data = Measurements(alone.channels, alone.dt, measured[None])
-        error = float(alone.rrmse(data, part)[0])
-        inside = [float(prediction.coverage(data, part=part)[0]) for prediction in (alone, noisy)]
-        scores = noisy.score(data, part=part)
+        of_response, scores = (each.score(data, part=part) for each in (alone, noisy))
+        error, inside = float(of_response.rrmse[0]), [float(each.coverage[0]) for each in (of_response, scores)]
         relative = {
             what: float(getattr(scores, what)[0] / scores.rms[0]) for what in ("interval_score", "crps", "width")
         }

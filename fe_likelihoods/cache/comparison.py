@@ -11,9 +11,9 @@ import numpy as np
 from ..noise.statistics import Statistic, needs_response
 from ..signals.comparison import Comparison
 from ..simulation.faults import TransientReason
+from ..simulation.files import Opened, observing
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, misfit_of_responses, most_responses, simulate_batch
-from ..simulation.opened import Opened, observing
 from ..simulation.user_code import is_of_user
 
 __all__ = [

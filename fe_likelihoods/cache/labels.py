@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..simulation.files import Opened
 from ..simulation.label import ModelLabel, cpu_name, value_digest
 from ..simulation.local_pool import LocalPool
 from ..simulation.model import Model
-from ..simulation.opened import Opened
 from .file import CacheFile
 from .rows import source_number
 

@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model, SimulationBatch, misfit_of_responses
-from ..simulation.opened import Opened
 from .comparison import (
     DEFAULT_TOLERANCE,
     Simulated,

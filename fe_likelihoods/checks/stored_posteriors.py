@@ -7,7 +7,7 @@ import numpy as np
 
 from .finding import CARE, Finding
 
-__all__ = ["check_chain_length", "check_equal_ratios", "check_impossible_draws", "check_new_test", "check_reweighting"]
+__all__ = ["check_equal_ratios", "check_impossible_draws", "check_new_test", "check_reweighting"]
 
 # Limits with study `hierarchy_warnings` of docs/results.rst, where the exact result is known.
 LARGEST_SHAPE = 0.8  # Pareto shape; up to here, right results have it as well
@@ -53,15 +53,6 @@ def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters
         )
         found.append(Finding("Too few samples of a test", CARE, text, "Give more samples.", {"error": error}))
     return found
-
-
-def check_chain_length(times: float, needed: float) -> list[Finding]:
-    """Whether a population was sampled for as many autocorrelation times as are needed."""
-    if times >= needed:
-        return []
-    text = f"A population was sampled for {times:.1f} autocorrelation times, {needed:.0f} are needed."
-    action = "Give sample= with another sampler, or a Hierarchy with more different hyper-samples."
-    return [Finding("The chain is short", CARE, text, action, {"times": times})]
 
 
 def check_new_test(outside: Mapping[str, float], share: float) -> list[Finding]:

@@ -12,7 +12,6 @@ from .steps import NOTHING, UNREAD
 __all__ = [
     "check_bandwidth",
     "check_coverage",
-    "check_emulated",
     "check_failed_samples",
     "check_final_values",
     "check_interval_samples",
@@ -28,8 +27,7 @@ PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
 NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
-# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands; and of the
-# variance that an emulator leaves, which then saves less than half of the simulations
+# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands
 HALF = 0.5
 FAR = 10.0  # factor beyond all values: no reader asks for a probability so close to 0 or 1
 
@@ -138,32 +136,6 @@ def check_coverage(shares: Mapping[str, float], level: float) -> list[Finding]:
         "the response; and look for what the model lacks."
     )
     return [Finding("The measurements are outside of the band", CARE, text, action, missed)]
-
-
-def check_emulated(simulations: int, equal: bool, unexplained: float, unknown: int) -> list[Finding]:
-    """What few simulations cannot show: equal numbers, and variances that are unknown or unexplained."""
-    found = []
-    if equal:
-        text = (
-            f"All {simulations} simulated values of a number are equal, so nothing is known of its scatter: a rare "
-            f"event with a probability below about {3.0 / simulations:.0%} may not be among them."
-        )
-        found.append(Finding("No scatter was seen", CARE, text, "Use more simulations."))
-    if unknown:
-        text = (
-            f"The signed sample does not determine the standard deviation of {unknown} numbers, whose variance by it "
-            "is negative."
-        )
-        action = "Use more simulations, or propagate with the chain."
-        found.append(Finding("A standard deviation is not determined", CARE, text, action))
-    if unexplained > HALF:
-        text = (
-            f"The emulator leaves {unexplained:.0%} of the variance unexplained, so these simulations are worth hardly "
-            "more than as many draws."
-        )
-        action = "Use more simulations, or propagate with the chain."
-        found.append(Finding("The emulator is rough", CARE, text, action, {"unexplained": unexplained}))
-    return found
 
 
 def check_interval_samples(n_samples: int, needed: int, level: float) -> list[Finding]:

@@ -1,12 +1,12 @@
 r"""Damage as a quantity of the posterior: presence, location and extent.
 
 The presence of a limit state is the probability that its measure exceeds its limit, estimated by the fraction of the
-samples (`fe_likelihoods.prediction.reliability`). For a strain limit, the location is the same probability at each
-section and side of a column. The extent is given by quantiles of the measures.
+samples (`fe_likelihoods.prediction.reliability`). A limit may have a distribution: the capacity of such structures.
+For a strain limit, the location is the same probability at each section and side of a column. The extent is given by
+quantiles of the measures.
 
 The samples contain the uncertainty of the parameters only. The model error, which is often larger, enters as ratios of
-measured to fitted values (``ratios=``). Without them a probability of 0 or 1 means that all parameter samples agree,
-and a warning says so.
+measured to fitted values (``ratios=``).
 
 References
 ----------
@@ -27,30 +27,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks.finding import Finding, labelled
+from ..checks.finding import labelled
 from ..events.ratios import EventRatios
-from ..events.spread import EventSpread
 from ..prediction.prediction import Prediction
-from ..prediction.propagation import check_effective_sample_size
-from ..prediction.reliability import (
-    Exceedance,
-    check_level,
-    exceedance_probability,
-    warn_of_missing_error,
-    with_collapses,
-)
+from ..prediction.reliability import Exceedance, check_level, exceeded, warn_of_missing_error
+from ..priors.distributions import Distribution
 from ..text_tables import number
 from ..units import DIMENSIONS, find_unit, from_si
-from .measures import SIDES, STRAIN_MEASURES, DamageMeasures
+from .measures import DamageMeasures
 
 __all__ = ["Damage", "LimitState", "damage", "limit_states"]
 
-_UNITS = {"dissipated energy": "kJ", "period": "s"}
+_UNITS = {"dissipated energy": "kJ"}
 """Units in which measures are printed; the others are numbers."""
-
-
-_DECREASING = ("stiffness ratio",)
-"""Measures that damage decreases: their limit states are reached below the limit."""
 
 
 class LimitState(NamedTuple):
@@ -59,12 +48,12 @@ class LimitState(NamedTuple):
     Attributes
     ----------
     name : str
-        Name of the state that is reached when the measure exceeds the limit. For "stiffness ratio", which damage
-        decreases, it is reached when the measure is below the limit.
+        Name of the state that is reached when the measure exceeds the limit.
     measure : str
         Name of the measure, such as "bar tension" or "residual drift".
-    limit : float or ndarray, shape (n_samples,)
-        Limit [SI], or one limit for each sample of the prediction, such as fy/Es.
+    limit : float, Distribution, or ndarray, shape (n_samples,)
+        Limit [SI]; the distribution of limits of such structures; or one limit for each sample of the prediction, such
+        as fy/Es.
     source : str
         Where the limit comes from.
 
@@ -72,20 +61,21 @@ class LimitState(NamedTuple):
     --------
     >>> from fe_likelihoods.column_damage.damage import LimitState
     >>> wide = LimitState("wide cracks", "bar tension", 0.015, source="own tests")
-    >>> wide._replace(limit=0.02).limit
-    0.02
+    >>> print(wide._replace(limit=LogNormal(0.015, 0.3)))
+    wide cracks: bar tension beyond LogNormal(median=0.015, log_sd=0.3) (own tests)
     """
 
     name: str
     measure: str
-    limit: ArrayLike
+    limit: ArrayLike | Distribution
     source: str = ""
 
     def __str__(self) -> str:
-        unit = _UNITS.get(self.measure, "1")
-        limits = from_si(np.ravel(self.limit), unit)
-        value = number(limits[0]) if len(limits) == 1 else f"{number(limits.min())} to {number(limits.max())}"
-        value += "" if unit == "1" else f" {unit}"
+        unit, value = _UNITS.get(self.measure, "1"), f"{self.limit}"
+        if not isinstance(self.limit, Distribution):
+            limits = from_si(np.ravel(self.limit), unit)
+            value = number(limits[0]) if len(limits) == 1 else f"{number(limits.min())} to {number(limits.max())}"
+            value += "" if unit == "1" else f" {unit}"
         return f"{self.name}: {self.measure} beyond {value}" + (f" ({self.source})" if self.source else "")
 
 
@@ -107,8 +97,6 @@ class Damage(NamedTuple):
 
     Attributes
     ----------
-    events : tuple of str
-        Names of the events.
     limits : tuple of LimitState
         The limit states.
     presence : dict of str to Exceedance
@@ -118,60 +106,35 @@ class Damage(NamedTuple):
         For each limit state of strains, the probability at each place, arrays of shape (n_events, n_sections, 2).
     extent : dict of str to ndarray
         For each measure its quantiles [SI], shape (n_probabilities, n_events), or, for "bar tension" and "cover
-        compression", (n_probabilities, n_events, n_sections, 2).
-    probabilities : tuple of float
-        Probabilities of the quantiles.
-    heights : ndarray, shape (n_sections,)
-        Heights of the sections [m].
-    sides : tuple of str
-        The sides, "-" at negative and "+" at positive positions in the direction of loading.
-    height, diameter : float
-        Height and diameter of the column [m].
-    measures : DamageMeasures
-        How the measures are defined, with the constants of the Park-Ang index.
-    effective_sample_size : float
-        Effective number of independent samples.
-    n_samples : int
-        Number of samples that are counted.
-    n_failed, n_collapsed : int
-        Number of samples whose simulation failed, and of samples whose structure collapsed. Collapsed structures reach
-        every limit state everywhere; quantiles of measures are those of the others. Failures are not counted, so that
-        the probabilities are too low if simulations fail where the damage is large.
-    from_state : str
-        State of the structure at the beginning, "virgin" or "end".
+        compression", (n_probabilities, n_events, n_sections, 2). Collapsed structures are left out.
     uncertainty : str
         Which uncertainties the probabilities contain.
-    findings : tuple of Finding
-        What speaks against the prediction (`Prediction.findings`), such as residual drifts of a moving column.
+    prediction : Prediction
+        The prediction, with the probabilities of the quantiles; its `quantity` are the `DamageMeasures`.
     """
 
-    events: tuple[str, ...]
     limits: tuple[LimitState, ...]
     presence: dict[str, Exceedance]
     location: dict[str, Exceedance]
     extent: dict[str, np.ndarray]
-    probabilities: tuple[float, ...]
-    heights: np.ndarray
-    sides: tuple[str, ...]
-    height: float
-    diameter: float
-    measures: DamageMeasures
-    effective_sample_size: float
-    n_samples: int
-    n_failed: int
-    n_collapsed: int
-    from_state: str
     uncertainty: str
-    findings: tuple[Finding, ...] = ()
+    prediction: Prediction
+
+    @property
+    def events(self) -> tuple[str, ...]:
+        """Names of the events."""
+        return self.prediction.quantity.events
 
     @property
     def failures(self) -> str:
         """How many structures collapsed and how many samples failed, in a sentence; an empty text if none."""
-        total, said = self.n_samples + self.n_failed + self.n_collapsed, []
-        if self.n_collapsed:
-            said.append(f"{self.n_collapsed} of {total} structures collapsed and reach every limit state")
-        if self.n_failed:
-            said.append(f"{self.n_failed} of {total} samples failed and are not counted: probabilities may be too low")
+        collapsed, failed, said = len(self.prediction.collapsed), self.prediction.n_failed, []
+        total = self.prediction.n_samples + failed
+        if collapsed:
+            said.append(f"{collapsed} of {total} structures collapsed and reach every limit state")
+        if failed > collapsed:
+            said.append(f"{failed - collapsed} of {total} samples failed and are not counted: probabilities may be")
+            said[-1] += " too low"
         return "; ".join(said)
 
     def __str__(self) -> str:
@@ -189,8 +152,8 @@ class Damage(NamedTuple):
         rows = [("probability of", events)]
         for name, each in self.presence.items():
             rows.append((name, [_stated(*values) for values in zip(*each[1:5], strict=True)]))
-        if self.probabilities:
-            quantiles = "quantiles " + ", ".join(f"{p:g}" for p in self.probabilities)
+        if self.extent:
+            quantiles = "quantiles " + ", ".join(f"{p:g}" for p in self.prediction.probabilities)
             rows += [("", []), (quantiles, events)]
         for name, values in self.extent.items():
             unit = _UNITS.get(name, "1")
@@ -202,7 +165,7 @@ class Damage(NamedTuple):
         lines = [(f"{name:<{first}}" + "".join(f"{c:>{width}}" for c in cells)).rstrip() for name, cells in rows]
         closing = [f"The probabilities contain {self.uncertainty}."]
         closing += [f"{self.failures}."] if self.failures else []
-        return "\n".join([*lines, "", *closing, *labelled(self.findings)])
+        return "\n".join([*lines, "", *closing, *labelled(self.prediction.findings)])
 
 
 def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
@@ -233,13 +196,12 @@ def limit_states(measures: DamageMeasures) -> tuple[LimitState, ...]:
     beyond repair Park-Ang index 0.4
     collapse Park-Ang index 1.0
     """
-    names = _names(measures)
     states = _ASSUMED
     if np.isfinite(measures.yield_strain):
         states = (LimitState("bar yield", "bar tension", measures.yield_strain, "nominal fy/Es of the steel"), *states)
-    if not measures.sensors.heights.size:  # limits of drift are for lengths that were divided by a height
+    if not len(measures.heights):  # limits of drift are for lengths that were divided by a height
         states = tuple(state for state in states if state.measure != "residual drift" or measures.height != 1.0)
-    return tuple(state for state in states if state.measure in names)
+    return tuple(state for state in states if state.measure in measures.names)
 
 
 def damage(
@@ -248,7 +210,6 @@ def damage(
     *,
     ratios: EventRatios | Mapping[str, EventRatios] | None = None,
     noise: bool | None = None,
-    effective_sample_size: float | None = None,
     level: float = 0.95,
     seed: int = 0,
 ) -> Damage:
@@ -266,8 +227,6 @@ def damage(
         ``EventRatios([1.0], prior_sd=0.3, prior_events=10)``.
     noise : bool, optional
         False states that the model error is left out on purpose. Default: a warning if there are no ratios.
-    effective_sample_size : float, optional
-        Effective number of independent samples. Default: as in the prediction.
     level : float
         Level of the probabilities' intervals, between 0 and 1.
     seed : int
@@ -280,9 +239,8 @@ def damage(
     Raises
     ------
     ValueError
-        If the prediction is of another quantity, contains noise or has no values of the samples, or a limit has an
-        unknown measure, is no `LimitState`, is not positive, or does not have one value or one for each sample; if
-        ratios are for an unknown measure or for several quantities; and for ``noise=True``.
+        If the prediction is of another quantity or contains noise, a limit is not positive, has an unknown measure or
+        does not have one value or one for each sample, or ratios are for an unknown measure or several quantities.
 
     Warns
     -----
@@ -319,58 +277,42 @@ def damage(
             "the noise of sensors does no damage, and errors that are drawn do work and leave residual values: "
             "propagate the measures with noise=False, and give ratios= for the error of the model"
         )
-    if prediction.values is None:
-        raise ValueError("damage needs the values of the samples: propagate with memory_bytes=None")
-    states = limit_states(measures) if limits is None else _checked_states(limits)
+    listed = not isinstance(limits, str | LimitState) and np.iterable(limits)
+    states = limit_states(measures) if limits is None else tuple(limits) if listed else ()
+    if limits is not None and not (listed and all(isinstance(state, LimitState) for state in states)):
+        raise ValueError(
+            'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
+            f"{limits!r}"
+        )
     names = [state.name for state in states]
     if len(set(names)) != len(names):
         raise ValueError(f"limit states need different names; got {', '.join(names)}")
     values = measures.split(prediction.values)
     errors = _ratios_of_measures(ratios, tuple(values))
-    effective = float(check_effective_sample_size(effective_sample_size, prediction.effective_sample_size))
     check_level(level)
-    weights = None if prediction.spread is None else prediction.spread.weights
     presence, location = {}, {}
+    settings = len(prediction.collapsed), prediction.effective_sample_size, level, seed
     for state in states:
         if state.measure not in values:
             raise ValueError(
                 f"limit state {state.name!r} is of {state.measure!r}, the measures are {', '.join(values)}; "
                 "damage_measures(measures=...) chooses them"
             )
-        found, limit = values[state.measure], _limit_per_sample(state, prediction)
-        reported = np.asarray(state.limit if np.ndim(state.limit) == 0 else limit.mean(), dtype=float)
+        found, limit = values[state.measure], _limit_per_sample(state, prediction, np.random.default_rng(seed))
+        reported = np.asarray(state.limit if np.isscalar(state.limit) else np.mean(limit), dtype=float)
         shown = {"threshold": reported, "unit": DIMENSIONS[find_unit(_UNITS.get(state.measure, "1")).dimension]}
-        spread = EventSpread(found, weights, errors.get(state.measure))
-        options = (limit, spread, effective, level, seed, state.measure in _DECREASING)
-        largest = found.max(axis=(2, 3)) if found.ndim == 4 else found
-        presence[state.name] = with_collapses(_exceeded(largest, *options), prediction, level)._replace(**shown)
+        ratios_of = errors.get(state.measure)
         if found.ndim == 4:
-            location[state.name] = with_collapses(_exceeded(found, *options), prediction, level)._replace(**shown)
+            at_places = exceeded(found, limit[:, None, None, None], ratios_of, *settings)
+            location[state.name], found = at_places._replace(**shown), found.max(axis=(2, 3))
+        presence[state.name] = exceeded(found, limit[:, None], ratios_of, *settings)._replace(**shown)
     without = [state.name for state in states if state.measure not in errors]
     if without and noise is None:
         guess = "state a guess, such as EventRatios([1.0], prior_sd=0.3, prior_events=10)"
         warn_of_missing_error(f"damage ({', '.join(without)})", guess)
-    quantiles = _extent(prediction, values, errors, np.random.default_rng(seed)) if prediction.probabilities else {}
-    return Damage(
-        events=measures.events,
-        limits=states,
-        presence=presence,
-        location=location,
-        extent=quantiles,
-        probabilities=prediction.probabilities,
-        heights=measures.sensors.heights,
-        sides=SIDES,
-        height=measures.height,
-        diameter=measures.diameter,
-        measures=measures,
-        effective_sample_size=effective,
-        n_samples=int(prediction.n_samples),
-        n_failed=int(prediction.n_failed) - len(prediction.collapsed),
-        n_collapsed=len(prediction.collapsed),
-        from_state=prediction.from_state,
-        uncertainty=_contents(states, errors, weights is not None),
-        findings=prediction.findings,
-    )
+    rng, probabilities = np.random.default_rng(seed), prediction.probabilities
+    quantiles = _extent(values, probabilities, errors, rng) if probabilities else {}
+    return Damage(states, presence, location, quantiles, _contents(states, errors), prediction)
 
 
 def _stated(probability: float, error: float, lower: float, upper: float) -> str:
@@ -380,24 +322,11 @@ def _stated(probability: float, error: float, lower: float, upper: float) -> str
     return f"{probability:.3f} +- {error:.3f}"
 
 
-def _names(measures: DamageMeasures) -> tuple[str, ...]:
-    return measures.measures + (STRAIN_MEASURES if measures.sensors.strains else ())
-
-
-def _checked_states(limits: Sequence[LimitState]) -> tuple[LimitState, ...]:
-    alone = isinstance(limits, str | LimitState) or not np.iterable(limits)
-    states = () if alone else tuple(limits)
-    if alone or not all(isinstance(state, LimitState) for state in states):
-        raise ValueError(
-            'limits must be a sequence of LimitState, such as [LimitState("cracks", "bar tension", 0.015)]; got '
-            f"{limits!r}"
-        )
-    return states
-
-
-def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
-    """Limits of the samples that did not fail, shape (n,) or (1,)."""
+def _limit_per_sample(state: LimitState, prediction: Prediction, rng: np.random.Generator) -> np.ndarray:
+    """Limits of the samples that did not fail, shape (n,) or (1,); of a distribution quantiles in random order."""
     n = prediction.n_samples + prediction.n_failed
+    if isinstance(state.limit, Distribution) and state.limit.bounds[0] >= 0.0:
+        return state.limit.ppf((rng.permutation(prediction.n_samples) + 0.5) / prediction.n_samples)
     try:
         limit = np.asarray(state.limit, dtype=float)
     except (TypeError, ValueError):
@@ -409,8 +338,8 @@ def _limit_per_sample(state: LimitState, prediction: Prediction) -> np.ndarray:
         or not (limit > 0.0).all()
     ):
         raise ValueError(
-            f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples; got "
-            f"{state.limit!r}"
+            f"the limit of {state.name!r} must be a positive number, or one for each of the {n} samples, or a "
+            f"distribution of positive numbers; got {state.limit!r}"
         )
     return limit.reshape(1) if limit.ndim == 0 else np.delete(limit, prediction.failed)
 
@@ -429,45 +358,33 @@ def _ratios_of_measures(ratios: Any, measures: tuple[str, ...]) -> dict[str, Eve
 
 
 def _extent(
-    prediction: Prediction,
     values: dict[str, np.ndarray],
+    probabilities: Sequence[float],
     errors: Mapping[str, EventRatios],
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
     """Quantiles of the measures, multiplied by draws of their ratios."""
-    quantiles = prediction.quantity.split(prediction.quantiles)
-    for name, ratios in errors.items():
-        found = values[name].copy()
-        for event in range(found.shape[1]):
-            drawn = found[:, event].reshape(len(found), -1)
-            largest = drawn.max(axis=1)  # all places of an event share its error
-            factor = np.ones(len(found))
-            factor[largest > 0.0] = ratios.draw(largest[largest > 0.0], rng)
-            found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
-        quantiles[name] = np.quantile(found, prediction.probabilities, axis=0)
+    quantiles = {}
+    for name, found in values.items():
+        if name in errors:
+            found = found.copy()
+            for event in range(found.shape[1]):
+                largest = found[:, event].reshape(len(found), -1).max(axis=1)  # all places of an event share its error
+                factor = np.ones(len(found))
+                factor[largest > 0.0] = errors[name].draw(largest[largest > 0.0], rng)
+                found[:, event] *= factor.reshape(-1, *(1,) * (found.ndim - 2))
+        quantiles[name] = np.quantile(found, probabilities, axis=0)
     return quantiles
 
 
-def _contents(states: Sequence[LimitState], errors: Mapping[str, EventRatios], of_population: bool) -> str:
+def _contents(states: Sequence[LimitState], errors: Mapping[str, EventRatios]) -> str:
     """Which uncertainties the probabilities contain, in words."""
-    said = "the uncertainty of the parameters" + (", their spread between events" if of_population else "")
+    capacity = any(isinstance(state.limit, Distribution) for state in states)
+    said = "the uncertainty of the parameters" + (", the distribution of limits" if capacity else "")
+    without = "" if capacity else " or of the limits"
     measures = list(dict.fromkeys(state.measure for state in states))
     with_error = [name for name in measures if name in errors]
     if not with_error:
-        return f"{said}, not the error of the model or of the limits"
+        return f"{said}, not the error of the model{without}"
     whose = "" if len(with_error) == len(measures) else f" in {', '.join(with_error)}"
-    return f"{said} and the error of the model{whose}, not that of the limits"
-
-
-def _exceeded(
-    values: np.ndarray,
-    limit: np.ndarray,
-    spread: EventSpread,
-    effective: float,
-    level: float,
-    seed: int,
-    below: bool,
-) -> Exceedance:
-    """Probability that a measure (n, ...) exceeds its limit (n,) or (1,), or is below it."""
-    limits = np.broadcast_to(limit.reshape(-1, *(1,) * (values.ndim - 1)), values.shape)
-    return exceedance_probability(values, limits, spread, effective, level, seed, below)
+    return f"{said} and the error of the model{whose}" + ("" if capacity else ", not that of the limits")

@@ -80,7 +80,7 @@ class ParkAng(NamedTuple):
         return np.asarray(peak) / self.ultimate_displacement + share * np.asarray(energy)
 
 
-def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: float = 0.05) -> ParkAng:
+def park_ang_constants(column: RCColumn, beta: float = 0.05) -> ParkAng:
     """Find the constants of the damage index by pushing the column to failure.
 
     The top is displaced in the positive direction. The yield force is the lateral force at the yield of the outermost
@@ -92,9 +92,7 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
     Parameters
     ----------
     column : RCColumn
-        The column; its loading is not used.
-    theta : (n_parameters,) array_like, optional
-        Its parameters, such as posterior means. Default: ones, the nominal values.
+        The column, with its nominal values; its loading is not used.
     beta : float
         Factor of the energy. The default, 0.05, is **assumed**. Park & Ang derive it from axial load and reinforcement;
         0.05 to 0.15 are usual for columns that fail in flexure.
@@ -106,7 +104,7 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
     Raises
     ------
     ValueError
-        If `theta` has another length, or no bar yields or none of the three events is reached up to a drift of 20 %.
+        If no bar yields or none of the three events is reached up to a drift of 20 %.
     SimulationFailed
         If the analysis does not converge.
 
@@ -118,22 +116,16 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
     """
     from ..models.rc_column_analysis import expect_fracture
 
-    values = np.ones(len(column.parameters)) if theta is None else np.asarray(theta, dtype=float)
-    if values.shape != (len(column.parameters),):
-        raise ValueError(f"expected one value for each of {', '.join(column.parameters)}; got shape {values.shape}")
-    kept = [name not in ("a0", "a1") for name in column.parameters]  # damping does not act in a static analysis
-    names = tuple(name for name, keep in zip(column.parameters, kept, strict=True) if keep)
     bar, core = column.section.outermost_bars[0], 0.5 * column.core_diameter
     outputs = ("force", f"strain@0:{bar:.10g}", f"strain@0:{core:.10g}")
-    physical = {**column.nominal, **{n: column.nominal[n] * v for n, v in zip(column.parameters, values, strict=True)}}
-    limits = column.steel.ultimate_strain, column.section.confinement(physical["fc"]).ultimate_strain
-    yield_strain = physical["fy"] / physical["Es"]
+    nominal = column.nominal
+    limits = column.steel.ultimate_strain, column.section.confinement(nominal["fc"]).ultimate_strain
+    yield_strain = nominal["fy"] / nominal["Es"]
     for drift in _DRIFTS:
         push = DisplacementHistory("monotonic", np.linspace(0.0, drift * column.height, _STEPS + 1))
-        # with a parameter that does not change the column, if there were only damping parameters
-        static = replace(column, loading=push, outputs=outputs, units=(), parameters=names or ("Ec",))
+        static = replace(column, loading=push, outputs=outputs, units=(), parameters=("Ec",))
         expect_fracture(static)
-        force, tension, compression = static.simulate(values[kept] if names else np.ones(1))
+        force, tension, compression = static.simulate(np.ones(1))
         after = np.arange(force.size) > np.argmax(force)
         low = _LOSS * force.max()
         failures = {
@@ -144,8 +136,7 @@ def park_ang_constants(column: RCColumn, theta: ArrayLike | None = None, beta: f
         yield_force = _first(tension >= yield_strain, tension - yield_strain, force)
         cause = min(failures, key=failures.__getitem__)
         if failures[cause] < math.inf and yield_force < math.inf:
-            at = "nominal parameters" if theta is None else "given parameters"
-            source = f"static analysis at {at}: first yield of a bar, {cause}; beta assumed"
+            source = f"static analysis at nominal parameters: first yield of a bar, {cause}; beta assumed"
             return ParkAng(failures[cause], yield_force, float(beta), source)
     raise ValueError(
         f"the column does not fail up to a drift of {100 * _DRIFTS[-1]:.0f} %: give ParkAng(ultimate_displacement, "

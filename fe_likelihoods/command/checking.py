@@ -167,9 +167,9 @@ def _say_cost(
         say(f"Estimated cost until beta = 1:\n{estimate}")
     if "max_simulations" in budget:
         say(f"The run stops at {budget['max_simulations']} simulations (max_simulations)")
-        if not guided and budget["max_simulations"] < estimate.evaluations.low:
+        if not guided and budget["max_simulations"] < estimate.fewest:
             say(
-                f"CAUTION: it needs about {estimate.evaluations.low:.3g} or more, and will probably end before "
+                f"CAUTION: it needs about {estimate.fewest:.3g} or more, and will probably end before "
                 "beta = 1; a larger max_simulations continues it"
             )
 

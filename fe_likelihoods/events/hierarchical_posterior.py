@@ -102,8 +102,6 @@ class HierarchicalPosterior:
     common : mapping of str to Distribution, optional
         Parameters with one value for all tests, and their priors. All parameters that are neither varying nor common
         belong to each test alone, with the prior of its stored posterior.
-    max_samples : int
-        Largest number of samples per test. More are thinned; the time of an evaluation is proportional to it.
 
     Attributes
     ----------
@@ -149,10 +147,9 @@ class HierarchicalPosterior:
         varying: Mapping[str, Varying],
         *,
         common: Mapping[str, Distribution] | None = None,
-        max_samples: int = 1000,
     ) -> None:
         common = {} if common is None else common
-        _check(tests, varying, common, max_samples)
+        _check(tests, varying, common)
         self.tests, self.varying, self.common = dict(tests), dict(varying), tuple(common)
         distributions: dict[str, Any] = {}
         for name, each in varying.items():
@@ -163,7 +160,7 @@ class HierarchicalPosterior:
         self.described = {}
         for name, test in self.tests.items():
             try:
-                self.described[name] = describe(test, [*varying, *common], self.scales, max_samples)
+                self.described[name] = describe(test, [*varying, *common], self.scales)
             except ValueError as error:
                 raise ValueError(f"test {name!r}: {error}") from None
         self._set_smallest_sd()
@@ -180,16 +177,6 @@ class HierarchicalPosterior:
         return (
             f"<HierarchicalPosterior: {len(self.tests)} tests, varying {', '.join(self.varying)}, {common}{self.ndim} "
             "hyper-parameters>"
-        )
-
-    def __str__(self) -> str:
-        varying = ", ".join(f"{name} ({each.scale})" for name, each in self.varying.items())
-        return "\n".join(
-            [
-                f"Hierarchical posterior of {len(self.tests)} tests: {', '.join(self.tests)}",
-                f"varying: {varying}; common: {', '.join(self.common) or 'none'}",
-                f"{self.ndim} hyper-parameters: {', '.join(self.parameter_names)}",
-            ]
         )
 
     def without(self, test: str) -> "HierarchicalPosterior":
@@ -266,9 +253,9 @@ class HierarchicalPosterior:
         -------
         (n, n_tests) float
         """
-        center, factor = self.population(x)
+        center, sd = self.population(x)
         columns = [
-            population_marginal(each, center, factor).log_value + (self.tests[name].log_evidence or 0.0)
+            population_marginal(each, center, sd).log_value + (self.tests[name].log_evidence or 0.0)
             for name, each in self.described.items()
         ]
         return np.stack(columns, axis=1)
@@ -285,22 +272,22 @@ class HierarchicalPosterior:
         -------
         center : (n, n_varying + n_common) float
             Means of the varying parameters on their scales, then the common parameters.
-        factor : (n, n_varying, n_varying) float
-            Cholesky factors of the varying parameters' covariances.
+        sd : (n, n_varying) float
+            Standard deviations of the varying parameters on their scales.
         """
         points, n = np.atleast_2d(as_points(x, self.prior.names)), len(self.varying)
         end = points.shape[1] - len(self.common)
         center = np.concatenate([points[:, 0 : 2 * n : 2], points[:, end:]], axis=1)
         center = self.scales.to_scale(center)
         deviations = np.clip(points[:, 1 : 2 * n : 2], self._smallest_sd, _LARGEST)
-        return np.clip(center, -_LARGEST, _LARGEST), deviations[:, :, None] * np.eye(n)
+        return np.clip(center, -_LARGEST, _LARGEST), deviations
 
     def from_scale(self, values: np.ndarray) -> np.ndarray:
         """Parameters (..., n_varying + n_common) from their values on the scales of the populations."""
         return self.scales.from_scale(values)
 
 
-def _check(tests: Any, varying: Any, common: Any, max_samples: Any) -> None:
+def _check(tests: Any, varying: Any, common: Any) -> None:
     """Raise ValueError for arguments of `HierarchicalPosterior` that cannot be used."""
     for what, values, kind in (("tests", tests, StoredPosterior), ("varying", varying, Varying)):
         if (
@@ -315,5 +302,3 @@ def _check(tests: Any, varying: Any, common: Any, max_samples: Any) -> None:
         raise ValueError(f"HierarchicalPosterior: common must be a mapping of names to distributions; got {common!r}")
     if both := sorted(set(varying) & set(common)):
         raise ValueError(f"HierarchicalPosterior: {', '.join(both)} cannot be both varying and common")
-    if not isinstance(max_samples, int | np.integer) or max_samples < 100:
-        raise ValueError(f"HierarchicalPosterior: max_samples must be a whole number, 100 or more; got {max_samples!r}")

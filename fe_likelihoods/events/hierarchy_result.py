@@ -4,7 +4,7 @@
 checks where the stored posteriors do not suffice, and draws the parameters of the tests and of a further one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,11 @@ from ..priors.distributions import RandomState
 from ..priors.points import as_points, complete_repr
 from ..text_tables import number, text_table
 from .hierarchical_posterior import HierarchicalPosterior
-from .population_marginal import draw_parameters, sample_weights
+from .population_marginal import draw_parameters
 from .reweighting import check_hierarchy
 
 __all__ = ["Hierarchy"]
 
-_HYPER_SAMPLES = 200
 _MOSTLY_PRIOR = 0.7  # posterior to prior standard deviation of a spread, above which the data say little
 
 
@@ -176,9 +175,9 @@ class Hierarchy:
             raise ValueError(f"new_test: n must be a whole number, 1 or more; got {n!r}")
         generator, posterior = _generator(rng), self.posterior
         rows = generator.permutation(np.resize(generator.permutation(len(self.samples)), n))
-        center, factor = posterior.population(self.samples[rows])
+        center, sd = posterior.population(self.samples[rows])
         varying = len(posterior.varying)
-        center[:, :varying] += np.einsum("nij,nj->ni", factor, generator.standard_normal((n, varying)))
+        center[:, :varying] += sd * generator.standard_normal((n, varying))
         draws = posterior.from_scale(center)
         own = [*posterior.varying, *posterior.common]
         outside = np.zeros(draws.shape, dtype=bool)
@@ -205,97 +204,12 @@ class Hierarchy:
         names = [*self.posterior.varying, *self.posterior.common]
         return dict(zip(names, self.posterior.from_scale(center.mean(axis=0)).tolist(), strict=True))
 
-    def population_weights(self, draws: Mapping[str, np.ndarray], n: int = 200) -> np.ndarray:
-        """Weights with which draws of a new test represent single populations.
-
-        The draws of `new_test` come from many populations, one per hyper-sample. With these weights they represent each
-        population alone, without further simulations: differences between populations show the uncertainty of the
-        population, and differences between draws of one population show the spread between tests.
-
-        Parameters
-        ----------
-        draws : mapping of str to (m,) array_like
-            Result of `new_test`. Common parameters, which do not vary within a population, and parameters that belong
-            to each test alone are not compared.
-        n : int
-            Number of populations, at most the number of hyper-samples.
-
-        Returns
-        -------
-        (n, m) ndarray
-            Each row sums to one.
-
-        Raises
-        ------
-        ValueError
-            If a varying parameter is missing.
-
-        Notes
-        -----
-        Importance sampling with the mixture of all populations as its proposal (the balance heuristic of Veach & Guibas
-        1995, doi:10.1145/218380.218498).
-        """
-        names = list(self.posterior.varying)
-        if missing := [name for name in names if name not in draws]:
-            raise ValueError(f"population_weights: expected draws of {', '.join(names)}; missing {', '.join(missing)}")
-        used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), n)).astype(int)
-        center, factor = self.posterior.population(self.samples[used])
-        values = np.stack([np.asarray(draws[name], dtype=float) for name in names], axis=1)
-        points = self.posterior.scales.first(len(names)).to_scale(values)
-        log_densities = np.empty((len(used), len(points)))
-        for row, (mean, root) in enumerate(zip(center[:, : len(names)], factor, strict=True)):
-            z = np.linalg.solve(root, (points - mean).T)
-            log_densities[row] = -0.5 * np.square(z).sum(axis=0) - np.log(np.diagonal(root)).sum()
-        log_densities -= log_densities.max(axis=0)
-        weights = np.exp(log_densities)
-        weights /= weights.sum(axis=0)
-        return weights / weights.sum(axis=1, keepdims=True)
-
-    def weights(self, test: str) -> np.ndarray:
-        """Weights with which the stored samples of one test represent its posterior in the hierarchy.
-
-        Given the other tests, the parameters of a test are better known than from the test alone: its posterior shrinks
-        towards the population.
-
-        Parameters
-        ----------
-        test : str
-            Name of the test.
-
-        Returns
-        -------
-        (n,) ndarray
-            Weights for all the test's samples, which sum to one: the mean over at most 200 hyper-samples.
-
-        Raises
-        ------
-        ValueError
-            If the test is unknown, or there are common parameters, whose exact value is not among the samples: use
-            `draw_test`.
-        """
-        self._check_name(test)
-        if self.posterior.common:
-            raise ValueError(
-                f"the stored samples do not have the exact value of {', '.join(self.posterior.common)}, which is "
-                f"common to all tests: use draw_test({test!r})"
-            )
-        stored, described = self.posterior.tests[test], self.posterior.described[test]
-        if len(described.points) < len(stored.samples):  # described with fewer samples
-            columns = [stored.prior.names.index(name) for name in self.posterior.varying]
-            points = described.scales.to_scale(stored.samples[:, columns])
-            described = described._replace(
-                points=points, log_weights=stored.log_weights, log_prior=described.log_prior_at(points)
-            )
-        used = np.linspace(0, len(self.samples) - 1, min(len(self.samples), _HYPER_SAMPLES)).astype(int)
-        center, factor = self.posterior.population(self.samples[used])
-        total = sum(sample_weights(described, center[i : i + 1], factor[i : i + 1])[0] for i in range(len(center)))
-        return total / total.sum()
-
     def draw_test(self, test: str, rng: RandomState = None) -> dict[str, np.ndarray]:
         """Draw the varying and common parameters of one test, one draw for each sample of the hyper-parameters.
 
-        Unlike `weights` it also draws points between the stored samples, from the fitted mixture, and therefore works
-        for narrow populations and common parameters. The draws and the rows of `samples` belong together.
+        Given the other tests, the parameters of a test are better known than from the test alone: its posterior shrinks
+        towards the population. Points between the stored samples are drawn from the fitted mixture. The draws and the
+        rows of `samples` belong together.
 
         Parameters
         ----------
@@ -313,15 +227,13 @@ class Hierarchy:
         ValueError
             If the test is unknown.
         """
-        self._check_name(test)
-        center, factor = self.posterior.population(self.samples)
-        draws = draw_parameters(self.posterior.described[test], center, factor, _generator(rng))
+        if test not in self.posterior.tests:
+            known = ", ".join(map(repr, self.posterior.tests))
+            raise ValueError(f"there is no test {test!r}; the tests are {known}")
+        center, sd = self.posterior.population(self.samples)
+        draws = draw_parameters(self.posterior.described[test], center, sd, _generator(rng))
         names = [*self.posterior.varying, *self.posterior.common]
         return dict(zip(names, self.posterior.from_scale(draws).T, strict=True))
-
-    def _check_name(self, test: str) -> None:
-        if test not in self.posterior.tests:
-            raise ValueError(f"there is no test {test!r}; the tests are {', '.join(map(repr, self.posterior.tests))}")
 
     def _prior_draws(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         """Prior draws of a parameter that belongs to each test alone."""

@@ -61,25 +61,23 @@ class Product(NamedTuple):
     factors: np.ndarray  # matrices A with covariances A A^T (n, n_components, n_varying, n_varying)
 
 
-def population_marginal(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> PopulationMarginal:
+def population_marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> PopulationMarginal:
     """Marginal likelihood of a test under normal populations, with n centres (n, d) of its parameters.
 
-    The first n_varying parameters vary between tests and have Cholesky factors (n, n_varying, n_varying) of
-    covariances; the others are common, and their centres are their values.
+    The first n_varying parameters vary between tests, with standard deviations (n, n_varying); the others are common,
+    and their centres are their values.
     """
-    size = max(1, _CHUNK // (len(described.points) * factor.shape[-1]))
-    parts = [
-        _marginal(described, center[i : i + size], factor[i : i + size]) for i in range(0, max(len(center), 1), size)
-    ]
+    size = max(1, _CHUNK // (len(described.points) * sd.shape[-1]))
+    parts = [_marginal(described, center[i : i + size], sd[i : i + size]) for i in range(0, max(len(center), 1), size)]
     return PopulationMarginal(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def sample_weights(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> np.ndarray:
+def sample_weights(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Weights (n, m) of a test's samples under n populations, which sum to one in each row; no parameter may be common.
 
     They are zero in a row where no sample has a density above the smallest float.
     """
-    log_weights = log_density(described.points, center, factor) + described.log_weights - described.log_prior
+    log_weights = log_density(described.points, center, sd) + described.log_weights - described.log_prior
     largest = log_weights.max(axis=1, keepdims=True)
     weights = np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
     total = weights.sum(axis=1, keepdims=True)
@@ -87,7 +85,7 @@ def sample_weights(described: DescribedPosterior, center: np.ndarray, factor: np
 
 
 def draw_parameters(
-    described: DescribedPosterior, center: np.ndarray, factor: np.ndarray, rng: np.random.Generator
+    described: DescribedPosterior, center: np.ndarray, sd: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """One draw (n, d) of a test's parameters given each of n hyper-parameters.
 
@@ -95,11 +93,11 @@ def draw_parameters(
     of `population_marginal`.
     """
     result = np.empty((len(center), center.shape[-1]))
-    products = draw_products(described, center, factor, _DRAWS, rng)
+    products = draw_products(described, center, sd, _DRAWS, rng)
     for i, drawn in enumerate(products):
-        one, spread, points = center[i : i + 1], factor[i : i + 1], drawn
+        one, spread, points = center[i : i + 1], sd[i : i + 1], drawn
         weights = inverse_prior(described, drawn)
-        if center.shape[-1] == factor.shape[-1]:
+        if center.shape[-1] == sd.shape[-1]:
             share = _share_of_samples(described)
             points = np.concatenate([described.points, drawn])
             own = share * np.exp(described.log_weights) * inverse_prior(described, described.points)
@@ -114,11 +112,11 @@ def draw_parameters(
 
 
 def draw_products(
-    described: DescribedPosterior, center: np.ndarray, factor: np.ndarray, size: int, rng: np.random.Generator
+    described: DescribedPosterior, center: np.ndarray, sd: np.ndarray, size: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Draws (n, size, d) of the normalised product of the mixture and n populations, with the common parameters."""
-    (n, dim), varying = center.shape, factor.shape[-1]
-    product = product_with_population(described, center, factor)
+    (n, dim), varying = center.shape, sd.shape[-1]
+    product = product_with_population(described, center, sd)
     cumulative = np.cumsum(np.exp(product.log_masses - product.log_masses.max(axis=1, keepdims=True)), axis=1)
     positions = rng.random((n, size)) * cumulative[:, -1:]
     which = (positions[:, :, None] > cumulative[:, None, :-1]).sum(axis=2)
@@ -137,12 +135,12 @@ def inverse_prior(described: DescribedPosterior, points: np.ndarray) -> np.ndarr
     return np.exp(lowest - np.maximum(log_prior, lowest - _LARGEST_EXCESS)) * (log_prior > -np.inf)
 
 
-def product_with_population(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> Product:
+def product_with_population(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> Product:
     """Product of a test's mixture and normal populations; arguments as for `population_marginal`."""
-    varying, dim = factor.shape[-1], center.shape[-1]
-    spread = factor @ factor.swapaxes(-1, -2)
+    varying, dim = sd.shape[-1], center.shape[-1]
     total = np.tile(described.covariances, (len(center), 1, 1, 1))
-    total[..., :varying, :varying] += spread[:, None]
+    diagonal = np.arange(varying)
+    total[..., diagonal, diagonal] += np.square(sd)[:, None]
     lower = np.linalg.cholesky(total)
     offset = center[:, None] - described.means
     scaled = np.linalg.solve(lower, offset[..., None])[..., 0]
@@ -151,7 +149,7 @@ def product_with_population(described: DescribedPosterior, center: np.ndarray, f
     gain = np.linalg.solve(total, np.tile(described.covariances[..., :varying], (len(center), 1, 1, 1)))
     means = described.means[:, :varying] + np.einsum("ncdv,ncd->ncv", gain, offset)
     # the covariance C - C (C + S)^-1 C, written as S (C + S)^-1 C because the difference loses all digits for small S
-    covariances = spread[:, None] @ gain[..., :varying, :]
+    covariances = np.square(sd)[:, None, :, None] * gain[..., :varying, :]
     return Product(log_masses, means, _roots(covariances, np.einsum("cvv->cv", described.covariances)[:, :varying]))
 
 
@@ -171,21 +169,15 @@ def _roots(covariances: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return deviations[..., None] * roots
 
 
-def log_density(points: np.ndarray, center: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Logarithm of normal densities (n, m) at points (m, d) or (n, m, d), for means (n, d) and factors (n, d, d)."""
-    inverse, total = np.linalg.inv(factor), 0.0
-    for i in range(center.shape[-1]):  # written out, because products of many small matrices are slow
-        scaled = -np.einsum("nj,nj->n", inverse[:, i, : i + 1], center[:, : i + 1])[:, None]
-        for j in range(i + 1):
-            scaled = scaled + inverse[:, i, j, None] * points[..., j]
-        total = total + scaled * scaled
-    constant = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1) + 0.5 * center.shape[-1] * _LOG_TWO_PI
-    return -0.5 * total - constant[:, None]
+def log_density(points: np.ndarray, center: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Logarithm of independent normal densities (n, m) at points (m, d) or (n, m, d), for means and sd (n, d)."""
+    total = sum(np.square((points[..., k] - center[:, k, None]) / sd[:, k, None]) for k in range(sd.shape[1]))
+    return -0.5 * total - (np.log(sd).sum(axis=1) + 0.5 * sd.shape[1] * _LOG_TWO_PI)[:, None]
 
 
-def _marginal(described: DescribedPosterior, center: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    n, varying = len(center), factor.shape[-1]
-    product = product_with_population(described, center, factor)
+def _marginal(described: DescribedPosterior, center: np.ndarray, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    n, varying = len(center), sd.shape[-1]
+    product = product_with_population(described, center, sd)
     node_weights, directions = _nodes(varying)
     nodes = product.means[:, :, None] + np.einsum("ncvw,jw->ncjv", product.factors, directions)
     is_common = center.shape[-1] > varying
@@ -204,7 +196,7 @@ def _marginal(described: DescribedPosterior, center: np.ndarray, factor: np.ndar
         share = _share_of_samples(described)
 
         def ratio(points: np.ndarray) -> np.ndarray:
-            inverse = np.exp(np.minimum(log_mass[:, None] - log_density(points, center, factor), _LARGEST_EXPONENT))
+            inverse = np.exp(np.minimum(log_mass[:, None] - log_density(points, center, sd), _LARGEST_EXPONENT))
             return 1.0 / (share * inverse + 1.0 - share)
 
         of_samples = share * (ratio(described.points) @ np.exp(described.log_weights + lowest - described.log_prior))

@@ -27,7 +27,7 @@ from ..checks.finding import warn
 from ..checks.stored_posteriors import check_equal_ratios
 from ..text_tables import number, text_table
 
-__all__ = ["PRIOR_EVENTS", "PRIOR_SD", "SLOPE_SD", "EventRatios", "RatioPopulations", "standardised"]
+__all__ = ["PRIOR_EVENTS", "PRIOR_SD", "SLOPE_SD", "EventRatios", "RatioPopulations"]
 
 PRIOR_SD = 0.12
 """Scatter of log ratios of peaks where nothing else is known of it: 0.03 to 0.15 in five structures."""
@@ -47,13 +47,15 @@ class RatioPopulations(NamedTuple):
     sd: np.ndarray  # of log ratios between events
     log_level: float  # mean logarithm of the predicted values of the events
 
-    def center_at(self, log_predicted: np.ndarray) -> np.ndarray:
-        """Mean log ratio at logarithms of predicted values (n, ...), a row for each draw."""
-        center, slope = (each.reshape(-1, *(1,) * (log_predicted.ndim - 1)) for each in (self.center, self.slope))
-        return center + slope * (log_predicted - self.log_level)
+    def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
+        """Probability that a ratio from each population exceeds `ratio` (n, ...), at logarithms of predicted values."""
+        rows = (-1, *(1,) * (log_predicted.ndim - 1))
+        center, slope, sd = (each.reshape(rows) for each in (self.center, self.slope, self.sd))
+        center = center + slope * (log_predicted - self.log_level)
+        return special.ndtr(_standardised(center - np.log(ratio), sd))
 
 
-def standardised(difference: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _standardised(difference: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Differences divided by a scale. If the scale is zero: infinite, with negative sign for a difference of zero."""
     positive = np.asarray(scale) > 0.0
     return np.where(positive, difference / np.where(positive, scale, 1.0), np.where(difference > 0.0, np.inf, -np.inf))
@@ -83,6 +85,10 @@ class EventRatios:
         Parameters at which the values were predicted; predictions by these ratios use the same.
     new_sd : float or (n_quantities,) array_like, optional
         Expected scatter of the new event. Default: root mean square of `prior_sd` over the events.
+    spread : mapping of str to float, optional
+        Standard deviations of log parameters between events, from which predictions find the scatter of their motion.
+    remainder : float or (n_quantities,) array_like, optional
+        Variance of log ratios that this spread does not explain.
 
     Raises
     ------
@@ -129,6 +135,8 @@ class EventRatios:
     slope_sd: float = SLOPE_SD
     at: Mapping[str, float] | None = None
     new_sd: ArrayLike | None = None
+    spread: Mapping[str, float] | None = None
+    remainder: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
         values = np.array(self.values, dtype=float)
@@ -215,6 +223,7 @@ class EventRatios:
             levels=None if self.levels is None else np.asarray(self.levels)[:, k],
             prior_sd=np.broadcast_to(self.prior_sd, self.values.shape)[:, k],
             new_sd=np.broadcast_to(self.new_sd, self.shape)[k],
+            remainder=np.broadcast_to(self.remainder, self.shape)[k],
         )
 
     def quantile(self, probability: ArrayLike, predicted: ArrayLike = 1.0) -> np.ndarray:
@@ -264,7 +273,7 @@ class EventRatios:
     def probability_above(self, ratio: np.ndarray, log_predicted: np.ndarray) -> np.ndarray:
         """Probability that the ratio of a new event exceeds `ratio`, at logarithms of predicted values."""
         center, scale = self._center_and_scale(log_predicted)
-        return special.stdtr(self.degrees_of_freedom, standardised(center - np.log(ratio), scale))
+        return special.stdtr(self.degrees_of_freedom, _standardised(center - np.log(ratio), scale))
 
     def draw_populations(self, n: int, rng: np.random.Generator) -> RatioPopulations:
         """Draw the line and the standard deviation of log ratios from their posterior; ValueError for quantities."""

@@ -1,6 +1,5 @@
-"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails, bounds and errors."""
+"""Whether stored posteriors of single tests suffice for a hierarchical model: weights, tails and errors."""
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,13 +15,12 @@ from .stored_posterior import resampled_description
 if TYPE_CHECKING:
     from .hierarchical_posterior import HierarchicalPosterior
 
-__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy", "ends_within"]
+__all__ = ["HierarchyChecks", "ReweightingCheck", "check_hierarchy"]
 
 _HYPER_SAMPLES = 100
 _RESAMPLINGS = 12
 _DRAWS = 500
 _QUANTILE = 0.9  # of the Pareto shapes over the hyper-samples
-_ROUND_OFF = 1e-9  # of the width of a prior, by which equal bounds may differ
 
 
 class ReweightingCheck(NamedTuple):
@@ -36,7 +34,6 @@ class ReweightingCheck(NamedTuple):
     effective_samples: float  # of the weights, median over the hyper-samples
     sample_share: float  # of the marginal likelihood, mean; the rest is from the fitted mixture
     pareto_shape: float  # 90 % quantile over the hyper-samples
-    error: float  # standard, of the log marginal likelihood: root mean square, from resampled samples
     shift: float  # largest standard error that this test causes in a hyper-parameter's mean [posterior sd]
 
 
@@ -49,10 +46,10 @@ class HierarchyChecks(NamedTuple):
     findings: tuple[Finding, ...]  # what is not reliable and what to do
 
     def __str__(self) -> str:
-        rows = [("test", "effective", "of samples", "Pareto", "error", "shift")]
+        rows = [("test", "effective", "of samples", "Pareto", "shift")]
         for name, each in self.tests.items():
             effective, share = number(each.effective_samples, 4), f"{each.sample_share:.0%}"
-            others = f"{each.pareto_shape:.2f}", f"{each.error:.2f}", f"{each.shift:.2f}"
+            others = f"{each.pareto_shape:.2f}", f"{each.shift:.2f}"
             rows.append((name, effective, share, *others))
         lines = [text_table(rows)]
         worst = max(self.mean_errors, key=lambda name: self.mean_errors[name])
@@ -67,22 +64,22 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
     """Check the stored samples of every test at 100 evenly spaced samples of the hyper-parameters (n, ndim)."""
     rng = np.random.default_rng(seed)
     used = samples[np.linspace(0, len(samples) - 1, min(len(samples), _HYPER_SAMPLES)).astype(int)]
-    center, factor = posterior.population(used)
+    center, sd = posterior.population(used)
     weighted = not posterior.common
     found, changes = {}, []
     for name, described in posterior.described.items():
-        marginal = population_marginal(described, center, factor)
+        marginal = population_marginal(described, center, sd)
         change = np.empty((_RESAMPLINGS, len(used)))
         for row in change:
-            row[:] = population_marginal(resampled_description(described, rng), center, factor).log_value
+            row[:] = population_marginal(resampled_description(described, rng), center, sd).log_value
         change -= marginal.log_value
         changes.append(change)
         sizes = np.full(2, np.nan)
-        drawn = draw_products(described, center, factor, _DRAWS, rng)
+        drawn = draw_products(described, center, sd, _DRAWS, rng)
         with np.errstate(divide="ignore"):
             shapes = [pareto_shape(row) for row in np.log(inverse_prior(described, drawn))]
         if weighted:
-            weights = sample_weights(described, center, factor)
+            weights = sample_weights(described, center, sd)
             square = np.square(weights).sum(axis=1)
             independent = described.effective_sample_size * np.exp(2.0 * described.log_weights).sum()
             sizes = np.where(square > 0.0, min(independent, 1.0) / np.where(square > 0.0, square, 1.0), 0.0)
@@ -90,7 +87,6 @@ def check_hierarchy(posterior: "HierarchicalPosterior", samples: np.ndarray, see
             float(np.median(sizes)),
             float(marginal.sample_share.mean()),
             float(np.sort(shapes)[int(_QUANTILE * (len(shapes) - 1))]),
-            float(np.sqrt(np.mean(np.var(change, axis=0, ddof=1)))),
             float(_mean_errors(used, change)[0].max()),
         )
     errors, evidence = _mean_errors(used, np.sum(changes, axis=0))
@@ -114,28 +110,3 @@ def _mean_errors(samples: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, f
     means = (weights / weights.sum(axis=1, keepdims=True)) @ samples
     deviations = samples.std(axis=0)
     return np.std(means, axis=0, ddof=1) / np.where(deviations > 0.0, deviations, 1.0), float(np.std(evidence, ddof=1))
-
-
-def ends_within(posterior: "HierarchicalPosterior", name: str, others: Iterable[str] = ()) -> dict[str, list[float]]:
-    """Prior bounds of a test that leave out values of common parameters which the other tests' priors permit.
-
-    Bounds [unit of the parameter] by the name of the common parameter; no entry where nothing is left out.
-    """
-    first = posterior.ndim - len(posterior.common)
-    permitted = [posterior.prior.bounds[first:], *(_common_bounds(posterior, other) for other in others)]
-    low, high = np.max(permitted, axis=0)[:, 0], np.min(permitted, axis=0)[:, 1]
-    own = _common_bounds(posterior, name)
-    widths = np.diff(own)
-    # of the width, and of the bound itself where the other one is infinite
-    round_off = _ROUND_OFF * np.where(np.isfinite(widths), widths, np.where(np.isfinite(own), np.abs(own), 0.0))
-    left_out = np.stack([own[:, 0] - round_off[:, 0] > low, own[:, 1] + round_off[:, 1] < high], axis=1)
-    return {
-        common: bounds[is_within].tolist()
-        for common, bounds, is_within in zip(posterior.common, own, left_out, strict=True)
-        if is_within.any()
-    }
-
-
-def _common_bounds(posterior: "HierarchicalPosterior", name: str) -> np.ndarray:
-    """Prior bounds (n_common, 2) of the common parameters in a test."""
-    return posterior.described[name].prior.bounds[len(posterior.varying) :]

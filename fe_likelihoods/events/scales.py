@@ -15,10 +15,6 @@ class Scales(NamedTuple):
 
     is_log: np.ndarray  # (dim,) bool
 
-    def first(self, n: int) -> "Scales":
-        """Scales of the first n parameters."""
-        return Scales(self.is_log[:n])
-
     def to_scale(self, values: np.ndarray) -> np.ndarray:
         """Values (..., dim) on the scales; NaN for the logarithm of a negative value."""
         with np.errstate(divide="ignore", invalid="ignore"):

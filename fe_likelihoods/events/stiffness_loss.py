@@ -174,22 +174,19 @@ def stiffness_loss(
     states = [_state(stored, names) for stored in (before, after)]
     sets = _sets(len(names), min(most, len(names)), presence)
     nodes = [
-        _Change(*_change(*states, factor), factor).with_scatter(scatter, common)
+        _node(*states, factor, scatter, common)
         for factor in _nodes(error, _NODES[1], "error")
         for scatter in _nodes(spread, _NODES[0], "spread")
     ]
     evidence = np.array([each.log_evidence + _log_evidence_of_sets(each, sets, damaged) for each in nodes])
     weights = np.exp(evidence - evidence.max())
-    drawn = _draw(nodes, sets, weights / weights.sum(), damaged, n_draws, np.random.default_rng(seed))
+    drawn = _draw(nodes, sets, weights / weights.sum(), damaged, common, n_draws, np.random.default_rng(seed))
     findings = [
         each._replace(text=f"In the calibration {when}: {each.text}")
         for when, state in zip(("before", "after"), states, strict=True)
         for each in state.findings
     ]
     return StiffnessLoss(names, *drawn, (*findings, *check_most(drawn[2], most, len(names))))
-
-
-# ---------------------------------------------------------------------- the calibrations
 
 
 class _State(NamedTuple):
@@ -246,46 +243,24 @@ def _prior_moments(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
     return logs.mean(axis=0), np.cov(logs.T)
 
 
-# ---------------------------------------------------------------------- the change between them
+class _Node(NamedTuple):
+    """Likelihood exp(log_evidence + vector' T - T' matrix T / 2) of the change T (d,) of the damaged stiffnesses.
 
-
-class _Change(NamedTuple):
-    """Likelihood exp(log_evidence + vector' T - T' matrix T / 2) of the change T (d,) of the logarithms.
-
-    With `scatter`, T is the change of the damaged stiffnesses, and the scatter and the common factor are integrated
-    out; `covariance` is their posterior covariance if T = 0, and `alone` the likelihood without them.
+    The scatter and the common factor are integrated out; `covariance` is their posterior covariance if T = 0, and
+    `alone` has the matrix and the vector without them.
     """
 
     matrix: np.ndarray
     vector: np.ndarray
     log_evidence: float
+    covariance: np.ndarray
+    alone: tuple[np.ndarray, np.ndarray]
     error: float
-    scatter: float = 0.0
-    common: float = 0.0
-    covariance: np.ndarray | None = None
-    alone: "_Change | None" = None
-
-    def with_scatter(self, scatter: float, common: float) -> "_Change":
-        d = len(self.vector)
-        variance = scatter**2 * np.eye(d) + common**2
-        both = np.eye(d) + self.matrix @ variance
-        matrix, vector = np.linalg.solve(both, self.matrix), np.linalg.solve(both, self.vector)
-        gain = -0.5 * np.linalg.slogdet(both)[1] + 0.5 * self.vector @ variance @ vector
-        covariance = variance @ np.linalg.inv(both)
-        return _Change(
-            0.5 * (matrix + matrix.T),
-            vector,
-            self.log_evidence + gain,
-            self.error,
-            scatter,
-            common,
-            0.5 * (covariance + covariance.T),
-            self,
-        )
+    scatter: float
 
 
-def _change(before: _State, after: _State, factor: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Matrix, vector and constant of the likelihood of the change, the stiffnesses before integrated out."""
+def _node(before: _State, after: _State, factor: float, scatter: float, common: float) -> _Node:
+    """The likelihood with a factor of the errors and a scatter, the stiffnesses before integrated out."""
     center, d = before.center, len(before.center)
     first, second = before.information / factor**2, after.information / factor**2
     peak, later = before.peak - center, after.peak - center
@@ -294,13 +269,23 @@ def _change(before: _State, after: _State, factor: float) -> tuple[np.ndarray, n
     mean = covariance @ (first @ peak)
     # x_before ~ N(mean, covariance), and the likelihood after of x_before + T
     spread = np.eye(d) + second @ covariance
-    matrix = np.linalg.solve(spread, second)
-    matrix = 0.5 * (matrix + matrix.T)
+    matrix = _symmetric(np.linalg.solve(spread, second))
+    vector = matrix @ (later - mean)
     of_before = mean @ precision @ mean - peak @ first @ peak - np.linalg.slogdet(precision)[1]
-    of_after = -np.linalg.slogdet(spread)[1] - (later - mean) @ matrix @ (later - mean)
+    of_after = -np.linalg.slogdet(spread)[1] - (later - mean) @ vector
     # densities of the peaks, whose errors grow with the factor
-    constant = 0.5 * (of_before + of_after) - (before.seen + after.seen) * np.log(factor)
-    return matrix, matrix @ (later - mean), float(constant)
+    log_evidence = 0.5 * (of_before + of_after) - (before.seen + after.seen) * np.log(factor)
+    variance = scatter**2 * np.eye(d) + common**2
+    both = np.eye(d) + matrix @ variance
+    damaged = np.linalg.solve(both, vector)
+    log_evidence += 0.5 * vector @ variance @ damaged - 0.5 * np.linalg.slogdet(both)[1]
+    of_scatter = _symmetric(variance @ np.linalg.inv(both))
+    of_damage = _symmetric(np.linalg.solve(both, matrix))
+    return _Node(of_damage, damaged, float(log_evidence), of_scatter, (matrix, vector), factor, scatter)
+
+
+def _symmetric(matrix: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrix + matrix.T)
 
 
 def _nodes(value: Distribution | float, n: int, name: str) -> np.ndarray:
@@ -311,9 +296,6 @@ def _nodes(value: Distribution | float, n: int, name: str) -> np.ndarray:
             f"stiffness_loss: expected {name} as a positive number, or a distribution of one; got {value!r}"
         )
     return nodes
-
-
-# ---------------------------------------------------------------------- sets of damaged stiffnesses
 
 
 class _Sets(NamedTuple):
@@ -335,7 +317,7 @@ def _sets(d: int, most: int, presence: float) -> _Sets:
     return _Sets(members, [np.full(len(each), log) for each, log in zip(members, logs, strict=True)])
 
 
-def _given_sets(change: _Change, members: np.ndarray, damaged: LogNormal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _given_sets(change: _Node, members: np.ndarray, damaged: LogNormal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Precision (n, m, m), mean (n, m) and log-evidence (n,) of the damage of sets (n, m), relative to no damage."""
     m = members.shape[1]
     mean, variance = np.log(damaged.median), damaged.log_sd**2
@@ -346,7 +328,7 @@ def _given_sets(change: _Change, members: np.ndarray, damaged: LogNormal) -> tup
     return precision, found, log_evidence - 0.5 * m * (np.log(variance) + mean**2 / variance)
 
 
-def _log_evidence_of_sets(change: _Change, sets: _Sets, damaged: LogNormal) -> np.ndarray:
+def _log_evidence_of_sets(change: _Node, sets: _Sets, damaged: LogNormal) -> np.ndarray:
     """Logarithms (n_sets,) of prior times evidence of all sets, in order."""
     found = [sets.log_prior[0]]
     for members, log_prior in zip(sets.members[1:], sets.log_prior[1:], strict=True):
@@ -356,14 +338,20 @@ def _log_evidence_of_sets(change: _Change, sets: _Sets, damaged: LogNormal) -> n
 
 
 def _draw(
-    nodes: list[_Change], sets: _Sets, weights: np.ndarray, damaged: LogNormal, n: int, rng: np.random.Generator
+    nodes: list[_Node],
+    sets: _Sets,
+    weights: np.ndarray,
+    damaged: LogNormal,
+    common: float,
+    n: int,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Losses (n, d), common factors, numbers of damaged stiffnesses and factors of the errors (n,)."""
     cumulative = np.cumsum(weights.ravel())
     chosen = np.searchsorted(cumulative / cumulative[-1], (np.arange(n) + rng.random()) / n)
     node, number = np.unravel_index(np.minimum(chosen, weights.size - 1), weights.shape)
     d = len(nodes[0].vector)
-    damage, change, common = np.zeros((n, d)), np.empty((n, d)), np.empty(n)
+    damage, change, factors = np.zeros((n, d)), np.empty((n, d)), np.empty(n)
     count = np.empty(n, dtype=int)
     for k in np.unique(node):
         for rows, members in _rows_by_size(np.flatnonzero(node == k), number, sets):
@@ -375,12 +363,12 @@ def _draw(
                 damage[rows[:, None], members] = mean + noise
         rows = np.flatnonzero(node == k)
         each, factor = nodes[k], np.linalg.cholesky(nodes[k].covariance)
-        pull = each.alone.vector - damage[rows] @ each.alone.matrix
+        pull = each.alone[1] - damage[rows] @ each.alone[0]
         other = pull @ each.covariance + rng.standard_normal((len(rows), d)) @ factor.T
-        precision = 1.0 / each.common**2 + d / each.scatter**2
+        precision = 1.0 / common**2 + d / each.scatter**2
         shared = other.sum(axis=1) / each.scatter**2 / precision + rng.standard_normal(len(rows)) / np.sqrt(precision)
-        common[rows], change[rows] = np.exp(shared), damage[rows] + other - shared[:, None]
-    return -np.expm1(change), common, count, np.array([nodes[k].error for k in node])
+        factors[rows], change[rows] = np.exp(shared), damage[rows] + other - shared[:, None]
+    return -np.expm1(change), factors, count, np.array([nodes[k].error for k in node])
 
 
 def _rows_by_size(rows: np.ndarray, number: np.ndarray, sets: _Sets) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -37,6 +37,9 @@ __all__ = [
 ]
 
 
+_MOST = 1000  # samples of a test in a hierarchical model; the time of an evaluation is proportional to them
+
+
 @dataclass(frozen=True, eq=False)
 class StoredPosterior:
     """Posterior samples of one test, with the prior and the evidence.
@@ -252,31 +255,24 @@ def log_density_on_scale(prior: Prior, scales: Scales, points: np.ndarray) -> np
     return log_density.reshape(points.shape[:-1])
 
 
-def describe(
-    stored: StoredPosterior,
-    names: Sequence[str],
-    scales: Scales,
-    max_samples: int,
-    seed: int = 0,
-) -> DescribedPosterior:
+def describe(stored: StoredPosterior, names: Sequence[str], scales: Scales) -> DescribedPosterior:
     """Describe the stored samples of some parameters.
 
-    More than `max_samples` are thinned: evenly, or by systematic resampling if they have weights. ValueError if a
-    parameter is unknown, has a joint prior with parameters that are not described, or has samples that its scale does
-    not permit; and as `fit_mixture`.
+    More than 1000 are thinned: evenly, or by systematic resampling if they have weights. ValueError if a parameter is
+    unknown, has a joint prior with parameters that are not described, or has samples that its scale does not permit;
+    and as `fit_mixture`.
     """
     prior, points = on_scale(stored, names, scales)
-    rng, weights = np.random.default_rng(seed), np.exp(stored.log_weights)
+    rng, weights = np.random.default_rng(0), np.exp(stored.log_weights)
     equal = np.ptp(stored.log_weights) == 0.0
-    rows = systematic(weights, rng, min(len(points), max_samples))  # evenly spaced rows for equal weights
-    mixture = _fit(points[rows], names, stored.effective_sample_size, seed)
-    if len(points) > max_samples:
+    rows = systematic(weights, rng, min(len(points), _MOST))  # evenly spaced rows for equal weights
+    mixture = _fit(points[rows], names, stored.effective_sample_size)
+    log_weights = stored.log_weights
+    if len(points) > _MOST:
         points, log_weights = points[rows], np.full(len(rows), -np.log(len(rows)))
-    else:
-        log_weights = np.full(len(points), -np.log(len(points))) if equal else stored.log_weights
-    size = min(stored.effective_sample_size, max_samples)
-    if len(stored.samples) > max_samples and not equal:  # resampling adds the error of as many samples
-        size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / max_samples)
+    size = min(stored.effective_sample_size, _MOST)
+    if len(stored.samples) > _MOST and not equal:  # resampling adds the error of as many samples
+        size = 1.0 / (1.0 / stored.effective_sample_size + 1.0 / _MOST)
     incomplete = DescribedPosterior(
         points, log_weights, np.zeros(len(points)), prior, scales, *_components(mixture), mixture, size
     )
@@ -304,7 +300,7 @@ def resampled_description(described: DescribedPosterior, rng: np.random.Generato
     )
 
 
-def _fit(points: np.ndarray, names: Sequence[str], effective: float, seed: int) -> MixtureDistribution:
+def _fit(points: np.ndarray, names: Sequence[str], effective: float) -> MixtureDistribution:
     """Mixture fitted to points of equal weight, in coordinates of mean zero and standard deviation one."""
     deviations = points.std(axis=0)
     if constant := [name for name, each in zip(names, deviations, strict=True) if not each > 0.0]:
@@ -315,7 +311,7 @@ def _fit(points: np.ndarray, names: Sequence[str], effective: float, seed: int) 
             for name, mean, sd in zip(names, points.mean(axis=0), deviations, strict=True)
         }
     )
-    return fit_mixture(points, coordinates, effective_sample_size=effective, seed=seed)
+    return fit_mixture(points, coordinates, effective_sample_size=effective, seed=0)
 
 
 def _components(mixture: MixtureDistribution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,9 +19,9 @@ from ..cache.verification import VerifiedCache
 from ..noise.statistics import Statistic
 from ..simulation.by_value import is_arriving
 from ..simulation.faults import ChangedModel
+from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
 from ..simulation.model import Model
-from ..simulation.opened import Opened
 
 __all__ = ["CheckedModel"]
 

@@ -29,6 +29,7 @@ from ..signals.channels import Measurements
 from ..signals.comparison import Comparison, compare_with
 from ..simulation.executors import as_executor
 from ..simulation.faults import ChangedModel
+from ..simulation.folder import Observed, unpack
 from ..simulation.model import (
     Model,
     SimulationBatch,
@@ -39,7 +40,6 @@ from ..simulation.model import (
     sent_simulation,
     simulate_batch,
 )
-from ..simulation.opened import Observed, unpack
 from .checked_model import CheckedModel
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic

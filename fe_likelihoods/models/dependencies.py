@@ -8,8 +8,8 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+from ..simulation.files import file_digest
 from ..simulation.label import value_digest
-from ..simulation.opened import file_digest
 
 __all__ = ["Dependencies", "content_digest"]
 

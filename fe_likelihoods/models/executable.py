@@ -1,7 +1,7 @@
 """Model defined by an external program: it reads input files that contain the parameters, and writes an output file.
 
 Each run has a temporary folder. A program that hangs, crashes, writes too much or returns an unusable response is a
-failed simulation, with a reason and the last lines of its standard error. The folders of failed runs can be kept.
+failed simulation, with a reason and the last lines of its standard error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..signals.records import Record
 from ..simulation.faults import RunFailed, TransientReason, reason_of
-from ..simulation.folder import keep_folder
+from ..simulation.folder import KEEP, keep_folder
 from ..simulation.model import SimulationFailed
 from ..simulation.programs import run_program
 from ..simulation.worker import describe_exit, last_lines
@@ -31,7 +31,7 @@ from .dependencies import content_digest
 from .user_model import UserModel
 from .validation import positive_float
 
-__all__ = ["ExecutableModel"]
+__all__ = ["ExecutableModel", "read_table"]
 
 _WATCH_INTERVAL = 0.1  # [s] between checks of the output size
 _FREE_BYTES = 2**16  # less free space than this may be the reason of a failure
@@ -46,7 +46,11 @@ class ExecutableModel(UserModel):
     the run, without a shell and without standard input.
 
     After the program has ended or was stopped, all processes in its process group are killed. A program that is stopped
-    is killed with all processes that it waits for, on Linux. Daemons, containers and queued jobs are not found.
+    is killed with all processes that it waits for, on Linux. Daemons, containers and queued jobs are not found. It has
+    the environment variables of this process: name those that matter in `depends_on`. A run that writes more than 256
+    MiB is stopped. The folders of failed runs are kept where the variable ``FE_LIKELIHOODS_KEEP_FAILURES`` says so. The
+    label contains the program, and files that an argument names by an absolute path, alone or as in
+    ``--script=/path``.
 
     Parameters
     ----------
@@ -84,21 +88,6 @@ class ExecutableModel(UserModel):
         another record then need no `from_state`.
     files : mapping of str to Path, optional
         Further files, copied into the run folder under the given names.
-    keep_failures : path, optional
-        Folder into which the folders of failed runs are moved, each with a file ``reason.txt``.
-    max_kept : int
-        Largest number of folders that are kept there.
-    max_output : int
-        Largest amount that a run may write into the run folder and to standard output and error [bytes].
-    env : mapping of str to str, optional
-        All environment variables of the program; they are part of the fingerprint. By default the program has the
-        variables of this process at each run, which are not part of the fingerprint: name the variables that matter in
-        `depends_on`, since a cache compares only some of its rows with new runs.
-    hash_executable : bool
-        Whether the label contains the content of the program, and of files that an argument names by an absolute
-        path, alone or as in ``--script=/path``. For large installations use `version` instead.
-    written : sequence of Path, optional
-        Files among `files` that the program itself writes, such as a log; the label does not contain them.
     version : str, optional
         Text that enters the fingerprint; change it whenever the program computes something else for a reason that the
         files do not show. If `output` is a function, it replaces the code of the function.
@@ -126,6 +115,8 @@ class ExecutableModel(UserModel):
     array([[0.05]])
     """
 
+    max_output = 2**28  # [bytes] that a run may write
+
     def __init__(
         self,
         command: Sequence[str | Path],
@@ -143,19 +134,11 @@ class ExecutableModel(UserModel):
         columns: Sequence[int] | None = None,
         output_units: Mapping[str, str] | None = None,
         files: Mapping[str, Path] | None = None,
-        keep_failures: str | Path | None = None,
-        max_kept: int = 20,
-        max_output: int = 2**28,
-        env: Mapping[str, str] | None = None,
-        hash_executable: bool = True,
-        written: Sequence[str | Path] = (),
         version: str | None = None,
         depends_on: Sequence[Any] = (),
     ) -> None:
         super().__init__(parameter_names, channels, dt, n_steps, depends_on, record, path_dependent)
         self.time_limit = positive_float(time_limit, "ExecutableModel: time_limit", "seconds")
-        self.max_output = int(positive_float(max_output, "ExecutableModel: max_output", "bytes"))
-        self.max_kept = int(positive_float(max_kept, "ExecutableModel: max_kept", "folders"))
         if isinstance(command, str | Path) or not command:
             raise ValueError(
                 f"ExecutableModel: command must be a list with the program and its arguments; got {command!r}"
@@ -183,14 +166,10 @@ class ExecutableModel(UserModel):
             )
         self.output_units = dict(output_units or {})
         self._factors = self._check_units()
-        self.env = None if env is None else _environment(env)
-        self.keep_failures = None if keep_failures is None else Path(keep_failures).resolve()
         self.version = version
-        written = {Path(file).resolve() for file in written}
-        named = _named_files(self.command) if hash_executable else []
         given = {*self.templates, *self.files, self.record_file}
         self._elsewhere = [part for part in self.command[1:] if os.path.isfile(part) and part not in given]
-        self._named = tuple(file for file in named if file.resolve() not in written)
+        self._named = tuple(_named_files(self.command))
         self._prepare()
 
     def _files(self) -> tuple[Path, ...]:
@@ -198,9 +177,7 @@ class ExecutableModel(UserModel):
 
     def _prepare(self) -> None:
         output = "function" if callable(self.output) else self.output
-        stated = [] if self.env is None else [sorted(self.env.items())]
-        if self.record is not None:
-            stated.append(["record", self.record_file, self.record.fingerprint])
+        stated = [] if self.record is None else [["record", self.record_file, self.record.fingerprint]]
         if self.output_units:
             stated.append(["output units", sorted(self.output_units.items())])
         self.fingerprint = self._digest(output, self.columns, self.version, *stated)
@@ -304,9 +281,8 @@ class ExecutableModel(UserModel):
                 raise RunFailed(TransientReason(f"stopped because it wrote more than {self.max_output} bytes"), seconds)
             return min(_WATCH_INTERVAL, self.time_limit - seconds + 1e-3)
 
-        environment = os.environ if self.env is None else self.env
         outputs = place / "stdout.txt", place / "stderr.txt"
-        exit_code = run_program([self.command[0], *arguments], environment, place / "run", *outputs, place, watch)
+        exit_code = run_program([self.command[0], *arguments], place / "run", *outputs, place, watch)
         seconds = time.monotonic() - start
         if exit_code:
             with open(outputs[1], "rb") as stderr:
@@ -331,16 +307,7 @@ class ExecutableModel(UserModel):
         """Read the response from the folder of the run."""
         if callable(self.output):
             return self.output(folder)
-        path = folder / self.output
-        if not path.is_file():
-            raise SimulationFailed(f"the program succeeded but wrote no file {self.output}")
-        text = path.read_text().replace(",", " ").splitlines()
-        if not any(line.partition("#")[0].strip() for line in text):
-            raise SimulationFailed(f"{self.output} is empty")
-        try:
-            table = np.loadtxt(text, ndmin=2)
-        except ValueError as error:
-            raise SimulationFailed(f"{self.output} is not a table of numbers: {error}") from error
+        table = read_table(folder, self.output)
         if table.shape[1] <= max(self.columns) or (self._no_other_columns and table.shape[1] != len(self.columns)):
             wanted = (
                 f"{len(self.columns)} columns"
@@ -351,10 +318,23 @@ class ExecutableModel(UserModel):
         return self._factors * table[:, self.columns].T
 
     def _keep(self, place: Path, values: dict[str, str], reason: str, seconds: float) -> None:
-        """Move the folder of a failed run to `keep_failures`."""
-        if self.keep_failures is not None:
+        """Keep the folder of a failed run, if that is asked for."""
+        if os.environ.get(KEEP):
             lines = [reason, f"after {seconds:.3g} s", *(f"{name} = {value}" for name, value in values.items())]
-            keep_folder(place, self.keep_failures, "\n".join(lines) + "\n", self.max_kept)
+            keep_folder(place, os.environ[KEEP], "\n".join(lines) + "\n")
+
+
+def read_table(folder: Path, name: str) -> np.ndarray:
+    """Numbers (n_lines, n_columns) in a file that a program has written; `SimulationFailed` if there are none."""
+    if not (folder / name).is_file():
+        raise SimulationFailed(f"the program succeeded but wrote no file {name}")
+    text = (folder / name).read_text().replace(",", " ").splitlines()
+    if not any(line.partition("#")[0].strip() for line in text):
+        raise SimulationFailed(f"{name} is empty")
+    try:
+        return np.loadtxt(text, ndmin=2)
+    except ValueError as error:
+        raise SimulationFailed(f"{name} is not a table of numbers: {error}") from error
 
 
 def _executable(name: str) -> str:
@@ -365,19 +345,6 @@ def _executable(name: str) -> str:
             f"ExecutableModel: expected an executable program, as a path or in the folders of PATH; got {name!r}"
         )
     return os.path.abspath(found)
-
-
-def _environment(env: Mapping[str, str]) -> dict[str, str]:
-    """Copy of environment variables; ValueError for names and values that no process can have."""
-    if not isinstance(env, Mapping):
-        raise ValueError(f"ExecutableModel: env must be a mapping of names to values, both str; got {env!r}")
-    for name, value in env.items():
-        text = isinstance(name, str) and isinstance(value, str)
-        if not text or not name or "=" in name or "\0" in name + value:
-            raise ValueError(
-                f"ExecutableModel: env must map names without '=' to values, both str; got {name!r}: {value!r}"
-            )
-    return dict(env)
 
 
 def _inside(name: str) -> str:

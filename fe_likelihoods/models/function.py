@@ -18,8 +18,9 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import sample_window
 from ..simulation.faults import UnusableModel
-from ..simulation.opened import Observed, note
-from ..simulation.sandbox import Sandbox
+from ..simulation.files import note
+from ..simulation.folder import Observed
+from ..simulation.worker import Sandbox
 from .user_model import UserModel
 from .validation import check_theta, positive_float
 
@@ -181,9 +182,7 @@ class FunctionModel(UserModel):
             function = _Bound(function, self.record, n_steps)
         if not self.isolated:
             return function
-        return Sandbox(
-            Observed(function), self.time_limit, self.memory_limit or 0, runs_per_process=self.runs_per_process
-        )
+        return Sandbox(Observed(function), self.time_limit, self.memory_limit or 0, self.runs_per_process)
 
     def code_parts(self) -> dict[str, Any]:
         """User code, for the label of stored simulations."""

@@ -6,7 +6,6 @@ part is kept until each other part has taken it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from ..signals.channels import Channel
 from ..simulation.model import Model, SimulationBatch, SimulationFailed, simulate_batch
 from .base import digest
+from .executable import read_table
 
 __all__ = ["PartOfRun", "one_run"]
 
@@ -63,7 +63,7 @@ def one_run(
         raise ValueError(f"one_run: expected an output for each of the parts {', '.join(parts)}; got {output!r}")
     shapes = {name: (len(channels), n_steps) for name, (channels, _, n_steps) in parts.items()}
     size = sum(rows * columns for rows, columns in shapes.values())
-    joined = _Files(dict(output), shapes) if isinstance(output, Mapping) else _Joined(output, shapes)
+    joined = _Joined(dict(output) if isinstance(output, Mapping) else output, shapes)
     everything = (Channel("all responses", "dimensionless", "1"),)
     run, first, models = _Run(make(joined, channels=everything, dt=1.0, n_steps=size), len(parts)), 0, {}
     for name, (channels, dt, n_steps) in parts.items():
@@ -74,32 +74,17 @@ def one_run(
 
 
 class _Joined:
-    """Function that returns the samples of all responses of a user's function as one row."""
+    """Function that returns the samples of all responses of a user's function, or of all output files, as one row."""
 
-    def __init__(self, function: Callable[..., Mapping[str, Any]], shapes: Mapping[str, tuple[int, int]]) -> None:
-        self.function, self.shapes = function, shapes
+    def __init__(
+        self, output: Callable[..., Mapping[str, Any]] | Mapping[str, str], shapes: Mapping[str, tuple[int, int]]
+    ) -> None:
+        self.output, self.shapes = output, shapes
 
     def __call__(self, *arguments: Any) -> np.ndarray:
-        return _in_a_row(self.function(*arguments), self.shapes)
-
-
-class _Files:
-    """Function of a folder that returns the samples of all output files as one row."""
-
-    def __init__(self, files: Mapping[str, str], shapes: Mapping[str, tuple[int, int]]) -> None:
-        self.files, self.shapes = files, shapes
-
-    def __call__(self, folder: Path) -> np.ndarray:
-        found = {}
-        for name, file in self.files.items():
-            if not (folder / file).is_file():
-                raise SimulationFailed(f"the program succeeded but wrote no file {file}")
-            text = (folder / file).read_text().replace(",", " ")
-            try:
-                found[name] = np.loadtxt(text.splitlines(), ndmin=2).T
-            except ValueError as error:
-                raise SimulationFailed(f"{file} is not a table of numbers: {error}") from error
-        return _in_a_row(found, self.shapes)
+        if callable(self.output):
+            return _in_a_row(self.output(*arguments), self.shapes)
+        return _in_a_row({name: read_table(*arguments, file).T for name, file in self.output.items()}, self.shapes)
 
 
 def _in_a_row(responses: Any, shapes: Mapping[str, tuple[int, int]]) -> np.ndarray:

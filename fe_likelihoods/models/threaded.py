@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
+import numba
 import numpy as np
 
-from ..simulation.model import MisfitBatch, SimulationBatch
-from ..simulation.threads import map_threads
+from ..simulation.model import SimulationBatch, SimulationFailed
 from .base import BuiltInModel
-from .validation import check_measured, check_thetas
+from .validation import check_thetas
 
 __all__ = ["ThreadedModel"]
 
@@ -23,25 +25,36 @@ class ThreadedModel(BuiltInModel):
     `_prepared`.
     """
 
-    runs_on_threads: ClassVar[bool] = True
-
     def simulate_batch(self, thetas: np.ndarray) -> SimulationBatch:
         """Simulate rows of `thetas` (n, n_parameters) on as many threads as numba uses; rows that failed are NaN, with
         reasons.
         """
         thetas = check_thetas(thetas, self.parameter_names)
         _ = self._prepared  # computed here, so that not every thread computes it
-        return SimulationBatch(*map_threads(self._respond, thetas, (len(self.channels), self.n_steps)))
+        response = np.full((len(thetas), len(self.channels), self.n_steps), np.nan)
+        reasons = [""] * len(thetas)
 
-    def misfit_batch(self, thetas: np.ndarray, measured: np.ndarray) -> MisfitBatch:
-        """Sums (n, n_channels) of squared residuals to `measured` (n_channels, n_steps) [SI] at rows of `thetas`.
+        def one(i: int) -> None:
+            try:
+                values = self._respond(thetas[i])
+                if np.iscomplexobj(values):  # the assignment would keep the real part
+                    raise ValueError("expected real numbers, got complex ones")
+                response[i] = values
+            except SimulationFailed as failure:
+                reasons[i] = failure.reason
 
-        Rows that failed are NaN, with reasons; responses are not stored.
-        """
-        thetas = check_thetas(thetas, self.parameter_names)
-        measured = check_measured(measured, self.channels, self.n_steps)
-        _ = self._prepared  # computed here, so that not every thread computes it
-        return MisfitBatch(*map_threads(self._respond, thetas, (len(self.channels),), measured))
+        n_threads = min(numba.get_num_threads(), len(thetas), os.cpu_count() or 1)
+        if n_threads <= 1:
+            for i in range(len(thetas)):
+                one(i)
+            return SimulationBatch(response, reasons)
+        with ThreadPoolExecutor(n_threads) as threads:
+            try:
+                list(threads.map(one, range(len(thetas))))
+            except BaseException:  # Ctrl-C: cancel the simulations that have not begun
+                threads.shutdown(wait=False, cancel_futures=True)
+                raise
+        return SimulationBatch(response, reasons)
 
     def _prepare(self) -> Any:
         raise NotImplementedError

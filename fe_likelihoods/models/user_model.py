@@ -21,7 +21,7 @@ from ..signals.channels import Channel
 from ..signals.records import Record
 from ..signals.sampling import rest_samples
 from ..simulation.by_value import is_arriving
-from ..simulation.faults import ChangedModel, TransientReason, reason_of
+from ..simulation.faults import ChangedModel, reason_of, reworded
 from ..simulation.interrupts import raise_if_it_ends_the_run
 from ..simulation.model import SimulationFailed, real_response
 from .base import StructuralModel, digest
@@ -104,7 +104,7 @@ class ExternalModel(StructuralModel):
             seconds = getattr(error, "seconds", None)  # excludes the start of a process, where that is known
             seconds = time.perf_counter() - start if seconds is None else seconds
             text = f"{reason} after {seconds:.3g} s"
-            raise SimulationFailed(reason.with_text(text) if isinstance(reason, TransientReason) else text) from error
+            raise SimulationFailed(reworded(reason, text)) from error
 
     def _digest(self, *parts: Any) -> str:
         """Fingerprint of the names, the channels, the step, the length and `parts`, which JSON can represent."""

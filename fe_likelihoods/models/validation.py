@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from ..signals.channels import Channel
 from ..simulation.model import SimulationFailed
 
 __all__ = [
     "check_fields",
     "check_finite",
     "check_integer",
-    "check_measured",
     "check_names",
     "check_nominal",
     "check_non_negative",
@@ -139,15 +137,3 @@ def check_thetas(thetas: np.ndarray, names: Sequence[str]) -> np.ndarray:
             f"expected rows with one value for each of {tuple(names)}, shape (n, {len(names)}); got {thetas.shape}"
         )
     return thetas
-
-
-def check_measured(measured: np.ndarray, channels: Sequence[Channel], n_steps: int) -> np.ndarray:
-    """Convert measured responses to floats (n_channels, n_steps); raise ValueError for another shape."""
-    measured = np.asarray(measured, dtype=float)
-    if measured.shape != (len(channels), n_steps):
-        raise ValueError(
-            f"expected measured responses of shape {(len(channels), n_steps)}, one row for each of "
-            f"{[c.name for c in channels]}; got {measured.shape}; resample and trim the record and the measurements to "
-            "the same step and length"
-        )
-    return measured

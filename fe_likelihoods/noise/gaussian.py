@@ -133,7 +133,7 @@ class GaussianNoise:
     ``local=1``.
     Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may
     prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
-    ``level="si"`` (`fit_measures`). The statistics are not quadratic in the residuals, so samplers cannot use a guide.
+    ``level="si"``. The statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
     **Frequency bands.** The coefficients of the orthonormal cosine transform (DCT-II) are independent. In band b their
     variance is sensor^2 + (share_b u_b)^2, where u_b is the root mean square of the response coefficients in the band,

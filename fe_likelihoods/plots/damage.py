@@ -24,9 +24,6 @@ _EXTENT = (
     ("residual drift", "residual drift", 100.0, "%"),
     ("dissipated energy", "energy", 1e-3, "kJ"),
     ("Park-Ang index", "Park-Ang index", 1.0, ""),
-    ("period", "period", 1.0, "s"),
-    ("damping", "damping", 100.0, "%"),
-    ("stiffness ratio", "stiffness ratio", 1.0, ""),
 )
 """Measures that are written beside the columns: name, label, factor, unit."""
 
@@ -91,7 +88,7 @@ def plot_damage(damage: Damage, events: Sequence[str] | None = None) -> Figure:
     bar = figure.colorbar(
         ScalarMappable(Normalize(0.0, 1.0), colours), ax=panels[:, :-1], location="bottom", aspect=50, pad=0.02
     )
-    label = f"probability, from {damage.effective_sample_size:.0f} effective samples; {damage.uncertainty}"
+    label = f"probability, from {damage.prediction.effective_sample_size:.0f} effective samples; {damage.uncertainty}"
     bar.set_label(label + (f"\n{damage.failures}" if damage.failures else ""), fontsize=7)
     bar.ax.tick_params(labelsize=7)
     return figure
@@ -101,7 +98,7 @@ def _draw_column(axes: Axes, damage: Damage, state: str, event: int, colours) ->
     """Draw one column with the probabilities of one limit state after one event."""
     from matplotlib.patches import Rectangle
 
-    height, heights = damage.height, damage.heights
+    height, heights = damage.prediction.quantity.height, damage.prediction.quantity.heights
     probability = damage.location[state].probability[event]
     axes.add_patch(Rectangle((-1.7, -0.06 * height), 3.4, 0.06 * height, facecolor="0.55"))
     axes.add_patch(Rectangle((-1.4, height), 2.8, 0.07 * height, facecolor="0.78", edgecolor="0.5", linewidth=0.6))
@@ -148,8 +145,8 @@ def _write_extent(axes: Axes, damage: Damage, event: int, states: Sequence[str])
     """Write the probabilities of limit states without a place, and the quantiles of the measures."""
     axes.set_axis_off()
     lines = []
-    if damage.probabilities:
-        order = np.argsort(damage.probabilities)
+    if damage.prediction.probabilities:
+        order = np.argsort(damage.prediction.probabilities)
         low, middle, high = order[0], order[len(order) // 2], order[-1]
         for name, label, factor, unit in _EXTENT:
             if name in damage.extent:

@@ -1,138 +1,172 @@
-"""Statistics of a quantity that are accumulated while responses arrive in batches."""
+"""Mean, variance and quantiles of a quantity over samples, from responses that arrive in batches.
+
+Mean and variance need one pass. They are combined over batches by the update of T. F. Chan, G. H. Golub and R. J.
+LeVeque (1983), The American Statistician 37(3), 242-247, doi:10.1080/00031305.1983.10483115, which avoids the
+cancellation in "mean square minus squared mean". Quantiles need the values themselves. See
+``docs/theory/prediction.rst``.
+"""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..noise.draws import SampleNoise
 from ..simulation.model import is_collapse, split_seconds
 from .model_error import ModelError
-from .streaming import RetainedResults, RunningMoments
+from .quantities import Evaluator
 
-__all__ = ["Accumulator"]
+__all__ = ["Accumulator", "RunningMoments", "quantiles_with_errors"]
+
+_IN_DOUBLE = 2**29  # bytes of histories; larger ones are kept in single precision, which has seven digits
+_MOST = 2**32  # bytes in single precision: 500 samples of 20 channels with 100 000 steps
+_CHUNK = 2**18  # values that are sorted at once
 
 
-@dataclass(eq=False)
+class RunningMoments:
+    """Running mean (None before the first sample) and variance of `count` equally shaped arrays."""
+
+    def __init__(self) -> None:
+        self.count = 0.0
+        self.mean: np.ndarray | None = None
+        self._squares: np.ndarray | None = None
+
+    def add(self, values: np.ndarray, counts: np.ndarray) -> None:
+        """Add results `values` (m, ...) that stand for `counts` (m,) samples each."""
+        total = float(counts.sum())
+        mean = np.tensordot(counts / total, values, axes=1)
+        deviations = values - mean
+        with np.errstate(over="ignore"):  # unstable responses may have an infinite variance
+            squares = np.tensordot(counts, np.square(deviations, out=deviations), axes=1)
+        if self.mean is None:
+            self.count, self.mean, self._squares = total, mean, squares
+            return
+        joint = self.count + total
+        shift = mean - self.mean
+        self.mean = self.mean + shift * (total / joint)
+        with np.errstate(over="ignore"):
+            self._squares = self._squares + squares + shift**2 * (self.count * total / joint)
+        self.count = joint
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Mean squared deviation from the mean, shape (...)."""
+        return self._squares / self.count
+
+
 class Accumulator:
-    """Evaluates a quantity of responses and accumulates its statistics, by result and by sample.
+    """Evaluates a quantity of responses and keeps its values: one per response, with noise one per sample.
 
-    A result is the value of the quantity for one response. Without noise, equal samples share one result. With noise,
-    every sample has its own.
+    `members` are the sample indices of each distinct parameter set; histories are kept if `keep`, for their quantiles.
     """
 
-    members: list[np.ndarray]  # sample indices for each distinct theta
-    noise: SampleNoise | ModelError | None  # None: without noise
-    evaluate: Callable[[np.ndarray], np.ndarray] | None  # of a response (n_channels, n_steps) [SI]; None for histories
-    rows: list[int] | None  # of the response whose histories are wanted, or None
-    result_of_sample: np.ndarray  # (n,)
-    probabilities: tuple[float, ...]  # of the quantiles
-    memory_bytes: int | None  # of the retained results [bytes]; None: no limit
-    seeds: np.random.SeedSequence  # of the noise and of the choice of retained samples
-    moments: RunningMoments = field(default_factory=RunningMoments)  # of histories without noise
-    noise_variance: RunningMoments = field(default_factory=RunningMoments)  # of histories; per step for some noises
-    retained: RetainedResults | None = None  # results for quantiles
-    failed: list[np.ndarray] = field(default_factory=list)  # indices of samples that are left out
-    collapsed: list[np.ndarray] = field(default_factory=list)  # indices of samples whose structure collapsed
-    reasons: Counter = field(default_factory=Counter)  # samples left out per reason, without durations
-    shape: tuple[int, ...] | None = None  # of a result; None until it is known
+    def __init__(
+        self,
+        quantity: Evaluator,
+        members: Sequence[np.ndarray],
+        noise: SampleNoise | ModelError | None,
+        keep: bool,
+        entropy: int,
+        n_steps: int,
+    ) -> None:
+        self.quantity, self.members, self.noise, self.keep = quantity, members, noise, keep
+        n = sum(len(each) for each in members)
+        self.result_of_sample = np.arange(n)  # with noise
+        if noise is None:
+            for row, each in enumerate(members):
+                self.result_of_sample[each] = row
+        self.moments = RunningMoments()  # of histories without the noise
+        self.noise_variance = RunningMoments()  # of histories; per step for some noises
+        self.failed: list[np.ndarray] = []  # indices of samples that are left out
+        self.collapsed: list[np.ndarray] = []  # indices of samples whose structure collapsed
+        self.reasons: Counter = Counter()  # samples left out per reason, without durations
+        self.shape: tuple[int, ...] | None = None  # of a value; None until it is known
+        self._entropy = entropy
+        if quantity.rows is not None:
+            self._allocate((len(quantity.rows), n_steps))
 
-    def allocate(self, shape: tuple[int, ...]) -> None:
-        """Allocate memory for retained results, once the shape of a result is known."""
-        self.shape = shape
-        histories = self.rows is not None
-        if histories and not self.probabilities:
+    def _allocate(self, shape: tuple[int, ...]) -> None:
+        """Memory for the values, once their shape is known; ValueError for histories beyond the limit."""
+        self.shape, histories = shape, self.quantity.rows is not None
+        if histories and not self.keep:
             return
-        # Numbers are retained whatever the limit; arrays without quantiles only if all of them fit.
-        limit = None if shape == () else self.memory_bytes
-        n_results = int(self.result_of_sample.max()) + 1
-        fits = limit is None or 8 * int(np.prod(shape)) * n_results <= limit
-        if not self.probabilities and not fits:
-            return
-        rng = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(0,)))
-        dtype = np.float32 if histories and not fits else np.float64
-        self.retained = RetainedResults(self.result_of_sample, shape, dtype, limit, rng)
+        n = self.result_of_sample.max() + 1
+        values = n * int(np.prod(shape))
+        if histories and 4 * values > _MOST:
+            raise ValueError(
+                f"quantiles of these histories need {4e-9 * values:.1f} GB, at most {1e-9 * _MOST:.1f} are used: "
+                "predict fewer channels, take fewer samples, or use quantiles=() for mean and variance only"
+            )
+        dtype = np.float32 if histories and 8 * values > _IN_DOUBLE else np.float64
+        self._kept = np.empty((n, *shape), dtype=dtype)
 
     def add(self, start: int, responses: np.ndarray, reasons: list[str]) -> None:
-        """Add responses (m, n_channels, n_steps) [SI] of the distinct thetas from index `start` on.
+        """Add responses (m, n_channels, n_steps) [SI] of the distinct parameters from index `start` on.
 
         The reasons say why each simulation failed, empty for a success.
         """
-        members = self.members[start : start + len(responses)]
-        usable = []
+        members, rows = self.members[start : start + len(responses)], self.quantity.rows
+        usable = np.array([j for j, reason in enumerate(reasons) if not reason], dtype=int)
         for j, reason in enumerate(reasons):
             if reason:
                 self._leave_out(members[j], reason)
-            else:
-                usable.append(j)
-        if not usable:
+        if not len(usable):
             return
-        if self.rows is not None:
-            every = len(usable) == len(responses) and self.rows == list(range(responses.shape[1]))
-            histories = responses if every else responses[np.ix_(usable, self.rows)]
-            self._add_histories(start, histories, usable, members, responses)
+        if rows is not None:
+            every = len(usable) == len(responses) and rows == list(range(responses.shape[1]))
+            histories = responses if every else responses[np.ix_(usable, rows)]
+            self.moments.add(histories, np.array([len(members[j]) for j in usable]))
+            if self.noise is not None:
+                self._add_noisy(histories, responses[usable], [members[j] for j in usable])
+            elif self.keep:
+                self._keep(start + usable, histories)
         elif self.noise is None:
             values = [self._value(responses[j]) for j in usable]
-            self._add_values(values, [start + j for j in usable], [members[j] for j in usable])
+            self._add_values(values, start + usable, [members[j] for j in usable])
         else:
             for j in usable:
                 values = [self._value(responses[j] + self._noise(i, responses[j])) for i in members[j]]
-                self._add_values(values, list(members[j]), [np.array([i]) for i in members[j]])
+                self._add_values(values, members[j], [np.array([i]) for i in members[j]])
 
-    def _add_histories(
-        self,
-        start: int,
-        histories: np.ndarray,
-        usable: list[int],
-        members: Sequence[np.ndarray],
-        responses: np.ndarray,
-    ) -> None:
-        self.moments.add(histories, np.array([len(members[j]) for j in usable]))
-        if self.noise is None:
-            if self.retained is not None:
-                self.retained.add(start + np.array(usable), histories)
-            return
-        if self.noise.of_response is not None:
-            for j in usable:
-                for i in members[j]:
-                    variance = np.square(self.noise.of_response(self.noise.deviations[i], responses[j])[self.rows])
+    def _add_noisy(self, histories: np.ndarray, responses: np.ndarray, members: list[np.ndarray]) -> None:
+        """Variance of the noise, and a draw of it for each sample, for all channels whichever are wanted."""
+        rows, noise = self.quantity.rows, self.noise
+        if noise.of_response is None:
+            samples = np.concatenate(members)
+            self.noise_variance.add(np.square(noise.deviations[samples][..., rows]), np.ones(len(samples)))
+        for history, response, samples in zip(histories, responses, members, strict=True):
+            for i in samples:
+                if noise.of_response is not None:
+                    variance = np.square(noise.of_response(noise.deviations[i], response)[rows])
                     self.noise_variance.add(variance[None], np.ones(1))
-        else:
-            samples = np.concatenate([members[j] for j in usable])
-            self.noise_variance.add(np.square(self.noise.deviations[samples][..., self.rows]), np.ones(len(samples)))
-        if self.retained is None:
-            return
-        for history, j in zip(histories, usable, strict=True):
-            for i in members[j]:
-                if i in self.retained:
-                    # Noise is drawn for all channels, so that it does not depend on which channels are wanted.
-                    noise = self._noise(i, responses[j])
-                    self.retained.add(np.array([i]), (history + noise[self.rows])[None])
+                if self.keep:
+                    self._keep([i], (history + self._noise(i, response)[rows])[None])
 
-    def _add_values(self, values: list[np.ndarray], results: list[int], members: list[np.ndarray]) -> None:
-        finite = [bool(np.isfinite(value).all()) for value in values]
+    def _add_values(self, values: list[np.ndarray], results: np.ndarray, members: list[np.ndarray]) -> None:
+        finite = np.array([bool(np.isfinite(value).all()) for value in values])
         for usable, samples in zip(finite, members, strict=True):
             if not usable:
                 self._leave_out(samples, "the quantity is not finite")
-        if any(finite):
-            rows = np.array([value for value, usable in zip(values, finite, strict=True) if usable])
-            counts = np.array([len(samples) for samples, usable in zip(members, finite, strict=True) if usable])
-            self.moments.add(rows, counts)
-            if self.retained is not None:
-                self.retained.add(np.array(results)[finite], rows)
+        if finite.any():
+            rows = np.array(values)[finite]
+            self.moments.add(rows, np.array([len(samples) for samples in members])[finite])
+            self._keep(np.asarray(results)[finite], rows)
+
+    def _keep(self, results: Sequence[int], values: np.ndarray) -> None:
+        largest = float(np.finfo(self._kept.dtype).max)  # unstable responses stay finite in single precision
+        self._kept[results] = np.clip(values, -largest, largest)
 
     def _value(self, response: np.ndarray) -> np.ndarray:
-        value = np.asarray(self.evaluate(response), dtype=float)
+        value = np.asarray(self.quantity.function(response), dtype=float)
         if self.shape is None:
-            self.allocate(value.shape)
+            self._allocate(value.shape)
         if value.shape != self.shape:
             raise ValueError(f"quantity must return one shape for every response; got {self.shape}, then {value.shape}")
         return value
 
     def _noise(self, sample: int, response: np.ndarray) -> np.ndarray:
         # Each sample has its own random stream, so that its noise depends neither on batches nor on failures.
-        rng = np.random.default_rng(np.random.SeedSequence(self.seeds.entropy, spawn_key=(1, int(sample))))
+        rng = np.random.default_rng(np.random.SeedSequence(self._entropy, spawn_key=(1, int(sample))))
         return self.noise.draw(int(sample), response.shape[1], rng, response)
 
     def _leave_out(self, samples: np.ndarray, reason: str) -> None:
@@ -140,3 +174,45 @@ class Accumulator:
         if is_collapse(reason):
             self.collapsed.append(samples)
         self.reasons[split_seconds(reason)[0]] += len(samples)
+
+    def values_of(self, samples: np.ndarray) -> np.ndarray:
+        """Values (m, ...) of samples that did not fail."""
+        return self._kept[self.result_of_sample[samples]]
+
+    def quantiles(
+        self, samples: np.ndarray, probabilities: Sequence[float], effective: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Quantiles over samples that did not fail, and their errors, each (n_probabilities, ...)."""
+        kept = self._kept.reshape(len(self._kept), -1)
+        results, size = self.result_of_sample[samples], kept.shape[1]
+        out = np.empty((2, len(probabilities), size))
+        columns = max(1, _CHUNK // len(results))
+        for start in range(0, size, columns):
+            part = slice(start, start + columns)
+            out[:, :, part] = quantiles_with_errors(kept[results, part].astype(float), probabilities, effective)
+        return tuple(out.reshape(2, len(probabilities), *self.shape))
+
+
+def quantiles_with_errors(
+    values: np.ndarray, probabilities: Sequence[float], effective: float
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Quantiles (n_probabilities, k) of values (n, k) and their standard errors, inf for a single sample.
+
+    The number of samples below the p-quantile is binomial, so that its rank has the standard error
+    :math:`s = n \sqrt{p (1 - p) / n_\mathrm{eff}}`. The error of the quantile is a quarter of the distance between the
+    sorted samples at the ranks 2 s below and 2 s above it, the 95 % interval.
+    """
+    n, ascending = len(values), np.sort(values, axis=0)
+
+    def at(position: float) -> np.ndarray:
+        low = min(int(position), n - 1)
+        value, share = ascending[low], position - low
+        return value if share == 0.0 else value + share * (ascending[low + 1] - value)
+
+    quantiles, errors = np.empty((2, len(probabilities), values.shape[1]))
+    for k, p in enumerate(probabilities):
+        position, spread = (n - 1) * p, n * np.sqrt(p * (1.0 - p) / effective)
+        low, high = max(position - 2.0 * spread, 0.0), min(position + 2.0 * spread, n - 1.0)
+        quantiles[k] = at(position)
+        errors[k] = (at(high) - at(low)) * (spread / (high - low)) if high > low else np.inf
+    return quantiles, errors

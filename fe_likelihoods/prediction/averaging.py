@@ -11,81 +11,16 @@ Science 14(4), 382-417, doi:10.1214/ss/1009212519.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
-from ..checks.finding import Finding, labelled
-from ..signals.channels import Channel
-from ..text_tables import number, text_table
-from ..units import from_si
 from .prediction import Prediction
 
-__all__ = ["AveragedPrediction", "average_predictions"]
+__all__ = ["average_predictions"]
 
 
-class AveragedPrediction(NamedTuple):
-    """Prediction averaged over models (Bayesian model averaging).
-
-    Attributes
-    ----------
-    mean : ndarray, shape (...)
-        Mean of the mixture.
-    variance : ndarray, shape (...)
-        Variance of the mixture, ``within + between``.
-    within : ndarray, shape (...)
-        Mean of the models' variances.
-    between : ndarray, shape (...)
-        Variance of the models' means.
-    standard_error : ndarray, shape (...)
-        Monte Carlo error of `mean` for the given probabilities.
-    probabilities : dict of str to float
-        Probabilities of the models.
-    channels : tuple of Channel
-        Channels of the predictions.
-    dt : float or None
-        Time step of histories [s], None for other quantities.
-    findings : tuple of Finding
-        What speaks against the predictions, each finding once.
-    """
-
-    mean: np.ndarray
-    variance: np.ndarray
-    within: np.ndarray
-    between: np.ndarray
-    standard_error: np.ndarray
-    probabilities: dict[str, float]
-    channels: tuple[Channel, ...]
-    dt: float | None
-    findings: tuple[Finding, ...] = ()
-
-    def __str__(self) -> str:
-        shares = ", ".join(f"{name} {share:.2f}" for name, share in self.probabilities.items())
-        what = "values" if self.dt is None else "histories, the sample with the largest mean"
-        known = len(self.channels) == (self.mean.size if self.dt is None else len(self.mean))
-        arrays = [np.atleast_1d(each) for each in (self.mean, self.sd, self.within, self.between)]
-        if self.dt is not None:
-            at = np.abs(self.mean).argmax(axis=1)[:, None]
-            arrays = [np.take_along_axis(each, at, axis=1) for each in arrays]
-        rows = [("value", "unit", "mean", "sd", "within models", "between models")]
-        for k, (mean, sd, within, between) in enumerate(zip(*map(np.ravel, arrays), strict=True)):
-            name, unit = (self.channels[k].name, self.channels[k].unit) if known else (f"{k}", "SI")
-            shown = [x if unit == "SI" else from_si(x, unit) for x in (mean, sd, np.sqrt(within), np.sqrt(between))]
-            rows.append((name, unit, *map(number, shown)))
-        first = f"Average of the models {shares}; {what}; sd within and between models"
-        return "\n".join([first, text_table(rows), *labelled(self.findings)])
-
-    __repr__ = __str__
-
-    @property
-    def sd(self) -> np.ndarray:
-        """Standard deviation, shape (...)."""
-        return np.sqrt(self.variance)
-
-
-def average_predictions(
-    predictions: Mapping[str, Prediction], probabilities: Mapping[str, float]
-) -> AveragedPrediction:
+def average_predictions(predictions: Mapping[str, Prediction], probabilities: Mapping[str, float]) -> Prediction:
     """Average the predictions of several models with their probabilities as weights.
 
     Parameters
@@ -97,8 +32,9 @@ def average_predictions(
 
     Returns
     -------
-    AveragedPrediction
-        Mean and variance of the mixture.
+    Prediction
+        Mean and variance of the mixture, with the Monte Carlo error of the mean for these probabilities, and the
+        findings of all. There are no quantiles and no values.
 
     Raises
     ------
@@ -136,8 +72,20 @@ def average_predictions(
     mean = np.tensordot(weights, [part.mean for part in parts], axes=1)
     within = np.tensordot(weights, [part.variance for part in parts], axes=1)
     between = np.tensordot(weights, [np.square(part.mean - mean) for part in parts], axes=1)
-    error = np.sqrt(np.tensordot(weights**2, [np.square(part.standard_error) for part in parts], axes=1))
-    known = dict(zip(names, weights.tolist(), strict=True))
-    findings = tuple(dict.fromkeys(each for part in parts for each in part.findings))
-    first = parts[0]
-    return AveragedPrediction(mean, within + between, within, between, error, known, first.channels, first.dt, findings)
+    none = np.zeros((0, *mean.shape))
+    return replace(
+        parts[0],
+        mean=mean,
+        variance=within + between,
+        standard_error=np.sqrt(np.tensordot(weights**2, [np.square(part.standard_error) for part in parts], axes=1)),
+        probabilities=(),
+        quantiles=none,
+        quantile_error=none,
+        values=None,
+        n_samples=sum(part.n_samples for part in parts),
+        effective_sample_size=sum(part.effective_sample_size for part in parts),
+        failed=np.zeros(0, dtype=int),
+        collapsed=np.zeros(0, dtype=int),
+        failure_reasons={},
+        findings=tuple(dict.fromkeys(each for part in parts for each in part.findings)),
+    )

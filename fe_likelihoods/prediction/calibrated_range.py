@@ -49,16 +49,14 @@ class Peaks:
 class Ends:
     """How much the channels of final values still move at the end, collected while responses are simulated.
 
-    Examined are quantities by `final_value`, and `final_values` of others by name; tests with imposed deformations are
-    not.
+    Examined are means of last samples, such as `final_value`; tests with imposed deformations are not.
     """
 
     def __init__(self, quantities: Iterable[Any], model: Any) -> None:
         final: dict[str, ChannelQuantity] = {}
         for each in quantities if motions_of(model) else ():
-            final |= getattr(each, "final_values", {})
-            several = each if isinstance(each, list | tuple) else [each]
-            final |= {one.channel: one for one in several if isinstance(getattr(one, "function", None), MeanOfLast)}
+            several = each if isinstance(each, Sequence) else [each]
+            final |= {str(one): one for one in several if isinstance(getattr(one, "function", None), MeanOfLast)}
         names = [channel.name for channel in model.channels]
         self._final = {name: (names.index(one.channel), one.part, one.function) for name, one in final.items()}
         self._steps = max(2, round(_LAST / model.dt))

@@ -1,7 +1,7 @@
 """Fragility: probability that a response exceeds a limit, against the intensity of the shaking.
 
-Under each record the probability of an exceedance is the mean over the samples of the posterior, or over draws of a new
-event (`Hierarchy`), of the probability that each exceeds. It contains the model error, from ratios of measured to
+Under each record the probability of an exceedance is the mean over the samples of the posterior of the probability that
+each exceeds; for a `Hierarchy`, the probability in a new event. It contains the model error, from ratios of measured to
 fitted values or from a noise that follows the response. A lognormal curve is fitted to these points
 (`fe_likelihoods.prediction.fragility_curve`). See ``docs/theory/prediction.rst``.
 """
@@ -17,7 +17,6 @@ from scipy import stats
 
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import EventRatios
-from ..events.spread import EventSpread
 from ..noise.protocol import follows_response
 from ..signals.records import Record
 from ..simulation.model import SimulationFailed
@@ -26,10 +25,11 @@ from ..units import DIMENSIONS
 from .excitation import chosen_state, excite, under_record
 from .fragility_curve import FragilityCurve, curve_with_errors
 from .inputs import PredictionSource, part_of, read_source, split_samples
-from .new_event import at_parameters, draw_new_event
+from .new_event import at_parameters, under_motion
 from .propagation import AllFailed, check_effective_sample_size, propagate
 from .quantities import ChannelQuantity, evaluator
 from .reliability import (
+    Estimate,
     check_level,
     contents,
     estimate,
@@ -71,8 +71,8 @@ class Fragility(NamedTuple):
         State of the structure at the beginning of each record, "virgin" or "end", as in
         `fe_likelihoods.prediction.propagation.propagate`.
     draws : ndarray, shape (n_draws, n_records), or None
-        Probabilities for posterior draws of the ratio distribution and the event population, from which intervals and
-        bands are made. None if there are neither ratios nor a population.
+        Probabilities for posterior draws of the ratio distribution, from which intervals and bands are made. None
+        without ratios.
     uncertainty : str
         Which uncertainties the probabilities contain.
     unit : str
@@ -139,7 +139,7 @@ class Fragility(NamedTuple):
         Science 10(1), 3-41, doi:10.1214/ss/1177010123.
         """
         if self.draws is None:
-            raise ValueError("a band needs what is unknown of the events: give fragility ratios=, or a Hierarchy")
+            raise ValueError("a band needs what is unknown of the events: give fragility ratios=")
         check_level(level)
         whole = self.draws[np.isfinite(self.draws).all(axis=1)]
         if len(whole) < 20:
@@ -185,12 +185,10 @@ def fragility(
     unit: str | None = None,
     ratios: EventRatios | None = None,
     noise: bool | str | None = None,
-    n: int = 500,
     intensity: Callable[[Record], float] = peak_ground_acceleration,
     failures_exceed: bool = False,
     from_state: str | None = None,
     rest: float = 10.0,
-    effective_sample_size: float | None = None,
     level: float = 0.95,
     seed: int | None = None,
     **settings: Any,
@@ -200,9 +198,9 @@ def fragility(
     Parameters
     ----------
     posterior_or_model, samples
-        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`: without ratios, `n`
-        parameter draws for a new event are then simulated under each record, and the intervals contain the uncertainty
-        of the population.
+        As in `fe_likelihoods.prediction.propagation.propagate`. The samples may be a `Hierarchy`, with the ratios of
+        `event_ratios`: each record is then simulated at the median parameters, and at their spread between events, from
+        which the scatter under this record follows.
     records : sequence of (Record or tuple of Record)
         Excitations, such as one motion scaled, ``[record.scale(k) for k in factors]``, or different motions. Each is a
         tuple if the model has several components: the horizontal and the vertical record of an `IsolatedBridge`, or the
@@ -216,15 +214,11 @@ def fragility(
     unit : str, optional
         Unit of the threshold, with the dimension of the quantity's channel. Default: SI.
     ratios : EventRatios, optional
-        Ratios of measured to predicted values of the quantity in several events: the model error. With the result of
-        `event_ratios`, which contains the spread of the parameters as well, the samples may be the `Hierarchy`: each
-        record is then simulated once, at the median parameters. Draws of a `Hierarchy` with other ratios are refused.
+        Ratios of measured to predicted values of the quantity in several events: the model error.
     noise : bool or str, optional
         The model error from the noise of the calibration, as for `propagate`. Default: "model" if there are no ratios,
         the noise follows the response (`GaussianNoise` with shares) and the samples have its parameters. Otherwise the
         model error is left out, with a warning; False states that this is on purpose.
-    n : int
-        Number of draws from a `Hierarchy`.
     intensity : callable
         Function that returns a positive number for an element of `records`. Default: peak acceleration [m/s²], of the
         first record of a tuple (the horizontal component, or the first support).
@@ -234,15 +228,12 @@ def fragility(
     from_state, rest
         State of the structure at the beginning of each record, as in `propagate`. With "end" every record follows the
         excitation of the model, not the other records.
-    effective_sample_size : float, optional
-        Effective number of independent samples. Default: the number of samples.
     level : float
         Probability of the intervals, between 0 and 1.
     seed : int, optional
-        Seed for the noise, for drawing new events and ratio distributions, and for the resampling that gives the errors
-        of the curve.
+        Seed of the noise, of ratio distributions, and of the resampling for the errors of the curve.
     **settings
-        Further arguments of `propagate`: batch, pool, progress.
+        Further arguments of `propagate`: cache, effective_sample_size, pool, progress.
 
     Returns
     -------
@@ -282,9 +273,9 @@ def fragility(
     The probabilities contain the uncertainty of the parameters and the error of the model, from the ratios of 4
     events.
     """
-    if taken := {"record", "quantiles", "memory_bytes"} & set(settings):
+    if taken := {"record", "quantiles"} & set(settings):
         raise ValueError(f"fragility sets {', '.join(sorted(taken))} itself; leave these arguments out")
-    predictor, rows, noise, weights = _chosen(posterior_or_model, samples, part, ratios, noise, n, seed)
+    predictor, rows, noise = _chosen(posterior_or_model, samples, part, ratios, noise)
     source = read_source(predictor)
     thetas, _ = split_samples(source, rows, noise, True)
     known = evaluator(quantity, source.model.channels, source.model.dt)
@@ -309,41 +300,43 @@ def fragility(
         measured = [each.measurements for each in samples.posterior.tests.values() if each.measurements is not None]
         settings = {"calibrated": measured, "check": False} | settings
     n = len(thetas)
-    effective = check_effective_sample_size(effective_sample_size, n)
+    effective = check_effective_sample_size(settings.get("effective_sample_size"), n)
     check_level(level)
 
     values = np.full((n, len(records)), np.nan)
     collapsed = np.zeros(values.shape, dtype=bool)
+    under = [ratios] * len(records)
+    common = {"from_state": state, "rest": rest, "noise": noise, "seed": seed}
     for k, record in enumerate(records):
+        more = settings if k == np.argmax(intensities) else settings | {"calibrated": ()}  # warned of once
         try:
-            prediction = propagate(
-                predictor,
-                rows,
-                quantity=quantity,
-                record=record,
-                from_state=state,
-                rest=rest,
-                noise=noise,
-                quantiles=(),
-                seed=seed,
-                **(settings if k == np.argmax(intensities) else settings | {"calibrated": ()}),  # warned of once
-            )
+            if isinstance(samples, Hierarchy):
+                prediction, found, under[k] = under_motion(predictor, ratios, record, quantity, **common, **more)
+                values[0, k], collapsed[0, k] = found[0], 0 in prediction.collapsed
+            else:
+                prediction = propagate(
+                    predictor, rows, quantity=quantity, record=record, quantiles=(), **common, **more
+                )
+                found = prediction.values
+                values[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True), k] = found
+                collapsed[prediction.collapsed, k] = True
         except AllFailed as error:
-            if not failures_exceed and len(error.collapsed) == 0:
+            collapsed[error.collapsed[error.collapsed < n], k] = True
+            if not failures_exceed and not collapsed[:, k].any():
                 raise SimulationFailed(f"record {_name(record)!r}: {error.reason}") from error
-            collapsed[error.collapsed, k] = True
-            continue
-        if prediction.values is None or prediction.values.ndim != 1:
-            raise ValueError(f"fragility needs one number as quantity; got arrays of shape {prediction.mean.shape}")
-        values[np.setdiff1d(np.arange(n), prediction.failed, assume_unique=True), k] = prediction.values
-        collapsed[prediction.collapsed, k] = True
-    spread = EventSpread(values, weights, ratios)
+        if not failures_exceed and np.isnan(values[:, k]).all() and not collapsed[:, k].any():
+            raise SimulationFailed(f"record {_name(record)!r}: the simulation at the median parameters failed")
     exceeding = np.isnan(values) if failures_exceed else collapsed
-    found = estimate(values, limit, spread, effective, level, seed, exceeding=exceeding)
+    columns = [
+        estimate(each, limit, of_record, exceeds, effective, level, seed)
+        for each, of_record, exceeds in zip(values.T, under, exceeding.T, strict=True)
+    ]
+    found = Estimate(*(None if each[0] is None else np.array(each) for each in zip(*columns, strict=True)))
+    draws = None if found.draws is None else found.draws.T
     intensity_unit = DIMENSIONS["acceleration"] if intensity is peak_ground_acceleration else ""
     try:
         rng = np.random.default_rng(seed)
-        curve = curve_with_errors(intensities, found.single.T, found.counted.T, effective, found.draws, rng)
+        curve = curve_with_errors(intensities, found.single, found.counted, effective, draws, rng)
         curve = curve._replace(unit=intensity_unit)
     except ValueError as reason:
         logger.warning("no fragility curve: %s", reason)
@@ -360,8 +353,8 @@ def fragility(
         curve,
         float(limit),
         state,
-        found.draws,
-        contents(bool(noise), spread),
+        draws,
+        contents(bool(noise), ratios),
         unit_of_threshold(unit, known.channels),
         intensity_unit,
     )
@@ -373,43 +366,30 @@ def _chosen(
     part: str | None,
     ratios: EventRatios | None,
     noise: bool | str | None,
-    n: int,
-    seed: int | None,
-) -> tuple[Any, Any, bool | str, np.ndarray | None]:
-    """The object to predict with, its samples, the noise to predict with, and the weights of the new-event draws."""
+) -> tuple[Any, Any, bool | str]:
+    """The object to predict with, its samples, and the noise to predict with."""
     if ratios is not None and noise:
         raise ValueError("ratios contain the error of the model already: leave out noise, or give noise=False")
-    of_population = isinstance(samples, Hierarchy)
-    predictor, rows = (
-        (posterior_or_model, None) if of_population else part_of(posterior_or_model, samples, part, bool(noise))
-    )
-    source = read_source(predictor)
-    if of_population and ratios is not None:
-        if ratios.at is None:
+    if isinstance(samples, Hierarchy):
+        if ratios is None or ratios.at is None:
             raise ValueError(
                 "fragility: draws of a Hierarchy and ratios are correlated; give ratios=event_ratios(hierarchy, "
                 "posteriors, quantity), which contain the spread of the parameters"
             )
-        return predictor, at_parameters(ratios.at, source.model.parameter_names, n), False, None
-    if noise is None and ratios is None and source.noise is not None and follows_response(source.noise):
-        names = source.noise.parameter_names
-        if of_population:
-            noise = "model" if set(names) <= {*samples.posterior.varying, *samples.posterior.common} else None
-        elif (complete := _with_noise(posterior_or_model, samples, part, source)) is not None:
-            noise, rows = "model", complete
+        names = read_source(posterior_or_model).model.parameter_names
+        return posterior_or_model, [at_parameters(ratios.at, names)], False
+    predictor, rows = part_of(posterior_or_model, samples, part, bool(noise))
+    source = read_source(predictor)
     if noise is None and ratios is None:
+        complete = None
+        if source.noise is not None and follows_response(source.noise):
+            complete = _with_noise(posterior_or_model, samples, part, source)
+        if complete is not None:
+            return predictor, complete, "model"
         warn_of_missing_error(
             "fragility", "calibrate with noise in shares of the response and give samples of all parameters", 4
         )
-    noise = noise or False
-    if not of_population:
-        return predictor, rows, noise, None
-    if noise and source.noise is None:
-        raise ValueError(f"noise={noise!r} needs a posterior; got a model")
-    names = [*source.model.parameter_names, *(source.noise.parameter_names if noise else ())]
-    seeds = np.random.SeedSequence(seed).spawn(1)
-    draws, weights = draw_new_event(samples, names, n, source.noise if noise else None, seeds[0])
-    return predictor, draws, noise, weights
+    return predictor, rows, noise or False
 
 
 def _with_noise(posterior: Any, samples: Any, part: str | None, source: PredictionSource) -> Any:

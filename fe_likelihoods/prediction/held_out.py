@@ -1,11 +1,10 @@
 """Each event predicted from the others: the population without it, and the scores of its prediction."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..events.hierarchical_posterior import HierarchicalPosterior
 from ..events.hierarchy_result import Hierarchy
 from ..events.leave_one_out import without_each
 from ..text_tables import NamedResults, number
@@ -110,22 +109,18 @@ class LeftOutTests(NamedResults):
         return found
 
 
-def leave_one_out(
-    hierarchy: Hierarchy, *, sample: Callable[[HierarchicalPosterior], Any] | None = None, seed: int = 0
-) -> LeftOutTests:
+def leave_one_out(hierarchy: Hierarchy, *, seed: int = 0) -> LeftOutTests:
     """Leave each test out of a hierarchical model in turn. No simulation is run.
+
+    The hyper-samples are weighted where this suffices; otherwise the population without the test is sampled anew, by
+    `samplers.SMCSampler` with 500 walkers.
 
     Parameters
     ----------
     hierarchy : Hierarchy
         Population of two tests or more.
-    sample : callable, optional
-        Function of a `HierarchicalPosterior` that returns independent samples (n, ndim) of its hyper-parameters, for
-        tests that weights cannot leave out. Default: emcee with differential evolution and 128 walkers, which start
-        from the population of all tests and lose the test in steps; each step takes 20 autocorrelation times, of which
-        the second half is used, and at most 4000 moves.
     seed : int
-        Seed of resampling and of the default sampler.
+        Seed of resampling and sampler.
 
     Returns
     -------
@@ -142,19 +137,15 @@ def leave_one_out(
     Warns
     -----
     UserWarning
-        If a new run of the default sampler was too short, or a predictive density is not known.
+        If a predictive density is not known.
 
     Examples
     --------
-    >>> def sample(population):
-    ...     run = SMCSampler(100, population.ndim, population, vectorize=True, seed=1)
-    ...     state = run.run_mcmc(None, 1)
-    ...     return run.get_chain(flat=True)
-    >>> left_out = leave_one_out(hierarchy, sample=sample)
+    >>> left_out = leave_one_out(hierarchy, seed=1)
     >>> print(left_out.scores(posteriors, quantity=peak("displacement")))
     event   displacement [cm]  90% interval of displacement  PIT of displacement  log density
     north ...
     middle ...
     south ...
     """
-    return LeftOutTests(without_each(hierarchy, sample, seed))
+    return LeftOutTests(without_each(hierarchy, seed))

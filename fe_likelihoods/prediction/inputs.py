@@ -25,7 +25,6 @@ __all__ = [
     "part_of",
     "read_source",
     "samples_of_rows",
-    "simulates_in_batches",
     "split_samples",
 ]
 
@@ -71,11 +70,6 @@ def part_of(posterior_or_model: Any, samples: Any, part: str | None, noise: bool
             f"a prediction is of one model: give part= one of {', '.join(map(repr, likelihood.likelihoods))}"
         )
     return likelihood[part], likelihood.samples_of(part, samples, noise)
-
-
-def simulates_in_batches(model: Model) -> bool:
-    """Return whether the model simulates several sets of parameters at once."""
-    return hasattr(model, "simulate_batch")
 
 
 def split_samples(

@@ -13,7 +13,6 @@ Histories are predicted with the parameters of the population, and with its nois
 Equations are on the page ``docs/theory/prediction.rst``.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -25,7 +24,6 @@ from ..checks.stored_posteriors import check_impossible_draws
 from ..events.hierarchy_result import Hierarchy
 from ..events.ratios import PRIOR_EVENTS, PRIOR_SD, EventRatios
 from ..events.scatter import REMAINDER, log_variance, remainder_variance, spread_rows
-from ..events.spread import EventSpread
 from ..likelihood.likelihood import FELikelihood
 from ..priors.between_events import BETWEEN_EVENTS
 from ..signals.records import Record
@@ -35,7 +33,7 @@ from .prediction import Prediction
 from .propagation import propagate
 from .quantities import ChannelQuantity, Quantity, evaluator, measured_quantity
 
-__all__ = ["at_parameters", "draw_new_event", "event_ratios", "predict_new_event"]
+__all__ = ["at_parameters", "event_ratios", "predict_new_event", "under_motion"]
 
 
 def event_ratios(
@@ -85,7 +83,34 @@ def event_ratios(
     >>> ratios.values.round(2)  # doctest: +SAMPLED
     array([1.55, 1.51, 0.86])
     """
-    return _ratios(hierarchy, posteriors, quantity, _checked_spread(spread), prior_events)[0]
+    spread = BETWEEN_EVENTS if spread is None else spread
+    if not isinstance(spread, Mapping) or not all(0.0 < each < np.inf for each in spread.values()):
+        raise ValueError(
+            "spread: expected positive standard deviations of logarithms by the beginning of a parameter's name, such "
+            f'as {{"frequency": 0.02}}; got {spread!r}'
+        )
+    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
+    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
+        raise ValueError(f"ratios of events need numbers such as quantity=peak(channel); got {quantity!r}")
+    of_population = isinstance(hierarchy, Hierarchy)
+    names = list(hierarchy.posterior.tests if of_population else posteriors)
+    if missing := [name for name in names if name not in posteriors]:
+        raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
+    at, found = hierarchy.median_test() if of_population else dict(hierarchy), []
+    for name in names:
+        source = read_source(posteriors[name])
+        if source.likelihood is None:
+            raise ValueError(
+                f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
+            )
+        try:
+            found.append(_event(source.likelihood, at, quantity, spread))
+        except ValueError as error:
+            raise ValueError(f"event {name!r}: {error}") from None
+    values, levels, of_parameters, of_remainder = (np.array(each) for each in zip(*found, strict=True))
+    remainder = of_remainder.mean(axis=0)
+    sd = np.sqrt(of_parameters + remainder)
+    return EventRatios(values, sd, prior_events, levels, at=at, spread=spread, remainder=remainder)
 
 
 def predict_new_event(
@@ -152,9 +177,8 @@ def predict_new_event(
     Warns
     -----
     UserWarning
-        As `propagate` for peaks outside the range of all events, and for harmonics. For histories also as
-        `Hierarchy.new_test`, and if more than 1 % of the draws have an impossible noise. Residuals of the single
-        calibrations are not checked.
+        As `propagate`, for peaks outside the range of all events; for histories also as `Hierarchy.new_test`, and if
+        more than 1 % of the draws have an impossible noise.
 
     Notes
     -----
@@ -194,23 +218,12 @@ def predict_new_event(
     if _is_number(quantity):
         if noise:
             raise ValueError("predict_new_event: numbers contain the errors of measurements already; noise=False")
-        spread = _checked_spread(spread)
-        ratios, remainder = _ratios(hierarchy, posteriors, quantity, spread, prior_events)
-        names = read_source(predictor).model.parameter_names
-        at = at_parameters(ratios.at, names, n)  # equal rows are simulated once
-        prediction = propagate(predictor, at, record=record, quantity=quantity, **settings)
-        rows = spread_rows([ratios.at[name] for name in names], names, spread)[1:]
-        changed = np.full((len(rows), *prediction.mean.shape), np.nan)
-        if len(rows):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the prediction has said it
-                own = settings | {"quantiles": (), "calibrated": (), "check": False}
-                moved = propagate(predictor, rows, record=record, quantity=quantity, **own)
-            changed[np.setdiff1d(np.arange(len(rows)), moved.failed)] = moved.values
-        sd = np.sqrt(log_variance(np.concatenate([prediction.values[:1], changed])) + remainder)
-        ratios = replace(ratios, new_sd=sd)
-        prediction = replace(prediction, spread=EventSpread(prediction.values, None, ratios))
-        return _corrected(prediction, ratios, np.random.default_rng(seed))
+        ratios = event_ratios(hierarchy, posteriors, quantity, spread=spread, prior_events=prior_events)
+        probabilities = settings.pop("quantiles", (0.05, 0.5, 0.95))
+        prediction, values, ratios = under_motion(predictor, ratios, record, quantity, **settings)
+        if np.isnan(values[0]).any():
+            raise SimulationFailed(f"the simulation at the median parameters fails: {[*prediction.failure_reasons]}")
+        return _corrected(prediction, values[0], ratios, n, probabilities, np.random.default_rng(seed))
     source = read_source(predictor)
     names = list(source.model.parameter_names)
     if noise:
@@ -218,58 +231,17 @@ def predict_new_event(
             raise ValueError("predict_new_event: noise=True needs a posterior; got a model")
         names += source.noise.parameter_names
     parameters, errors = np.random.SeedSequence(seed).spawn(2)
-    draws, _ = draw_new_event(hierarchy, names, n, source.noise if noise else None, parameters)
+    draws = hierarchy.new_test(n, names, np.random.default_rng(parameters))
+    if noise:
+        draws = _possible(draws, source.noise)
     own_seed = int(errors.generate_state(1)[0])
     return propagate(predictor, draws, record=record, quantity=quantity, noise=noise, seed=own_seed, **settings)
-
-
-def _checked_spread(spread: Mapping[str, float] | None) -> Mapping[str, float]:
-    """The spread of the parameters, by default `BETWEEN_EVENTS`; ValueError if it is not positive."""
-    spread = BETWEEN_EVENTS if spread is None else spread
-    if not isinstance(spread, Mapping) or not all(0.0 < each < np.inf for each in spread.values()):
-        raise ValueError(
-            "spread: expected positive standard deviations of logarithms by the beginning of a parameter's name, such "
-            f'as {{"frequency": 0.02}}; got {spread!r}'
-        )
-    return spread
-
-
-def _ratios(
-    hierarchy: Hierarchy | Mapping[str, float],
-    posteriors: Mapping[str, Any],
-    quantity: Any,
-    spread: Mapping[str, float],
-    prior_events: float,
-) -> tuple[EventRatios, np.ndarray]:
-    """As `event_ratios`, with the mean variance over the events that the spread of the parameters does not explain."""
-    several = [quantity] if isinstance(quantity, ChannelQuantity) else quantity
-    if not isinstance(several, list | tuple) or not all(isinstance(each, ChannelQuantity) for each in several):
-        raise ValueError(f"ratios of events need numbers such as quantity=peak(channel); got {quantity!r}")
-    of_population = isinstance(hierarchy, Hierarchy)
-    names = list(hierarchy.posterior.tests if of_population else posteriors)
-    if missing := [name for name in names if name not in posteriors]:
-        raise ValueError(f"the posteriors of {', '.join(map(repr, missing))} are missing")
-    at, found = hierarchy.median_test() if of_population else dict(hierarchy), []
-    for name in names:
-        source = read_source(posteriors[name])
-        if source.likelihood is None:
-            raise ValueError(
-                f"event {name!r} needs a posterior or a likelihood with measurements; got {source.model!r}"
-            )
-        try:
-            found.append(_event(source.likelihood, at, quantity, spread))
-        except ValueError as error:
-            raise ValueError(f"event {name!r}: {error}") from None
-    values, levels, of_parameters, of_remainder = (np.array(each) for each in zip(*found, strict=True))
-    remainder = of_remainder.mean(axis=0)
-    return EventRatios(values, np.sqrt(of_parameters + remainder), prior_events, levels, at=at), remainder
 
 
 def _event(likelihood: FELikelihood, at: Mapping[str, float], quantity: Any, spread: Mapping[str, float]) -> tuple:
     """Ratio of measured to predicted value of one event, the predicted one, and the variances of the log ratio."""
     model, measured = likelihood.model, measured_quantity(quantity, likelihood.measurements)
-    at_parameters(at, model.parameter_names, 1)
-    rows = spread_rows([at[name] for name in model.parameter_names], model.parameter_names, spread)
+    rows = spread_rows(at_parameters(at, model.parameter_names), model.parameter_names, spread)
     responses, reasons = likelihood.simulate(rows)
     if reasons[0]:
         raise SimulationFailed(reasons[0])
@@ -296,29 +268,31 @@ def _is_number(quantity: Any) -> bool:
     return callable(quantity) or (is_list and any(isinstance(each, ChannelQuantity) for each in several))
 
 
-def at_parameters(parameters: Mapping[str, float], names: Sequence[str], n: int) -> dict[str, np.ndarray]:
-    """Equal rows of a model's parameters (n,) by name; ValueError for parameters without a value."""
+def at_parameters(parameters: Mapping[str, float], names: Sequence[str]) -> list[float]:
+    """Values of a model's parameters; ValueError for parameters without a value."""
     if missing := [name for name in names if name not in parameters]:
         raise ValueError(
             f"{', '.join(missing)} belong to each event alone and have no median; make them varying or common in the "
             "HierarchicalPosterior"
         )
-    return {name: np.full(n, parameters[name]) for name in names}
+    return [parameters[name] for name in names]
 
 
-def draw_new_event(
-    hierarchy: Hierarchy, names: list[str], n: int, noise: Any, seed: np.random.SeedSequence
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draw named parameters of a new event, m arrays each, and their weights (n_populations, m) in single populations.
+def under_motion(
+    predictor: Any, ratios: EventRatios, record: Any, quantity: Quantity, **settings: Any
+) -> tuple[Prediction, np.ndarray, EventRatios]:
+    """Prediction at `ratios.at` and at its spread, the values (1 + 2 m, ...), NaN for failures, and ratios for them.
 
-    See `Hierarchy.population_weights`. Draws where the noise, whose parameters are among the names, is impossible are
-    left out, with a warning if they are more than 1 %.
+    The ratios have the scatter of the parameters that this motion makes of the number.
     """
-    own = [name for name in hierarchy.posterior.varying if name not in names]
-    draws = hierarchy.new_test(n, [*names, *own], np.random.default_rng(seed))
-    if noise is not None:
-        draws = _possible(draws, noise)
-    return {name: draws[name] for name in names}, hierarchy.population_weights(draws)
+    names = read_source(predictor).model.parameter_names
+    rows = spread_rows(at_parameters(ratios.at, names), names, ratios.spread or {})
+    prediction = propagate(predictor, rows, record=record, quantity=quantity, quantiles=(), **settings)
+    values = np.full((len(rows), *prediction.mean.shape), np.nan)
+    values[np.setdiff1d(np.arange(len(rows)), prediction.failed)] = prediction.values
+    if ratios.spread is not None and np.isfinite(values[0]).all():
+        ratios = replace(ratios, new_sd=np.sqrt(log_variance(values) + ratios.remainder))
+    return prediction, values, ratios
 
 
 def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]:
@@ -331,21 +305,34 @@ def _possible(draws: dict[str, np.ndarray], noise: Any) -> dict[str, np.ndarray]
     return {name: values[possible] for name, values in draws.items()}
 
 
-def _corrected(prediction: Prediction, ratios: EventRatios, rng: np.random.Generator) -> Prediction:
-    """The prediction at fixed parameters times the ratio of a new event: exact quantiles, and draws that have them."""
-    predicted, n = prediction.values[0], len(prediction.values)
+def _corrected(
+    prediction: Prediction,
+    predicted: np.ndarray,
+    ratios: EventRatios,
+    n: int,
+    probabilities: Sequence[float],
+    rng: np.random.Generator,
+) -> Prediction:
+    """The predicted values times the ratio of a new event: exact quantiles, and n draws that have them."""
     order = rng.permuted(np.tile(np.arange(n).reshape(-1, *[1] * predicted.ndim), (1, *predicted.shape)), axis=0)
-    values = predicted * ratios.quantile((order + 0.5) / n, predicted)
-    quantiles = [predicted * ratios.quantile(each, predicted) for each in prediction.probabilities]
-    shape = (len(prediction.probabilities), *prediction.mean.shape)
-    unknown = np.full(prediction.mean.shape, np.nan)  # exp(t) of Student's t has no mean
+    quantiles = [predicted * ratios.quantile(each, predicted) for each in probabilities]
+    shape = (len(probabilities), *predicted.shape)
+    unknown = np.full(predicted.shape, np.nan)  # exp(t) of Student's t has no mean
     return replace(
         prediction,
         mean=unknown,
         variance=unknown,
         standard_error=unknown,
+        probabilities=tuple(probabilities),
         quantiles=np.reshape(quantiles, shape),
         quantile_error=np.zeros(shape),
-        values=values,
+        values=predicted * ratios.quantile((order + 0.5) / n, predicted),
+        n_samples=n,
+        effective_sample_size=float(n),
+        failed=np.zeros(0, dtype=int),
+        collapsed=np.zeros(0, dtype=int),
+        failure_reasons={},
         noise=True,
+        ratios=ratios,
+        predicted=predicted,
     )

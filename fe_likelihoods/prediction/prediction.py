@@ -2,29 +2,23 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks.finding import Finding, labelled, warn
 from ..checks.transfer import check_interval_samples
-from ..events.spread import EventSpread
+from ..events.ratios import EventRatios
 from ..signals.channels import Channel, Measurements
 from ..signals.comparison import Comparison, compare_with
-from ..signals.error_measures import rrmse
 from ..text_tables import number, text_table
 from ..units import find_unit
 from .quantities import measured_quantity
 from .score_tables import HistoryScores, QuantityScores, envelope, score_histories, score_values
 
-if TYPE_CHECKING:
-    pass
-
-
 __all__ = ["Prediction"]
 
-_MOST_ROWS = 50  # of a table in a notebook
+_MOST_ROWS = 50  # of a printed table
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +44,9 @@ class Prediction:
     quantile_error : ndarray, shape (n_probabilities, ...)
         Monte Carlo errors of the quantiles.
     values : ndarray, shape (n_samples, ...), or None
-        The quantity of every sample that did not fail, in their order. None for histories, and for arrays that exceed
-        the limit of memory.
+        The quantity of every sample that did not fail, in their order. None for histories.
     n_samples : int
-        Number of samples used for mean and variance.
-    n_quantile : int
-        Number of samples used for the quantiles, smaller if not all of them fitted into the limit of memory.
+        Number of samples that did not fail.
     effective_sample_size : float
         Effective number of independent samples, for the Monte Carlo errors.
     failed : ndarray of int, shape (n_failed,)
@@ -76,9 +67,10 @@ class Prediction:
         which the model was made.
     quantity : object
         The quantity as it was given to `fe_likelihoods.propagate`.
-    spread : EventSpread or None
-        Uncertainty of ratios and event population, for the intervals of `fe_likelihoods.exceedance`; None unless a new
-        event is predicted (`fe_likelihoods.predict_new_event`).
+    ratios : EventRatios or None
+        Ratios by which the values predict measurements of a new event (`fe_likelihoods.predict_new_event`), else None.
+    predicted : ndarray, shape (...), or None
+        The value in the new event that the ratios multiply.
     findings : tuple of Finding
         What speaks against the prediction, each with what to do; the warnings of `fe_likelihoods.propagate`.
     data : Measurements or None
@@ -93,7 +85,6 @@ class Prediction:
     quantile_error: np.ndarray
     values: np.ndarray | None
     n_samples: int
-    n_quantile: int
     effective_sample_size: float
     failed: np.ndarray
     failure_reasons: dict[str, int]
@@ -102,7 +93,8 @@ class Prediction:
     noise: bool = False
     from_state: str = "virgin"
     quantity: object = None
-    spread: EventSpread | None = None
+    ratios: EventRatios | None = None
+    predicted: np.ndarray | None = None
     findings: tuple[Finding, ...] = ()
     collapsed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     data: Measurements | None = None
@@ -113,11 +105,6 @@ class Prediction:
         return np.sqrt(self.variance)
 
     @property
-    def has_ratios(self) -> bool:
-        """Whether the values predict measurements, by ratios of measured to simulated values in other events."""
-        return self.spread is not None and self.spread.ratios is not None
-
-    @property
     def n_failed(self) -> int:
         """Number of samples that are left out."""
         return len(self.failed)
@@ -125,7 +112,8 @@ class Prediction:
     @property
     def time(self) -> np.ndarray:
         """Times of the histories, from zero, shape (n_steps,) [s]; ValueError for other quantities."""
-        self._need_histories()
+        if self.dt is None:
+            raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
         return np.arange(self.mean.shape[1]) * self.dt
 
     def quantile(self, probability: float) -> np.ndarray:
@@ -143,86 +131,6 @@ class Prediction:
             )
         return self.quantiles[self.probabilities.index(probability)]
 
-    def rrmse(
-        self,
-        measurements: Measurements,
-        part: slice = slice(None),
-    ) -> np.ndarray:
-        """Compute the relative root mean square error of the mean.
-
-        Parameters
-        ----------
-        measurements : Measurements
-            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
-            has times of its own, the histories are interpolated there.
-        part : slice
-            The samples of the history to compare. Default: all.
-
-        Returns
-        -------
-        ndarray, shape (n_channels,)
-            The errors [-] in the order of `channels`, see `fe_likelihoods.signals.error_measures.rrmse`.
-
-        Raises
-        ------
-        ValueError
-            If the prediction has no histories, the measurements lack a channel or have samples outside the histories,
-            or a measured channel is zero, or has no sample, in the part.
-        """
-        compared = self._compared(measurements)
-        measured, mean = _values_of(compared), _at_samples(compared, self.mean)
-        return rrmse(mean[:, part], measured[:, part], [channel.name for channel in self.channels])
-
-    def coverage(
-        self,
-        measurements: Measurements,
-        lower: float = 0.05,
-        upper: float = 0.95,
-        part: slice = slice(None),
-    ) -> np.ndarray:
-        """Compute the fraction of the measured samples between two quantiles.
-
-        Parameters
-        ----------
-        measurements : Measurements
-            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
-            has times of its own, the histories are interpolated there.
-        lower, upper : float
-            Probabilities of the two quantiles.
-        part : slice
-            The samples of the history to compare. Default: all.
-
-        Returns
-        -------
-        ndarray, shape (n_channels,)
-            The fractions [-] in the order of `channels`. A prediction with noise should have about ``upper - lower``.
-            A prediction without noise is a band of the response, not of the measurements, and covers fewer of them.
-
-        Raises
-        ------
-        ValueError
-            As `rrmse`, and if the prediction lacks one of the quantiles or `lower` is not below `upper`.
-
-        Notes
-        -----
-        Between the samples of the histories, the quantiles are interpolated, which is approximate.
-
-        Examples
-        --------
-        >>> prediction.coverage(measurements).round(2)  # doctest: +SAMPLED
-        array([0.91, 0.9 ])
-        """
-        if not lower < upper:
-            raise ValueError(f"coverage needs lower < upper; got {lower} and {upper}")
-        compared = self._compared(measurements)
-        measured = _values_of(compared)[:, part]
-        below, above = _band_at_samples(compared, self.quantile(lower), self.quantile(upper))[..., part]
-        samples = np.isfinite(measured).sum(axis=1)
-        if not samples.all():
-            empty = [c.name for c, n in zip(self.channels, samples, strict=True) if not n]
-            raise ValueError(f"channels {', '.join(empty)} have no sample in this part; choose another one")
-        return ((below <= measured) & (measured <= above)).sum(axis=1) / samples
-
     def score(
         self,
         measured: Measurements | ArrayLike,
@@ -234,9 +142,10 @@ class Prediction:
         Parameters
         ----------
         measured : Measurements or array_like
-            Measurements of all channels, as for `rrmse`. For quantities other than histories also the measured values
-            themselves [SI], in the shape of the quantity. From `Measurements` the quantity, such as a peak, is computed
-            as it was from the responses.
+            Measurements of all channels, over the time of the histories. Missing samples are left out. Where a channel
+            has times of its own, the histories are interpolated there (quantiles too, which is approximate). For
+            quantities other than histories also the measured values themselves [SI], in the shape of the quantity. From
+            `Measurements` the quantity, such as a peak, is computed as it was from the responses.
         level : float
             Probability of the scored intervals, between 0 and 1. For histories, the prediction must have the quantiles
             with the probabilities (1 - level) / 2 and (1 + level) / 2, which a default prediction has for 0.9.
@@ -251,21 +160,21 @@ class Prediction:
         Raises
         ------
         ValueError
-            As `rrmse`. For histories from one sample. For other quantities: if the values of the samples are not kept
-            or are fewer than three, the measured values have another shape, samples of the channel are missing, or
-            measurements are given for a function of the whole response.
+            If the measurements lack a channel or have samples outside the histories, a measured channel is zero or has
+            no sample in the part, or the histories are from one sample or have no such quantiles. For other quantities:
+            if the samples are fewer than three, the measured values have another shape, samples of the channel are
+            missing, or measurements are given for a function of the whole response.
 
         Warns
         -----
         UserWarning
             If less than one sample is expected on each side of the intervals, which then have another level: with
-            fewer than 20 samples for 0.9. If the predicted standard deviation of measured samples of histories is zero;
-            they are left out of the PIT.
+            fewer than 20 samples for 0.9.
 
         Notes
         -----
-        Measurements contain the model error and sensor noise: score a prediction with ``noise=True``, unless the
-        quantity is known to be free of them. For histories, CRPS and PIT are computed for normal
+        Measurements contain the model error and sensor noise: score a prediction with ``noise=True``. A band of the
+        response alone covers fewer of them. For histories, CRPS and PIT are computed for normal
         distributions with the predicted means and standard deviations, because the samples of histories are not kept.
 
         Examples
@@ -289,15 +198,13 @@ class Prediction:
         lower, upper = _band_at_samples(compared, *ends)
         scored = (each[:, part] for each in (values, mean, sd, lower, upper, around))
         values, mean, sd, lower, upper, around = scored
-        _check_number(self.n_quantile, 2, level)
+        _check_number(self.n_samples, 2, level)
         return score_histories(self.channels, values, (mean, sd), (lower, upper), around, level)
 
     def _score_values(self, measured: Measurements | ArrayLike, level: float) -> QuantityScores:
         """Scores of numbers against the same numbers of measurements."""
         if self.values is None:
-            raise ValueError(
-                "score: this prediction has kept no values of the samples; propagate with more memory_bytes"
-            )
+            raise ValueError("score: an average of models has no samples; score the prediction of each model")
         _check_number(len(self.values), 3, level)
         observed = measured_quantity(self.quantity, measured) if isinstance(measured, Measurements) else measured
         observed = np.asarray(observed, dtype=float)
@@ -323,56 +230,41 @@ class Prediction:
         return f"<Prediction of shape {self.mean.shape}: {names}{self.n_samples} samples, {noise}{state}>"
 
     def __str__(self) -> str:
-        title, lines, header, rows = self._table()
-        cells = [[each if isinstance(each, str) else number(each) for each in row] for row in rows]
-        table = [text_table([header, *cells])] if rows else []
-        return "\n".join([f"{title}: {lines[0]}", *lines[1:], *table])
-
-    def _table(self) -> tuple[str, list[str], tuple[str, ...], list[tuple]]:
-        """Title, lines of text, header and rows: the largest values of histories, or the moments of a few numbers."""
         noise = "with measurement noise" if self.noise else "without measurement noise"
-        if self.has_ratios:
-            noise = f"of measured values, by the ratios of {len(self.spread.ratios.values)} events"
-        lines = [f"{self.n_samples} samples, {noise}; effective sample size {self.effective_sample_size:.0f}"]
-        if self.has_ratios:
-            share = np.mean(self.spread.ratios.prior_share)
+        if self.ratios is not None:
+            noise = f"of measured values, by the ratios of {len(self.ratios.values)} events"
+        title = "Prediction" if self.dt is None else "Prediction of histories"
+        size = f"effective sample size {self.effective_sample_size:.0f}"
+        lines = [f"{title}: {self.n_samples} samples, {noise}; {size}"]
+        if self.ratios is not None:
+            share = np.mean(self.ratios.prior_share)
             lines.append(f"the ratio of a new event has no mean: use the quantiles; {share:.0%} of their squared width")
             lines[-1] += " is due to the prior of the scatter between events"
         if self.n_failed:
             collapse = f" (the structure collapsed in {len(self.collapsed)})" if len(self.collapsed) else ""
             lines.append(f"{self.n_failed} samples failed{collapse} and are left out")
         lines += labelled(self.findings)
-        units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
+        known = [(c.name, c.unit, find_unit(c.unit, c.dimension).factor) for c in self.channels]
         if self.dt is not None:
-            header = ("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")
-            rows = []
-            for channel, (unit, factor), mean, sd in zip(self.channels, units, self.mean, self.sd, strict=True):
+            rows = [("channel", "unit", "largest mean", "at [s]", "its sd", "mean sd")]
+            for (name, unit, factor), mean, sd in zip(known, self.mean, self.sd, strict=True):
                 at = int(np.argmax(np.abs(mean)))
                 numbers = mean[at] / factor, at * self.dt, sd[at] / factor, sd.mean() / factor
-                rows.append((channel.name, unit, *map(float, numbers)))
-            return "Prediction of histories", lines, header, rows
-        if self.mean.size > _MOST_ROWS:
+                rows.append((name, unit, *map(number, numbers)))
+        elif self.mean.size > _MOST_ROWS:
             lines.append(f"{self.mean.size} values of shape {self.mean.shape}: mean, sd and quantiles are attributes")
-            return "Prediction", lines, (), []
-        of_channels = len(self.channels) == self.mean.size
-        names = [channel.name for channel in self.channels] if of_channels else [f"{i}" for i in range(self.mean.size)]
-        header = ("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))
-        table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
-        rows = [
-            (name, unit, *(column / factor).tolist())
-            for name, (unit, factor), column in zip(
-                names, units if of_channels else [("SI", 1.0)] * self.mean.size, table.T, strict=True
-            )
-        ]
-        return "Prediction", lines, header, rows
-
-    def _need_histories(self) -> None:
-        if self.dt is None:
-            raise ValueError("this needs the histories of channels: propagate with quantity=None or names of channels")
+            return "\n".join(lines)
+        else:
+            if len(known) != self.mean.size:
+                known = [(f"{k}", "SI", 1.0) for k in range(self.mean.size)]
+            rows = [("value", "unit", "mean", "MC error", "sd", *(f"{100 * p:g} %" for p in self.probabilities))]
+            table = np.vstack([np.ravel(each) for each in (self.mean, self.standard_error, self.sd, *self.quantiles)])
+            for (name, unit, factor), column in zip(known, table.T, strict=True):
+                rows.append((name, unit, *map(number, column / factor)))
+        return "\n".join([*lines, text_table(rows)])
 
     def _compared(self, measurements: Measurements) -> np.ndarray | Comparison:
         """Return what the histories are compared with, in the order of `channels`."""
-        self._need_histories()
         chosen = measurements.select([channel.name for channel in self.channels])
         for predicted, measured in zip(self.channels, chosen.channels, strict=True):
             if predicted.dimension != measured.dimension:

@@ -8,8 +8,7 @@ A quantity :math:`g` of the response (a history, a peak, or any function of it) 
    \mathrm{Var}[g] \approx \frac{1}{N} \sum_j \left(g(\theta_j) - E[g]\right)^2,
 
 estimated from samples :math:`\theta_j` of the posterior. The samples are simulated in batches, and equal samples once,
-because resampling makes many copies. Mean and variance use all samples in one pass. Quantiles use as many samples as
-fit into a limit of memory. Failed simulations are counted by reason and left out.
+because resampling makes many copies. Failed simulations are counted by reason and left out.
 
 See ``docs/theory/prediction.rst``.
 
@@ -23,8 +22,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
-from typing import Any, TypedDict, Unpack, overload
+from typing import Any, overload
 
 import numpy as np
 from tqdm import tqdm
@@ -35,8 +33,7 @@ from ..checks.finding import warn
 from ..checks.screening import check_gaps
 from ..checks.transfer import check_bandwidth, check_final_values, check_peaks, check_same_response
 from ..noise.protocol import noise_under
-from ..signals.channels import Channel, Measurements
-from ..signals.error_measures import sum_of_squares
+from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..simulation.model import Model, SimulationFailed
 from .accumulator import Accumulator
@@ -47,14 +44,13 @@ from .inputs import (
     part_of,
     read_source,
     samples_of_rows,
-    simulates_in_batches,
     split_samples,
 )
 from .other_channels import predict_channels_of
 from .prediction import Prediction
 from .quantities import Quantity, evaluator
 
-__all__ = ["AllFailed", "check_effective_sample_size", "fit_measures", "propagate"]
+__all__ = ["AllFailed", "check_effective_sample_size", "propagate"]
 
 logger = logging.getLogger(__name__)
 
@@ -63,37 +59,14 @@ _LARGEST_BATCH = 256
 _LARGEST_SERIAL_BATCH = 16  # small, so that the progress bar moves often when simulations run one by one
 
 
-class _Options(TypedDict, total=False):
-    """Keywords of `propagate` besides `quantity`, for type checkers."""
-
-    part: str | None
-    model: Model | None
-    record: Record | None
-    from_state: str | None
-    rest: float
-    noise: bool | str
-    quantiles: Sequence[float]
-    effective_sample_size: float | None
-    batch: int | None
-    memory_bytes: int | None
-    pool: Any
-    cache: SimulationCache | str | os.PathLike | None
-    calibrated: Sequence[Measurements] | None
-    check: bool
-    seed: int | None
-    progress: bool
-
-
 @overload
 def propagate(
-    posterior_or_model: Any, samples: Any, *, quantity: Mapping[str, Quantity], **options: Unpack[_Options]
+    posterior_or_model: Any, samples: Any, *, quantity: Mapping[str, Quantity], **options: Any
 ) -> dict[str, Prediction]: ...
 
 
 @overload
-def propagate(
-    posterior_or_model: Any, samples: Any, *, quantity: Quantity = ..., **options: Unpack[_Options]
-) -> Prediction: ...
+def propagate(posterior_or_model: Any, samples: Any, *, quantity: Quantity = ..., **options: Any) -> Prediction: ...
 
 
 def propagate(
@@ -109,8 +82,6 @@ def propagate(
     noise: bool | str = False,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
     effective_sample_size: float | None = None,
-    batch: int | None = None,
-    memory_bytes: int | None = 512 * 2**20,
     pool: Any = None,
     cache: SimulationCache | str | os.PathLike | None = None,
     calibrated: Sequence[Measurements] | None = None,
@@ -163,14 +134,6 @@ def propagate(
     effective_sample_size : float, optional
         Effective number of independent samples, for the Monte Carlo errors. Default: the number of samples, as if they
         were independent. This underestimates the errors for the copies and chains of a sampler.
-    batch : int, optional
-        Number of simulations per batch. Default: as many as make 32 MiB of responses, at most 256, or 16 if
-        simulations run one by one.
-    memory_bytes : int or None
-        Largest size [bytes] of the results retained for quantiles, per quantity, besides a few batches. Histories are
-        retained in single precision (seven digits) if they do not fit in double precision. If they do not fit in
-        single precision either, a random subsample is retained, and `Prediction.n_quantile` is its size. None: no
-        limit. Single numbers are always retained.
     pool : optional
         Where simulations run, as in `FELikelihood`. Default: the pool of the likelihood.
     cache : SimulationCache or path, optional
@@ -185,8 +148,7 @@ def propagate(
         parameters of one sample: a model that reads one file whatever motion it is given repeats the calibration. This
         is one simulation, which the likelihood counts, unless it has cached the response.
     seed : int, optional
-        Seed of the noise and of the subsample for quantiles. The result depends neither on `batch` nor on `pool`,
-        except for round-off.
+        Seed of the noise. The result does not depend on `pool`.
     progress : bool
         Whether to show a progress bar.
 
@@ -198,22 +160,17 @@ def propagate(
     Raises
     ------
     ValueError
-        Before any simulation: for samples of another shape, without rows, or not finite; unknown channels; noise of a
-        bare model, or impossible noise parameters; a model with one excitation only, or one that cannot continue from
-        the end of its excitation; settings out of range; a `model` with other parameters, or with a channel whose
-        quantity was not measured and whose noise is wanted.
-        Later: for a function that returns arrays of different shapes.
+        Before any simulation, for samples of another shape or not finite, unknown channels, noise of a bare model,
+        impossible noise parameters, a model with one excitation or without a state at the end, other settings out of
+        range, and channels of `model` whose noise is not known. Later, for a function that returns arrays of different
+        shapes.
     SimulationFailed
         If every simulation fails.
 
     Warns
     -----
     UserWarning
-        For each finding in `Prediction.findings` that is more than a note: channels of `model` have the mean noise of
-        others; a `final_value` is taken while the structure moves; the median of the predicted peak of a channel, under
-        another record or of another `model`, is more than twice the largest measured peak of the calibration, or less
-        than half of the smallest one; the power of another record is in a band of less than a fifth of the width in
-        the calibration; the response to another record is the response to the calibration record.
+        For each finding in `Prediction.findings` that is more than a note (``docs/predictions.rst``).
 
     Examples
     --------
@@ -237,9 +194,6 @@ def propagate(
     n = len(thetas)
     probabilities = _probabilities(quantiles)
     effective = check_effective_sample_size(effective_sample_size, n)
-    if batch is not None and not (isinstance(batch, (int, np.integer)) and batch >= 1):
-        raise ValueError(f"batch must be a whole number of simulations, 1 or more; got {batch!r}")
-    _check_bytes("memory_bytes", memory_bytes)
     if record is not None:
         under_record(source.model, record)  # errors come before the warning about the state
     state = chosen_state(source.model, record, from_state)
@@ -254,30 +208,18 @@ def propagate(
     evaluators = {name: evaluator(each, model.channels, model.dt, n_steps) for name, each in wanted.items()}
 
     distinct, row_of_sample = distinct_rows(thetas)
+    members = samples_of_rows(row_of_sample, len(distinct))
     try:
         entropy = np.random.SeedSequence(seed).entropy
     except (TypeError, ValueError) as error:
         raise ValueError(f"seed must be a whole number, zero or more, or None; got {seed!r}") from error
     accumulators = {
-        name: Accumulator(
-            members=samples_of_rows(row_of_sample, len(distinct)),
-            noise=sample_noise,
-            evaluate=evaluate.function,
-            rows=evaluate.rows,
-            result_of_sample=np.arange(n) if noise else row_of_sample,
-            probabilities=probabilities,
-            memory_bytes=memory_bytes,
-            seeds=np.random.SeedSequence(entropy),
-        )
+        name: Accumulator(evaluate, members, sample_noise, bool(probabilities), entropy, n_steps)
         for name, evaluate in evaluators.items()
     }
-    response_size = len(model.channels) * model.n_steps
-    for name, evaluate in evaluators.items():
-        if evaluate.rows is not None:
-            accumulators[name].allocate((len(evaluate.rows), n_steps))
-    if batch is None:
-        together = source.executor is not None or simulates_in_batches(model)
-        batch = max(1, min(_BATCH_VALUES // response_size, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
+    together = source.executor is not None or hasattr(model, "simulate_batch")
+    batch = _BATCH_VALUES // (len(model.channels) * model.n_steps)
+    batch = max(1, min(batch, _LARGEST_BATCH if together else _LARGEST_SERIAL_BATCH))
     stored = None
     if cache is not None:
         cache = cache if isinstance(cache, SimulationCache) else SimulationCache(cache)
@@ -295,14 +237,9 @@ def propagate(
                 first = None if good is None else (distinct[start + good], responses[good].copy())
             ends.add(responses, reasons)
             if other:
-                peaks.add(responses, reasons, accumulator.members[start : start + batch])
-            bar.update(sum(len(members) for members in accumulator.members[start : start + batch]))
-    predictions = {
-        name: replace(
-            _prediction(each, n, effective, evaluators[name].channels, model.dt, state), quantity=wanted[name]
-        )
-        for name, each in accumulators.items()
-    }
+                peaks.add(responses, reasons, members[start : start + batch])
+            bar.update(sum(map(len, members[start : start + batch])))
+    found = {name: _prediction(each, probabilities, effective, model.dt) for name, each in accumulators.items()}
     findings = [*assumed, *check_final_values(ends.medians())]
     if other:
         findings += check_peaks(peaks.medians(c.name for c in model.channels), known, alone=calibrated is None)
@@ -315,52 +252,12 @@ def propagate(
     warn(findings)
     measured = None if source.likelihood is None or other else source.likelihood.measurements
     data = None if measured is None or measured.is_history else measured
+    common = {"from_state": state, "findings": tuple(findings)}
     predictions = {
-        name: replace(each, findings=tuple(findings), data=None if each.dt is None else data)
-        for name, each in predictions.items()
+        name: replace(each, quantity=wanted[name], data=None if each.dt is None else data, **common)
+        for name, each in found.items()
     }
     return predictions if isinstance(quantity, Mapping) else predictions[""]
-
-
-def fit_measures(posterior: Any, samples: Any, part: str | None = None) -> np.ndarray:
-    """Compute the squared relative error of each sample's response.
-
-    The error is sum (simulated - measured)^2 / sum measured^2, the square of the RRMSE. It needs misfits only, so that
-    no response is stored and simulations cached by the likelihood are not repeated.
-
-    Parameters
-    ----------
-    posterior : Posterior, FELikelihood or JointLikelihood
-        The likelihood with the measurements.
-    samples : (n, ndim) array_like, or named values of shape (n,)
-        All parameters, or the structural parameters alone.
-    part : str, optional
-        As for `propagate`.
-
-    Returns
-    -------
-    ndarray, shape (n, n_channels)
-        The errors [-] in the order of the model's channels. Failed simulations have rows of NaN.
-
-    Raises
-    ------
-    ValueError
-        As `propagate`, and if there are no measurements or a measured channel is zero at all samples.
-
-    Examples
-    --------
-    >>> fit_measures(posterior, samples).shape
-    (300, 2)
-    """
-    posterior, samples = part_of(posterior, samples, part, False)
-    source = read_source(posterior)
-    if source.likelihood is None:
-        raise ValueError(f"fit_measures needs a posterior or a likelihood with measurements; got {posterior!r}")
-    likelihood = source.likelihood
-    compared = getattr(likelihood.measured, "values", likelihood.measured)
-    power = sum_of_squares(compared, [channel.name for channel in likelihood.measurements.channels])
-    thetas, _ = split_samples(source, samples, False)
-    return likelihood.misfit(thetas) / power
 
 
 def check_effective_sample_size(effective_sample_size: float | None, n: int) -> float:
@@ -380,14 +277,8 @@ class AllFailed(SimulationFailed):
         self.collapsed = collapsed
 
 
-def _prediction(
-    accumulator: Accumulator,
-    n: int,
-    effective: float,
-    channels: tuple[Channel, ...],
-    dt: float,
-    from_state: str,
-) -> Prediction:
+def _prediction(accumulator: Accumulator, probabilities: tuple[float, ...], effective: float, dt: float) -> Prediction:
+    n = len(accumulator.result_of_sample)
     failed, collapsed = (
         np.sort(np.concatenate([np.zeros(0, dtype=int), *samples]))
         for samples in (accumulator.failed, accumulator.collapsed)
@@ -399,28 +290,16 @@ def _prediction(
         logger.warning("%d of %d samples failed and are left out of the prediction (%s)", len(failed), n, frequent)
     used = np.setdiff1d(np.arange(n), failed, assume_unique=True)
     effective = effective * len(used) / n
-    histories, noise, retained = accumulator.rows is not None, accumulator.noise is not None, accumulator.retained
+    histories, noise = accumulator.quantity.rows is not None, accumulator.noise
     variance = accumulator.moments.variance
     error = np.sqrt(variance / effective)
-    if histories and noise:
+    if histories and noise is not None:
         added = accumulator.noise_variance.mean
-        per_step = accumulator.noise.of_response is not None
-        variance = variance + (added if per_step else accumulator.noise.over_time(added, variance.shape[1]))
-    probabilities, n_quantile = accumulator.probabilities, 0 if retained is None else retained.n_samples
-    if probabilities and n_quantile == 0:
-        logger.warning("no quantiles: all samples retained for them failed; increase memory_bytes")
-        probabilities = ()
+        per_step = noise.of_response is not None
+        variance = variance + (added if per_step else noise.over_time(added, variance.shape[1]))
+    quantiles = quantile_error = np.zeros((0, *accumulator.shape))
     if probabilities:
-        # The error of a random subsample adds to the error of all samples.
-        part = 1.0 / (1.0 / effective + 1.0 / n_quantile - 1.0 / len(used))
-        quantiles, quantile_error = retained.quantiles(probabilities, part)
-        if n_quantile < len(used):
-            logger.warning(
-                "quantiles are of %d of %d samples, because no more fit into memory_bytes", n_quantile, len(used)
-            )
-    else:
-        quantiles = quantile_error = np.zeros((0, *accumulator.shape))
-    whole = not histories and retained is not None and retained.complete
+        quantiles, quantile_error = accumulator.quantiles(used, probabilities, effective)
     return Prediction(
         mean=accumulator.moments.mean,
         variance=variance,
@@ -428,17 +307,15 @@ def _prediction(
         probabilities=probabilities,
         quantiles=quantiles,
         quantile_error=quantile_error,
-        values=retained.values_of(accumulator.result_of_sample[used]) if whole else None,
+        values=None if histories else accumulator.values_of(used),
         n_samples=len(used),
-        n_quantile=n_quantile if probabilities else 0,
         effective_sample_size=float(effective),
         failed=failed,
         collapsed=collapsed,
         failure_reasons=dict(accumulator.reasons),
-        channels=channels,
+        channels=accumulator.quantity.channels,
         dt=dt if histories else None,
-        noise=noise,
-        from_state=from_state,
+        noise=noise is not None,
     )
 
 
@@ -450,10 +327,3 @@ def _probabilities(quantiles: Sequence[float]) -> tuple[float, ...]:
     if not all(0.0 < p < 1.0 for p in probabilities) or len(set(probabilities)) != len(probabilities):
         raise ValueError(f"quantiles must be different probabilities between 0 and 1; got {quantiles!r}")
     return probabilities
-
-
-def _check_bytes(name: str, value: object) -> None:
-    """Raise ValueError unless a limit of memory is a number, zero or more, or None."""
-    if value is None or (isinstance(value, Real) and not isinstance(value, bool) and value >= 0):
-        return
-    raise ValueError(f"{name} must be a number of bytes, or None for no limit; got {value!r}")

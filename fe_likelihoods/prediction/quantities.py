@@ -57,6 +57,7 @@ class ChannelQuantity:
     timed: bool = False  # whether the last argument is the time step [s]
     describe: Callable[[Channel], Channel] | None = None
     name: str = "quantity"  # what the number is, such as "peak"
+    n_steps: int | None = None  # samples of the history that it is for; None: any number
 
     def __str__(self) -> str:
         return f"{self.name} of {self.channel}"
@@ -78,7 +79,12 @@ class ChannelQuantity:
         return channel if self.describe is None else self.describe(channel)
 
     def check_length(self, n_steps: int) -> None:
-        """Raise ValueError if an array among the arguments has another number of samples, or the part has none."""
+        """Raise ValueError if the quantity is for another number of samples, or the part has none."""
+        if self.n_steps not in (None, n_steps):
+            raise ValueError(
+                f"{self} is for responses of {self.n_steps} samples, got {n_steps}: make it with "
+                "model.with_record(record) for a prediction under another record"
+            )
         for each in self.others:
             if not isinstance(each, str) and len(each) != n_steps:
                 raise ValueError(

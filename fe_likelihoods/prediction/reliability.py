@@ -18,7 +18,7 @@ Biometrika 26(4), 404-413, doi:10.1093/biomet/26.4.404.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,26 +28,26 @@ from scipy import stats
 from ..checks.finding import warn
 from ..checks.transfer import check_unit_of_threshold
 from ..events.ratios import EventRatios
-from ..events.spread import EventSpread, exceedance_draws, exceedance_of_samples
 from ..signals.channels import Channel
 from ..text_tables import number, text_table
 from ..units import DIMENSIONS, find_unit, to_si
 from .prediction import Prediction
-from .propagation import check_effective_sample_size
 
 __all__ = [
+    "Estimate",
     "Exceedance",
-    "binomial_interval",
     "check_level",
     "contents",
     "estimate",
     "exceedance",
-    "exceedance_probability",
+    "exceeded",
     "threshold_in_si",
     "unit_of_threshold",
-    "with_collapses",
     "warn_of_missing_error",
 ]
+
+_DRAWS = 1000  # of the population of ratios
+_ARRAYS = ("probability", "standard_error", "lower", "upper", "upper_by_events")  # of an `Exceedance`
 
 
 class Exceedance(NamedTuple):
@@ -114,7 +114,6 @@ def exceedance(
     unit: str | None = None,
     ratios: EventRatios | None = None,
     noise: bool | None = None,
-    effective_sample_size: float | None = None,
     level: float = 0.95,
     seed: int = 0,
 ) -> Exceedance:
@@ -135,8 +134,6 @@ def exceedance(
         noise. A prediction by `predict_new_event` has its ratios already.
     noise : bool, optional
         False states that the model error is left out on purpose. Default: a prediction without it gives a warning.
-    effective_sample_size : float, optional
-        Effective number of independent samples. Default: as in the prediction, or the number of values.
     level : float
         Probability of the interval, between 0 and 1.
     seed : int
@@ -150,9 +147,8 @@ def exceedance(
     Raises
     ------
     ValueError
-        If the threshold has the wrong shape or unit, is not finite, or is not positive where there are ratios; the
-        values are missing or not finite; the ratios are for another number of quantities, or are given for a prediction
-        that contains errors already; or the prediction has noise and ``noise=False``.
+        If the threshold has the wrong shape or unit, or is not positive where there are ratios; the values are missing
+        or not finite; or ratios or ``noise=False`` contradict the prediction.
 
     Warns
     -----
@@ -170,32 +166,30 @@ def exceedance(
     events.
     """
     prediction = prediction_or_values if isinstance(prediction_or_values, Prediction) else None
+    n_collapsed, has_error, channels = 0, False, ()
     if prediction is not None:
         if prediction.values is None:
             raise ValueError(
                 "exceedance needs the values of the samples, but this prediction has none: propagate with a number as "
                 "quantity, such as peak(channel)"
             )
-        spread = EventSpread(prediction.values) if prediction.spread is None else prediction.spread
-        effective, channels, has_error = prediction.effective_sample_size, prediction.channels, prediction.noise
+        values, has_error, channels = prediction.values, prediction.noise, prediction.channels
+        effective, n_collapsed = prediction.effective_sample_size, len(prediction.collapsed)
     else:
-        values, channels, has_error = np.asarray(prediction_or_values, dtype=float), (), False
+        values = np.asarray(prediction_or_values, dtype=float)
         if values.ndim == 0 or len(values) == 0 or not np.isfinite(values).all():
             raise ValueError(f"values must be finite, one row per sample; got {values.size} of shape {values.shape}")
-        spread, effective = EventSpread(values), float(len(values))
+        effective = float(len(values))
     if noise is False and has_error:
         raise ValueError(
             "noise=False states that there is no error of the model, but the prediction contains one: propagate with "
             "noise=False, and predict_new_event without ratios"
         )
-    if ratios is not None:
-        if has_error:
-            raise ValueError("ratios contain the error of the model, and the prediction contains it already: leave one")
-        spread = spread._replace(ratios=ratios)
-    elif prediction is not None and noise is None and not has_error:
+    if ratios is not None and has_error:
+        raise ValueError("ratios contain the error of the model, and the prediction contains it already: leave one")
+    if ratios is None and prediction is not None and noise is None and not has_error:
         warn_of_missing_error("exceedance", 'propagate with noise="model" and noise in shares of the response')
-    effective = float(check_effective_sample_size(effective_sample_size, effective))
-    limits, values = threshold_in_si(threshold, unit, channels), spread.values
+    limits = threshold_in_si(threshold, unit, channels)
     if values.ndim > 1 and limits.shape not in ((), values.shape[1:]):
         raise ValueError(
             f"expected one threshold, or one for each entry of the quantity, shape {values.shape[1:]}; got shape "
@@ -204,43 +198,8 @@ def exceedance(
     check_level(level)
     if unit is None and len({channel.unit for channel in channels}) == 1 and limits.size:
         warn(check_unit_of_threshold(limits, values, channels[0]), stacklevel=2)
-    said, unit = contents(has_error, spread), unit_of_threshold(unit, channels)
-    found = _of_values(values, limits, spread, effective, level, seed)._replace(uncertainty=said, unit=unit)
-    return found if prediction is None else with_collapses(found, prediction, level)
-
-
-def with_collapses(found: Exceedance, prediction: Prediction, level: float = 0.95) -> Exceedance:
-    """Count the samples of a prediction whose structure collapsed as exceedances of every limit.
-
-    A probability that leaves them out speaks of the structures that stand, and is too low. For a share c of collapsed
-    samples and the probability p' among the others, p = c + (1 - c) p'; the interval combines the ends of c and p'.
-    """
-    n_collapsed = len(prediction.collapsed)
-    if not n_collapsed:
-        return found
-    total = prediction.n_samples + n_collapsed
-    share, effective = n_collapsed / total, found.effective_sample_size * total / prediction.n_samples
-    lowest, highest = binomial_interval(share, effective, level)
-    error = np.hypot(
-        (1.0 - share) * found.standard_error, (1.0 - found.probability) * np.sqrt(share * (1.0 - share) / effective)
-    )
-    by_events = found.upper_by_events
-    return found._replace(
-        probability=share + (1.0 - share) * found.probability,
-        standard_error=error,
-        lower=lowest + (1.0 - lowest) * found.lower,
-        upper=highest + (1.0 - highest) * found.upper,
-        effective_sample_size=effective,
-        uncertainty=f"{found.uncertainty}; {n_collapsed} of {total} structures collapsed, which exceed every limit",
-        upper_by_events=None if by_events is None else highest + (1.0 - highest) * by_events,
-    )
-
-
-def _of_values(
-    values: np.ndarray, limits: np.ndarray, spread: EventSpread, effective: float, level: float, seed: int
-) -> Exceedance:
-    """Probability that values (n, ...) exceed limits."""
-    ratios = spread.ratios
+    if prediction is not None and prediction.ratios is not None:  # exact, not by the draws
+        ratios, values = prediction.ratios, prediction.predicted[None]
     if ratios is not None:
         if not (limits > 0.0).all():
             raise ValueError(f"with ratios, thresholds must be positive; got {limits}")
@@ -248,36 +207,46 @@ def _of_values(
             raise ValueError(
                 f"expected ratios (n_events, ...) of a quantity of shape {values.shape[1:]}; got {ratios.values.shape}"
             )
-    if ratios is not None and ratios.shape:  # each quantity has ratios of its own
-        rows = np.broadcast_to(limits, values.shape[1:])
-        columns = [
-            exceedance_probability(
-                values[:, k], rows[k], spread._replace(ratios=ratios.of_quantity(k)), effective, level, seed
-            )
-            for k in range(len(rows))
-        ]
-        numbers = [np.array(each) for each in zip(*(column[1:5] for column in columns), strict=True)]
-        by_events = np.array([each.upper_by_events for each in columns])
-        return Exceedance(limits, *numbers, effective, upper_by_events=by_events)
     if values.ndim == 1 and limits.ndim:
         values = values.reshape(-1, *(1,) * limits.ndim)
-    return exceedance_probability(values, limits, spread, effective, level, seed)._replace(threshold=limits)
+    settings = n_collapsed, effective, level, seed
+    if ratios is None or not ratios.shape:
+        found = exceeded(values, limits, ratios, *settings)
+    else:  # each quantity has ratios of its own
+        rows = np.broadcast_to(limits, values.shape[1:])
+        columns = [exceeded(values[:, k], rows[k], ratios.of_quantity(k), *settings) for k in range(len(rows))]
+        arrays = {name: np.array([getattr(each, name) for each in columns]) for name in _ARRAYS}
+        found = columns[0]._replace(**arrays)
+    said = contents(has_error, ratios) + found.uncertainty
+    return found._replace(threshold=limits, uncertainty=said, unit=unit_of_threshold(unit, channels))
 
 
-def exceedance_probability(
+def exceeded(
     values: np.ndarray,
     limits: np.ndarray,
-    spread: EventSpread,
+    ratios: EventRatios | None,
+    n_collapsed: int,
     effective: float,
     level: float,
     seed: int,
-    below: bool = False,
 ) -> Exceedance:
-    """Probability of an exceedance, see `estimate`."""
-    found = estimate(values, limits, spread, effective, level, seed, below)
+    """Probability that values (n, ...) of samples exceed limits, which are broadcast to them.
+
+    Further `n_collapsed` samples exceed every limit: a probability without them speaks of the structures that stand.
+    """
     values, limits = np.broadcast_arrays(values, limits)
-    by_events = None if spread.ratios is None else _upper_by_events(values, limits, spread.ratios, level, below)
-    return Exceedance(limits[0], *found[:4], effective, contents(False, spread), by_events)
+    n, total = len(values), len(values) + n_collapsed
+    fallen, effective = np.full((n_collapsed, *values.shape[1:]), np.nan), effective * total / n
+    known, above = np.concatenate([values, fallen]), np.concatenate([limits, np.ones(fallen.shape)])
+    found = estimate(known, above, ratios, np.isnan(known), effective, level, seed)
+    by_events = None
+    if ratios is not None:  # each event is one trial
+        logs = np.log(np.where(values > 0.0, values, 1.0))
+        moved = [values * ratios.of_event(k, logs) > limits for k in range(len(ratios.values))]
+        share = (np.mean(moved, axis=0).sum(axis=0) + n_collapsed) / total
+        by_events = _binomial_interval(share, len(ratios.values), level)[1]
+    said = f"; {n_collapsed} of {total} structures collapsed, which exceed every limit" if n_collapsed else ""
+    return Exceedance(limits[0], *found[:4], effective, said, by_events)
 
 
 class Estimate(NamedTuple):
@@ -295,70 +264,64 @@ class Estimate(NamedTuple):
 def estimate(
     values: np.ndarray,
     limits: np.ndarray,
-    spread: EventSpread,
+    ratios: EventRatios | None,
+    exceeding: np.ndarray,
     effective: float,
     level: float,
     seed: int | None,
-    below: bool = False,
-    exceeding: np.ndarray | None = None,
 ) -> Estimate:
-    """Probability that values (n, ...) in a new event exceed limits, which are broadcast to them.
+    """Probability that values (n, ...), times a ratio, exceed limits, which are broadcast to them.
 
-    The values are not yet multiplied by ratios. NaN are failures, which are left out, or count as exceedances where
-    `exceeding`. With `below`, values below a limit exceed it. The interval is from quantiles of draws of the event
-    population, or the Clopper-Pearson interval without ratios and population.
+    Given the population of the ratios, the probability is a number; its mean over populations is the probability, and
+    its quantiles, over samples and populations, are the interval. Without ratios this is the Clopper-Pearson interval.
+    NaN are failures, which are left out, or count as exceedances where `exceeding`.
     """
     values, limits = np.broadcast_arrays(values, limits)
     failed = np.isnan(values)
-    exceeding = np.zeros(values.shape, dtype=bool) if exceeding is None else exceeding
-    known = np.where(failed, 1.0, values)
-    single = np.where(failed, exceeding, exceedance_of_samples(known, limits, spread.ratios, below))
     counted = 1.0 - (failed & ~exceeding)
+    known = np.where(failed, np.nanmax(np.where(failed, -np.inf, values), initial=-np.inf), values)
+
+    def of_samples(rows: np.ndarray | slice, above: np.ndarray) -> np.ndarray:
+        return np.where(failed[rows], exceeding[rows], above)
+
+    if ratios is None:
+        single = of_samples(slice(None), known > limits).astype(float)
+    else:
+        single = of_samples(slice(None), _with_ratios(known, limits, ratios.probability_above))
     number_of = counted.sum(axis=0)
     share, trials = (single * counted).sum(axis=0) / number_of, effective * number_of / len(values)
     error = np.sqrt((np.square(single - share) * counted).sum(axis=0) / number_of / trials)
-    if spread.ratios is None and spread.weights is None:
-        return Estimate(share, error, *binomial_interval(share, trials, level), single, counted, None)
+    if ratios is None:
+        return Estimate(share, error, *_binomial_interval(share, trials, level), single, counted, None)
     rng = np.random.default_rng(seed)
-    draws = exceedance_draws(values, limits, spread, rng, below, failed, exceeding)
-    return Estimate(share, error, *_interval_of_draws(draws, share, trials, spread, level), single, counted, draws)
-
-
-def _upper_by_events(
-    values: np.ndarray, limits: np.ndarray, ratios: EventRatios, level: float, below: bool
-) -> np.ndarray:
-    """Upper end of the binomial interval for the share of events that exceed; each event is one trial."""
-    logs = np.log(np.where(values > 0.0, values, 1.0))
-    moved = [values * ratios.of_event(k, logs) for k in range(len(ratios.values))]
-    exceeded = [(each < limits if below else each > limits).mean(axis=0) for each in moved]
-    return binomial_interval(np.mean(exceeded, axis=0), len(ratios.values), level)[1]
-
-
-def _interval_of_draws(
-    draws: np.ndarray, share: np.ndarray, effective: ArrayLike, spread: EventSpread, level: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Interval of the probability `share` (...) from draws of it (n_draws, ...), NaN left out, extended to contain it.
-
-    Probabilities far in a tail differ between populations by many powers of ten, so that their mean, which is the
-    probability of a new event, can be above nearly all of them. Without ratios, the drawn probabilities are shares of
-    samples, which may all be zero or one: the interval then also contains the Clopper-Pearson interval.
-    """
+    rows = rng.permutation(np.resize(rng.permutation(len(values)), _DRAWS))  # each population has one of the samples
+    populations = ratios.draw_populations(_DRAWS, rng)
+    draws = of_samples(rows, _with_ratios(known[rows], limits[rows], populations.probability_above))
+    draws = np.where(counted[rows] > 0.0, draws, np.nan)
     lower, upper = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
-    least, most = (share, share) if spread.ratios is not None else binomial_interval(share, effective, level)
-    return np.minimum(lower, least), np.maximum(upper, most)
+    # far in a tail the mean over populations can be above nearly all of their probabilities
+    return Estimate(share, error, np.minimum(lower, share), np.maximum(upper, share), single, counted, draws)
 
 
-def contents(has_noise: bool, spread: EventSpread) -> str:
+def _with_ratios(
+    values: np.ndarray, limits: np.ndarray, probability_above: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Probability that values times a ratio exceed positive limits; values that are not positive never do."""
+    positive = values > 0.0
+    known = np.where(positive, values, 1.0)
+    return np.where(positive, probability_above(limits / known, np.log(known)), 0.0)
+
+
+def contents(has_noise: bool, ratios: EventRatios | None) -> str:
     """Which uncertainties a probability contains, in words."""
-    found = ["the uncertainty of the parameters"]
-    if spread.weights is not None:
-        found.append("their spread between events")
-    if spread.ratios is not None:
-        found.append(f"the error of the model, from the ratios of {len(spread.ratios.values)} events")
-    elif has_noise:
-        found.append("the error of the model, from the noise of the calibration")
-    said = found[0] if len(found) == 1 else f"{', '.join(found[:-1])} and {found[-1]}"
-    return said if has_noise or spread.ratios is not None else f"{said}, not the error of the model"
+    said = "the uncertainty of the parameters"
+    if ratios is not None:
+        return f"{said} and the error of the model, from the ratios of {len(ratios.values)} events"
+    return said + (
+        " and the error of the model, from the noise of the calibration"
+        if has_noise
+        else ", not the error of the model"
+    )
 
 
 def warn_of_missing_error(caller: str, how: str, stacklevel: int = 3) -> None:
@@ -396,7 +359,7 @@ def unit_of_threshold(unit: str | None, channels: Sequence[Channel]) -> str:
     return DIMENSIONS[dimensions.pop()] if len(dimensions) == 1 else "SI"
 
 
-def binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
+def _binomial_interval(share: np.ndarray, effective: ArrayLike, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Clopper-Pearson interval of a probability, for a share of `effective` trials, which may be no whole number."""
     tail = 0.5 * (1.0 - level)
     share = np.asarray(share, dtype=float)

@@ -1,7 +1,6 @@
 """Scores of one prediction as tables: of histories per channel, of numbers (peaks, residual values) per quantity."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -65,9 +64,7 @@ class HistoryScores(NamedTuple):
     pit : ndarray, shape (n_channels, 10)
         Shares of the measured samples whose PIT (for the normal distributions) is in each tenth of 0 to 1: about 0.1
         each for a calibrated prediction; high at both ends if the prediction is too narrow, in the middle if too wide.
-    without_spread : ndarray of int, shape (n_channels,)
-        Number of measured samples with a predicted standard deviation of zero. They are left out of `pit`, which is NaN
-        if no other samples are left.
+        A sample with a predicted standard deviation of zero is at an end, or left out if it equals the mean.
     effective_samples : ndarray, shape (n_channels,)
         Number of independent samples that the measured ones are worth, from the autocorrelation of the normalised
         errors (`fe_likelihoods.effective_samples`): for the standard error of a coverage.
@@ -88,7 +85,6 @@ class HistoryScores(NamedTuple):
     coverage_strong: np.ndarray
     coverage_by_level: np.ndarray
     pit: np.ndarray
-    without_spread: np.ndarray
     effective_samples: np.ndarray
     coverage_error: np.ndarray
 
@@ -102,10 +98,7 @@ class HistoryScores(NamedTuple):
             row = [channel.name, channel.unit, rms, f"{self.rrmse[k]:.1%}", crps, score, width]
             shares = [self.coverage[k], self.coverage_strong[k], *self.coverage_by_level[k]]
             rows.append(row + ["-" if np.isnan(share) else f"{share:.1%}" for share in shares])
-        if not self.without_spread.any():
-            return text_table(rows)
-        left_out = ", ".join(f"{n} of {c.name}" for c, n in zip(self.channels, self.without_spread, strict=True) if n)
-        return f"{text_table(rows)}\nPIT without samples whose predicted standard deviation is zero: {left_out}"
+        return text_table(rows)
 
     __repr__ = __str__
 
@@ -190,7 +183,7 @@ def score_histories(
 
     Moments are means and standard deviations, the band has quantiles with the probabilities (1 - level) / 2 and (1 +
     level) / 2, and the envelope is of the predicted mean. ValueError if a channel has no sample or is zero at all of
-    them; warns if the predicted standard deviation of measured samples is zero.
+    them.
     """
     error = rrmse(moments[0], measured, [channel.name for channel in channels])
     there = np.isfinite(measured)
@@ -198,11 +191,7 @@ def score_histories(
     largest = np.array(LEVELS)[:, None, None] * envelope.max(axis=1, keepdims=True)
     classes = (envelope >= largest).sum(axis=0)
     spread = there & (moments[1] > 0.0)
-    certain = there.sum(axis=1) - spread.sum(axis=1)
-    if certain.any():
-        _warn_of_certainty(channels, certain, there.sum(axis=1))
-    transforms = pit_normal(*moments, measured)
-    shares = [_histogram(row[known]) for row, known in zip(transforms, spread, strict=True)]
+    shares = [_histogram(row[np.isfinite(row)]) for row in pit_normal(*moments, measured)]
     counts = np.stack([(there & (classes == k)).sum(axis=1) for k in range(len(LEVELS) + 1)], axis=1)
     worth = _effective(np.where(spread, measured - moments[0], np.nan) / np.where(spread, moments[1], 1.0))
     parts = counts * (worth / there.sum(axis=1))[:, None]
@@ -219,7 +208,6 @@ def score_histories(
         coverage_strong=_mean(inside, there & strong_part(measured)),
         coverage_by_level=np.stack([_mean(inside, there & (classes == k)) for k in range(len(LEVELS) + 1)], axis=1),
         pit=np.array(shares),
-        without_spread=certain,
         effective_samples=worth,
         coverage_error=np.sqrt(level * (1.0 - level) / np.where(counts > 0, np.maximum(parts, 1.0), np.nan)),
     )
@@ -280,16 +268,6 @@ def strong_part(measured: ArrayLike, start: float = 0.05, stop: float = 0.95) ->
     share = np.cumsum(squares, axis=-1)
     total = share[..., -1:]
     return (share >= start * total) & (share - squares <= stop * total)
-
-
-def _warn_of_certainty(channels: Sequence[Channel], certain: np.ndarray, samples: np.ndarray) -> None:
-    which = [f"{c.name} ({k} of {n})" for c, k, n in zip(channels, certain, samples, strict=True) if k]
-    warnings.warn(
-        f"score: the predicted standard deviation of measured samples is zero: {', '.join(which)}. They are left out "
-        "of the PIT. Predict with noise=True; for a noise that is a share of the response, state "
-        "the noise of the sensors too, such as GaussianNoise(model.channels, sensor=...)",
-        stacklevel=4,
-    )
 
 
 def _effective(errors: np.ndarray) -> np.ndarray:

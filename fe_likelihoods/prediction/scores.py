@@ -41,84 +41,30 @@ __all__ = [
 
 
 def crps_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
-    r"""Continuous ranked probability score of normal distributions.
+    r"""Continuous ranked probability score (...) of normal distributions; the absolute error where sd is zero.
 
-    Parameters
-    ----------
-    mean, sd : (...) array_like
-        Mean and standard deviation of the predictions. Where the standard deviation is zero, the score is the absolute
-        error.
-    observed : (...) array_like
-        Measured values, NaN where missing.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        :math:`\sigma\,[z\,(2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt \pi]` with :math:`z = (y - \mu) / \sigma`
-        (Gneiting and Raftery 2007, section 4.2, with the opposite sign), in the unit of the values.
-
-    Raises
-    ------
-    ValueError
-        If a standard deviation is negative.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.prediction.scores import crps_normal
-    >>> float(crps_normal(0.0, 1.0, 0.0).round(4))
-    0.2337
+    :math:`\sigma\,[z\,(2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt \pi]` with :math:`z = (y - \mu) / \sigma` (Gneiting
+    and Raftery 2007, section 4.2, with the opposite sign).
     """
-    mean, sd, observed = _normal("crps_normal", mean, sd, observed)
-    error = observed - mean
+    error = np.asarray(observed, dtype=float) - mean
     with np.errstate(divide="ignore", invalid="ignore"):
         z = error / sd
-        score = sd * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * _density(z) - 1.0 / np.sqrt(np.pi))
-    return np.where(sd > 0.0, score, np.abs(error))
+        density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+        score = sd * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
+    return np.where(np.asarray(sd) > 0.0, score, np.abs(error))
 
 
-def crps_samples(values: ArrayLike, observed: ArrayLike, effective_sample_size: float | None = None) -> np.ndarray:
-    r"""Continuous ranked probability score of distributions that are given by samples.
+def crps_samples(values: ArrayLike, observed: ArrayLike, effective: float | None = None) -> np.ndarray:
+    r"""Unbiased continuous ranked probability score (...) of samples (n, ...), n > 1, which are worth `effective` ones.
 
-    Parameters
-    ----------
-    values : (n, ...) array_like
-        Samples of the predictions, two or more.
-    observed : (...) array_like
-        Measured values, NaN where missing.
-    effective_sample_size : float, optional
-        Number of independent samples N that they are worth, above 1. Default: the number of samples n. If a sampler
-        has made copies of m different samples, give :math:`n^2 / \sum_g m_g^2` for the numbers of copies :math:`m_g`,
-        which is m for equal numbers. With the default, the score of a calibrated normal prediction is then too large
-        by the share 1 / m - 1 / n, such as 5 % for 400 copies of 20.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        :math:`\frac1n \sum_i |x_i - y| - \frac{1}{2 n^2 (1 - 1 / N)} \sum_{i, j} |x_i - x_j|` (Ferro 2014 for N = n),
-        in the unit of the values: an unbiased estimate of the score for the distribution that was sampled. NaN where a
-        sample is NaN.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two samples, the shapes do not fit, or the effective sample size is not above 1.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.prediction.scores import crps_samples
-    >>> float(crps_samples([0.0, 1.0, 2.0], 1.0).round(3))
-    0.0
+    :math:`\frac1n \sum_i |x_i - y| - \frac{1}{2 n^2 (1 - 1 / N)} \sum_{i, j} |x_i - x_j|` (Ferro 2014 for N = n).
+    Copies by a sampler are worth :math:`N = n^2 / \sum_g m_g^2` for the numbers of copies :math:`m_g`.
     """
-    ascending, observed = _samples(values, observed)
-    n = len(ascending)
-    effective = n if effective_sample_size is None else float(effective_sample_size)
-    if not 1.0 < effective < np.inf:
-        raise ValueError(f"crps_samples: the effective sample size must be above 1; got {effective_sample_size!r}")
+    ascending, n = np.sort(np.asarray(values, dtype=float), axis=0), len(values)
     # sum over pairs of |x_i - x_j| = 2 sum_i (2 i - n - 1) x_(i), with the ranks i = 1 ... n
     ranks = 2.0 * np.arange(1, n + 1) - n - 1.0
-    pairs = n * (n - 1.0) if effective == n else n * n * (1.0 - 1.0 / effective)
-    spread = np.tensordot(ranks, ascending, axes=1) / pairs
-    return np.abs(ascending - observed).mean(axis=0) - spread
+    pairs = n * (n - 1.0) if effective in (None, n) else n * n * (1.0 - 1.0 / effective)
+    return np.abs(ascending - observed).mean(axis=0) - np.tensordot(ranks, ascending, axes=1) / pairs
 
 
 def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, level: float) -> np.ndarray:
@@ -151,11 +97,11 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, leve
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"interval_score: level must be a probability between 0 and 1; got {level!r}")
-    lower, upper, observed = _as_floats(lower, upper, observed)
+    lower, upper, observed = (np.asarray(each, dtype=float) for each in (lower, upper, observed))
     if (lower > upper).any():
         raise ValueError(
-            f"interval_score: expected lower ends below the upper ends; {np.count_nonzero(lower > upper)} of "
-            f"{lower.size} are above: exchange them"
+            f"interval_score: expected lower ends below the upper ends; {np.count_nonzero(lower > upper)} "
+            "are above: exchange them"
         )
     outside = np.maximum(lower - observed, 0.0) + np.maximum(observed - upper, 0.0)
     return (upper - lower) + 2.0 / (1.0 - level) * outside
@@ -164,12 +110,10 @@ def interval_score(lower: ArrayLike, upper: ArrayLike, observed: ArrayLike, leve
 def pit_normal(mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> np.ndarray:
     """Predicted probability (...) of a value below the measured one, for normal distributions; NaN where missing.
 
-    Where the standard deviation is zero, it is 0 or 1, and NaN for a measured value that is the mean. A negative
-    standard deviation is a ValueError.
+    Where the standard deviation is zero, it is 0 or 1, and NaN for a measured value that is the mean.
     """
-    mean, sd, observed = _normal("pit_normal", mean, sd, observed)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return ndtr((observed - mean) / sd)
+        return ndtr((np.asarray(observed, dtype=float) - mean) / sd)
 
 
 def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
@@ -178,10 +122,9 @@ def pit_samples(values: ArrayLike, observed: ArrayLike) -> np.ndarray:
     It is (k + 0.5) / (n + 1) for k samples below the value, equal samples counting one half, and never 0 or 1, because
     no finite number of samples shows that a value is impossible.
     """
-    ascending, observed = _samples(values, observed)
-    below = (ascending < observed).sum(axis=0) + 0.5 * (ascending == observed).sum(axis=0)
-    unknown = np.isnan(observed) | np.isnan(ascending[-1])  # NaN is sorted to the end
-    return np.where(unknown, np.nan, (below + 0.5) / (len(ascending) + 1.0))
+    values, observed = np.asarray(values, dtype=float), np.asarray(observed, dtype=float)
+    below = (values < observed).sum(axis=0) + 0.5 * (values == observed).sum(axis=0)
+    return np.where(np.isnan(observed + values.sum(axis=0)), np.nan, (below + 0.5) / (len(values) + 1.0))
 
 
 class Share(NamedTuple):
@@ -253,29 +196,3 @@ def share_within(pit: ArrayLike, level: float) -> Share:
     if not there.size or not ((there >= 0.0) & (there <= 1.0)).all():
         raise ValueError(f"share_within: expected PIT values between 0 and 1; got {pit!r}")
     return Share(int((np.abs(there - 0.5) <= 0.5 * level).sum()), there.size)
-
-
-def _as_floats(*arrays: ArrayLike) -> tuple[np.ndarray, ...]:
-    return np.broadcast_arrays(*(np.asarray(each, dtype=float) for each in arrays))
-
-
-def _normal(name: str, mean: ArrayLike, sd: ArrayLike, observed: ArrayLike) -> tuple[np.ndarray, ...]:
-    mean, sd, observed = _as_floats(mean, sd, observed)
-    if (sd < 0.0).any():
-        raise ValueError(f"{name}: standard deviations must be zero or more; the smallest is {np.nanmin(sd)}")
-    return mean, sd, observed
-
-
-def _samples(values: ArrayLike, observed: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Sorted samples (n, ...) and the measured values (...)."""
-    values, observed = np.asarray(values, dtype=float), np.asarray(observed, dtype=float)
-    if values.ndim == 0 or len(values) < 2 or values.shape[1:] != observed.shape:
-        raise ValueError(
-            f"expected samples (n, ...), two or more, of measured values (...); got shapes {values.shape} and "
-            f"{observed.shape}"
-        )
-    return np.sort(values, axis=0), observed
-
-
-def _density(z: np.ndarray) -> np.ndarray:
-    return np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)

@@ -147,7 +147,7 @@ def _sentence(
 ) -> str:
     """How an event was predicted, and how the measurements compare with it."""
     noise = "with the noise of measurements" if first.noise else "without the noise of measurements"
-    if first.has_ratios:
+    if first.ratios is not None:
         noise = "times ratios of measured to simulated values in other events"
     state = "as the event of the calibration has left it" if first.from_state == "end" else "before any other event"
     text = f"Predicted from {first.n_samples} samples, {noise}. The motion meets the structure {state}."

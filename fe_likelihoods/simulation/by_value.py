@@ -6,8 +6,7 @@ notebook functions work. The worker imports this library, installed packages and
 
 * A module is sent once, with all of its values; sent functions that import it while they run find it under its name. Of
   the script or notebook (``__main__``), only the values that the sent functions use are sent.
-* If a value in a module or class cannot be sent, such as an open file, the other values are sent; a simulation that
-  uses the missing value ends the run. A lock becomes a new lock.
+* A lock becomes a new lock. Other values that cannot be sent, such as an open file, are refused with their name.
 * A worker refuses everything if its version of this library has different source code.
 """
 
@@ -17,6 +16,7 @@ import dis
 import functools
 import importlib.machinery
 import importlib.util
+import inspect
 import io
 import os
 import pickle
@@ -39,18 +39,18 @@ from .user_code import SCRIPTS, is_of_user, sources_digest
 __all__ = [
     "Arrived",
     "CannotLoad",
-    "NotSent",
     "Pickled",
     "Recent",
     "dumps",
     "is_arriving",
+    "names_in",
     "process_name",
     "without_addresses",
 ]
 
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
-_PLAIN = (int, float, complex, str, bytes, bool, type(None), type, types.ModuleType)
 _CACHED = type(functools.cache(len))
+_CODE = (types.FunctionType, type, _CACHED)
 _OF_THE_IMPORT = {"__builtins__", "__loader__", "__spec__", "__cached__"}
 _OF_A_FUNCTION = tuple(f"__{name}__" for name in "name qualname defaults kwdefaults annotations doc module".split())
 _COMPILED = tuple(importlib.machinery.EXTENSION_SUFFIXES)
@@ -113,15 +113,18 @@ class Pickled(NamedTuple):
 
     @classmethod
     def of(cls, function: Any) -> "Pickled":
-        """Pickle a function with everything that it uses at present; ValueError if that is impossible."""
+        """Pickle a function with everything that it uses at present; ValueError, with a name, if that is impossible."""
         try:
             payload = sources_digest() + process_name() + dumps(function)
             return cls(payload, blake2b(payload, digest_size=16).digest())
         except Exception as error:
-            name = getattr(function, "__qualname__", type(function).__qualname__)
+            name, value = _culprit(function)
+            kind = getattr(function, "__qualname__", type(function).__qualname__)
+            what = f"the {name} of {kind}, of type {type(value).__name__}," if name else kind
             raise ValueError(
-                f"{name} cannot be sent to another process ({type(error).__name__}: {without_addresses(str(error))}). "
-                "Objects that it uses must not contain open files, locks and connections"
+                f"{what} cannot be sent to another process ({type(error).__name__}: "
+                f"{without_addresses(str(error))}). Objects that it uses must not contain open files and connections: "
+                "make them inside the function"
             ) from error
 
     def load(self) -> "Arrived":
@@ -187,18 +190,26 @@ def dumps(thing: Any) -> bytes:
         return file.getvalue()
 
 
-class _Trial(cloudpickle.Pickler):
-    """Pickler that leaves out functions, classes and modules; fails for objects that cannot be sent."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, _CACHED | functools.cached_property):
-            return abs, (), getattr(obj, "__wrapped__", None) or obj.func
-        if not isinstance(obj, types.FunctionType | type | types.ModuleType | types.CodeType):
-            return NotImplemented
-        if not isinstance(obj, types.FunctionType) or not (obj.__module__ is None or is_of_user(obj.__module__)):
-            return abs, (0,)
-        values = [cell.cell_contents for cell in obj.__closure__ or () if cell != types.CellType()]
-        return abs, (0,), (obj.__defaults__, obj.__kwdefaults__, values, vars(obj))
+def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
+    """Name and value of the innermost attribute, or value that a function or module has, that cannot be pickled."""
+    try:
+        if isinstance(thing, types.FunctionType):
+            used = inspect.getclosurevars(thing)
+            values = used.globals if thing.__module__ in SCRIPTS else thing.__globals__
+            state = {**used.nonlocals, **{name: each for name, each in values.items() if not isinstance(each, _CODE)}}
+        elif isinstance(thing, types.ModuleType):
+            state = {name: each for name, each in vars(thing).items() if not isinstance(each, _CODE)}
+        else:
+            state = thing.__getstate__()
+    except Exception:
+        return "", thing
+    for name, value in (state if isinstance(state, dict) else getattr(thing, "__dict__", {})).items():
+        try:
+            dumps(None if name.startswith("__") else value)
+        except Exception:
+            inner, culprit = _culprit(value, depth - 1) if depth else ("", value)
+            return (f"{name}.{inner}", culprit) if inner else (name, value)
+    return "", thing
 
 
 class _Pickler(cloudpickle.Pickler):
@@ -231,8 +242,8 @@ class _Pickler(cloudpickle.Pickler):
             return self._reduce_module(obj) if self._module(obj.__name__) is obj else NotImplemented
         if isinstance(obj, _CACHED) and self._module(obj.__module__) is not None:  # pickled by its name otherwise
             return _new_cached, (obj.__wrapped__, *obj.cache_parameters().values())
-        if isinstance(obj, functools.cached_property):  # with a lock in Python 3.11
-            return functools.cached_property, (obj.func,), {"attrname": obj.attrname}
+        if isinstance(obj, _LOCKS):
+            return (threading.RLock if isinstance(obj, _LOCKS[1]) else threading.Lock), ()
         if not isinstance(obj, type):
             return NotImplemented
         self._module(obj.__module__)
@@ -242,7 +253,7 @@ class _Pickler(cloudpickle.Pickler):
         # a new class for each function, since the methods of an earlier class may refer to earlier values
         make, (*arguments, _, extra), (state, slots), *tail = reduced
         members = types.MemberDescriptorType  # of slots with private names, which cloudpickle leaves
-        state = {name: self._sendable(name, each) for name, each in state.items() if not isinstance(each, members)}
+        state = {name: each for name, each in state.items() if not isinstance(each, members)}
         return make, (*arguments, None, extra), (state, slots), *tail
 
     def _reduce_module(self, module: types.ModuleType) -> tuple:
@@ -254,19 +265,19 @@ class _Pickler(cloudpickle.Pickler):
             # modules of a package are sent where a function names them
             present = {key: value for key, value in present.items() if self._module(f"{name}.{key}") is None}
         parent = self._module(name.rpartition(".")[0])
-        sent = {key: self._sendable(key, value) for key, value in present.items() if key not in _OF_THE_IMPORT}
+        sent = {key: value for key, value in present.items() if key not in _OF_THE_IMPORT}
         return _new_module, (name,), (parent, sent), None, None, _fill_module
 
     def _function(self, function: types.FunctionType) -> Any:
         """Reduce a function; a user function gets the namespace of its module."""
-        module, names = self._module(function.__globals__.get("__name__")), _names_in(function.__code__)
+        module, names = self._module(function.__globals__.get("__name__")), names_in(function.__code__)
         if module is None or vars(module) is not function.__globals__:
             self._module(function.__module__)
             return super().reducer_override(function)
         namespace = self._namespaces.setdefault(module.__name__, _Namespace(module))
         used = {}
         if module.__name__ in SCRIPTS:
-            used = {name: _new_lock(value) for name, value in vars(module).copy().items() if name in names.all}
+            used = {name: value for name, value in vars(module).copy().items() if name in names.all}
         imported = _resolved(names.imported, module.__dict__.get("__package__") or "")
         state = (
             used,
@@ -278,31 +289,17 @@ class _Pickler(cloudpickle.Pickler):
         code = function.__code__
         return _new_function, (code, namespace, len(code.co_freevars)), state, None, None, _fill_function
 
-    def _sendable(self, name: str, value: Any) -> Any:
-        """A value in a module or class, or its replacement if it cannot be pickled."""
-        if isinstance(value, types.FunctionType):
-            plain = not (value.__defaults__ or value.__kwdefaults__ or value.__closure__ or vars(value))
-        else:
-            plain = isinstance(value, _PLAIN) or not getattr(getattr(value, "dtype", None), "hasobject", True)
-        if plain or isinstance(value, _LOCKS):
-            return _new_lock(value)
-        try:
-            _Trial(io.BytesIO(), protocol=5).dump(value)
-            _refuse_a_name(value)
-        except Exception as error:
-            return NotSent(name, f"{type(error).__name__}: {without_addresses(str(error))}")
-        return value
-
 
 class _Names(NamedTuple):
-    """Names in the code of a function and of the functions inside it."""
+    """Names in code, and what it imports."""
 
     all: frozenset[str]
     imported: frozenset[str]  # modules (with a dot per level of a relative import) and names imported from them
 
 
 @functools.lru_cache(maxsize=4096)
-def _names_in(code: types.CodeType) -> _Names:
+def names_in(code: types.CodeType) -> _Names:
+    """Names in a code object and in the code objects inside it."""
     imported: set[str] = set()
     before: list[Any] = [0, None]
     for step in dis.get_instructions(code):
@@ -311,7 +308,7 @@ def _names_in(code: types.CodeType) -> _Names:
             module = "." * level + step.argval
             imported |= {module, *(f"{module}{'.' if step.argval else ''}{item}" for item in items or ())}
         before.append(step.argval)
-    inner = [_names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    inner = [names_in(constant) for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return _Names(
         frozenset(code.co_names).union(*(names.all for names in inner)),
         frozenset(imported).union(*(names.imported for names in inner)),
@@ -384,52 +381,3 @@ def _fill_module(module: types.ModuleType, state: tuple[Any, Mapping[str, Any]])
 
 def _new_cached(function: Any, maxsize: int | None, typed: bool) -> Any:
     return functools.lru_cache(maxsize, typed)(function)
-
-
-def _new_lock(value: Any) -> Any:
-    return _Lock(isinstance(value, _LOCKS[1])) if isinstance(value, _LOCKS) else value
-
-
-def _refuse_a_name(value: Any) -> None:
-    """Raise TypeError if an object is pickled as its name in a user module, as compiled functions are."""
-    if isinstance(value, types.FunctionType | _CACHED):
-        return
-    reduce = cloudpickle.Pickler.dispatch_table.get(type(value), lambda value: value.__reduce_ex__(4))
-    name = reduce(value)
-    if isinstance(name, str) and is_of_user(sys.modules[pickle.whichmodule(value, name)]):
-        raise TypeError("it is known by its name only")
-
-
-class _Lock:
-    """A lock, which becomes a new lock in the receiving process."""
-
-    def __init__(self, reentrant: bool) -> None:
-        self._reentrant = reentrant
-
-    def __reduce__(self) -> tuple:
-        return (threading.RLock if self._reentrant else threading.Lock), ()
-
-
-class NotSent:
-    """Placeholder in a worker for a module value that cannot be sent; raises `ChangedModel` when it is used."""
-
-    def __init__(self, name: str, why: str) -> None:
-        vars(self).update(name=name, why=why)
-
-    def __reduce__(self) -> tuple:
-        return NotSent, (self.name, self.why)
-
-    def _refuse(self, *arguments: Any, **options: Any) -> Any:
-        raise ChangedModel(
-            f"the simulation uses the value {self.name!r} of its module, which cannot be sent to a worker process "
-            f"({self.why}): make it inside the function, or run the model without a pool and not isolated"
-        )
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return self._refuse()
-
-    __call__ = __next__ = __getitem__ = __setitem__ = __contains__ = __iter__ = __len__ = __bool__ = __enter__ = _refuse
-    __exit__ = __setattr__ = __eq__ = __lt__ = __add__ = __radd__ = __mul__ = __rmul__ = __array__ = _refuse
-    __hash__ = object.__hash__

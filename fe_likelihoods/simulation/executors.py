@@ -18,7 +18,7 @@ not depend on the pool, to the last bit.
 
 from typing import Any
 
-from .by_value import Pickled, dumps
+from .by_value import Pickled
 from .dask_executor import DaskExecutor
 from .local_pool import LocalPool
 from .pool_executor import PoolExecutor
@@ -42,30 +42,5 @@ def as_executor(pool: Any, model: Any = None) -> "LocalPool | DaskExecutor | Poo
     else:
         executor = LocalPool(pool)
     if executor is not None and executor.other_processes:
-        _check_picklable(model)
-    return executor
-
-
-def _check_picklable(model: Any) -> None:
-    """Raise ValueError, naming the attribute at fault, if a model cannot be sent to other processes."""
-    try:
         Pickled.of(model)
-    except ValueError as error:
-        name, value = _culprit(model)
-        what = f"the {name} of {type(model).__name__}, of type {type(value).__name__}," if name else "the model"
-        raise ValueError(f"{what} cannot be sent to other processes, as this pool needs. {error}") from error
-
-
-def _culprit(thing: Any, depth: int = 3) -> tuple[str, Any]:
-    """Name and value of an object's innermost attribute that cannot be pickled."""
-    try:
-        state = thing.__getstate__()
-    except Exception:
-        return "", thing
-    for name, value in (state if isinstance(state, dict) else getattr(thing, "__dict__", {})).items():
-        try:
-            dumps(value)
-        except Exception:
-            inner, culprit = _culprit(value, depth - 1) if depth else ("", value)
-            return (f"{name}.{inner}", culprit) if inner else (name, value)
-    return "", thing
+    return executor

@@ -19,6 +19,7 @@ __all__ = [
     "UnusableModel",
     "is_transient",
     "reason_of",
+    "reworded",
     "shortened",
 ]
 
@@ -70,10 +71,6 @@ class TransientReason(str):
     def __getnewargs__(self) -> tuple[str, float]:
         return str(self), self.time_limit
 
-    def with_text(self, text: str) -> "TransientReason":
-        """The same kind of reason in other words."""
-        return TransientReason(text, self.time_limit)
-
 
 class MisfitReason(str):
     """Reason of a failure that depends on the measurements: the response is usable, its statistics are not."""
@@ -98,5 +95,9 @@ def shortened(reason: str) -> str:
     """The first 2000 characters of a reason, which may be the whole output of a program; its kind is kept."""
     if len(reason) <= _LONGEST_REASON:
         return reason
-    text = f"{reason[:_LONGEST_REASON]} ..."
-    return reason.with_text(text) if isinstance(reason, TransientReason) else type(reason)(text)
+    return reworded(reason, f"{reason[:_LONGEST_REASON]} ...")
+
+
+def reworded(reason: str, text: str) -> str:
+    """A reason of the same kind in other words."""
+    return TransientReason(text, reason.time_limit) if isinstance(reason, TransientReason) else type(reason)(text)

@@ -3,9 +3,9 @@
 User code often writes files of fixed names and reads them back: input of a program, output of an OpenSees recorder. So
 a worker process changes into a temporary folder for each simulation, which shows the sender's working folder: files as
 links, subfolders as folders with links. If Python code opens a link for writing, a private file takes its place first
-(`fe_likelihoods.simulation.shared_files`). If compiled code or a program has written through a link, this name is a
-private copy from then on, and the simulation is run again. Threads of one process share its working folder: there,
-simulations that write run one after the other.
+(`fe_likelihoods.simulation.files`). If compiled code or a program has written through a link, this name is a private
+copy from then on, and the simulation is run again. Threads of one process share its working folder: there, simulations
+that write are refused.
 """
 
 import atexit
@@ -26,22 +26,30 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .by_value import process_name
-from .faults import RunFailed, TransientReason, UnusableModel, reason_of
-from .shared_files import RunningSimulation, of_this_library, running_simulation
+from .faults import RunFailed, TransientReason, UnusableModel, reason_of, reworded
+from .files import (
+    Opened,
+    RunningSimulation,
+    observing,
+    of_this_library,
+    refuse_shared,
+    running_simulation,
+)
 
 __all__ = [
     "KEEP",
+    "Observed",
     "Sender",
     "discard",
-    "get_ready",
     "keep_folder",
     "run_in_folder",
-    "shown",
+    "unpack",
     "working_folder",
 ]
 
 KEEP = "FE_LIKELIHOODS_KEEP_FAILURES"  # environment variable: where the folders of failed simulations are kept
 _MOST_KEPT = 20
+_MOST_REPEATED = 100  # if more files were opened, a result names the new ones only
 _MOST_BELOW = 300  # entries of subfolders that are linked one by one; larger subfolders are links until they are used
 _MOST_USED = 3000  # entries of a subfolder that was used, and beside the working folder, which ``..`` shows
 _CLOCK_TICK = 20_000_000  # [ns]; a file changed more recently may change again with the same modification time
@@ -51,10 +59,9 @@ _places: set[str] = set()  # folders for the folders of workers
 
 
 class Sender(NamedTuple):
-    """The process that sends simulations: its name, machine and working folder, a place for folders, and `KEEP`."""
+    """The process that sends simulations: its name, its working folder, a place for folders, and `KEEP`."""
 
     process: bytes
-    machine: str
     folder: str
     place: str
     keep: str
@@ -63,22 +70,61 @@ class Sender(NamedTuple):
     def here(cls) -> "Sender":
         """This process."""
         keep = os.path.abspath(os.environ[KEEP]) if os.environ.get(KEEP) else ""
-        return cls(process_name(), os.uname().nodename, working_folder(), _place(os.getpid()), keep)
-
-    @classmethod
-    def of_this_worker(cls) -> "Sender":
-        """The process that this process works for, whose name is not known, in the working folder of this process."""
-        return cls.here()._replace(process=b"")
+        return cls(process_name(), working_folder(), _place(os.getpid()), keep)
 
 
 def working_folder() -> str:
     """Working folder of this process, also while a simulation runs in its own folder; "" if it was removed."""
     simulation = running_simulation()
-    if simulation is not None and simulation.place and _mirror is not None:
-        return _mirror.base
+    if simulation is not None and simulation.place:
+        return simulation.base
     with contextlib.suppress(FileNotFoundError):
         return os.getcwd()
     return ""
+
+
+class Observed:
+    """A function of one item, whose results include what it opened; other processes call it in a folder of its own.
+
+    A call returns the result, and an `Opened` with all files that calls in this process have opened, or with the new
+    files if there are more than 100 in all; None if there is nothing to report.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], sender: Sender | None = None) -> None:
+        self.function, self._sender = function, sender
+        if sender is not None:
+            _get_ready(sender)
+        self.__qualname__ = getattr(function, "__qualname__", type(function).__qualname__)  # for messages
+        self._known: Opened | None = None
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __reduce__(self) -> tuple:
+        return Observed, (self.function, self._sender or Sender.here())
+
+    def __call__(self, item: Any) -> tuple[Any, Opened | None]:
+        """The result for an item, and what was opened."""
+        with observing() as observer:
+            result, shared = run_in_folder(self.function, item, self._sender)
+            observer.shared = observer.shared or shared
+        new = observer.result(self._known)
+        if new is not None:
+            self._known = new if self._known is None else new | self._known
+        # all files each time, since earlier results may have been lost
+        return result, self._known if len(self._known.files) <= _MOST_REPEATED else new
+
+
+def unpack(outcome: tuple, pool: Any) -> tuple[Any, Opened | None]:
+    """Simulation result from a pool, and what it opened; for a lost worker, the pool reports a result only.
+
+    `UnusableModel` if simulations write files that other simulations of the pool may write too.
+    """
+    if isinstance(outcome[1], str):
+        return outcome, None
+    if outcome[1] is not None:
+        refuse_shared(outcome[1].shared, getattr(pool, "n_workers", None))
+    return outcome
 
 
 def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | None) -> tuple[Any, str]:
@@ -92,7 +138,7 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
         return function(item), ""
     thread = 0 if is_main else threading.get_ident()
     if is_home or not (is_main or _is_only_thread_of_dask()):
-        simulation = RunningSimulation("", thread, _is_remote(sender))
+        simulation = RunningSimulation(thread)
         return simulation.run(function, item), simulation.shared
     try:
         result, error, shared = _run_in_mirror(_mirror_for(sender), function, item, sender, thread)
@@ -104,11 +150,7 @@ def run_in_folder(function: Callable[[Any], Any], item: Any, sender: Sender | No
     return result, shared
 
 
-def _is_remote(sender: Sender | None) -> bool:
-    return sender is not None and sender.machine != os.uname().nodename
-
-
-def get_ready(sender: Sender) -> None:
+def _get_ready(sender: Sender) -> None:
     """Make the folder for simulations of a sender, so that this does not count as time of the first simulation."""
     is_main = threading.current_thread() is threading.main_thread()
     if sender.process != process_name() and running_simulation() is None and is_main:
@@ -131,9 +173,8 @@ def _run_in_mirror(
     is_wanted = True
     while is_wanted:
         mirror.prepare()
-        simulation, argument = RunningSimulation(mirror.path, thread, _is_remote(sender)), copy.deepcopy(item)
-        result = error = None
-        before = working_folder()
+        simulation = RunningSimulation(thread, mirror.path, mirror.hop, mirror.base)
+        argument, result, error, before = copy.deepcopy(item), None, None, working_folder()
         os.chdir(mirror.path)
         try:
             result = simulation.run(function, argument)
@@ -150,7 +191,7 @@ def _run_in_mirror(
     kept = keep_folder(Path(mirror.path), sender.keep, reason) if is_kept else None
     mirror.clean(anew=kept is not None or simulation.has_programs)  # which may still write
     if kept is not None and not isinstance(error, UnusableModel | KeyboardInterrupt):
-        reason = _with(reason, f" (its folder is {kept})")
+        reason = reworded(reason, f"{reason} (its folder is {kept})")
         error, result = (None, (None, reason)) if error is None else (RunFailed(reason), None)
     return result, error, simulation.shared
 
@@ -158,12 +199,6 @@ def _run_in_mirror(
 def _is_failure(result: Any) -> bool:
     """Whether a result is an `Outcome` with a reason."""
     return isinstance(result, tuple) and len(result) == 2 and result[0] is None and isinstance(result[1], str)
-
-
-def _with(reason: str, more: str) -> str:
-    """A longer reason of the same kind."""
-    text = reason + more
-    return reason.with_text(text) if isinstance(reason, TransientReason) else type(reason)(text)
 
 
 def _is_only_thread_of_dask() -> bool:
@@ -176,26 +211,15 @@ def _is_only_thread_of_dask() -> bool:
         return False
 
 
-def shown(path: str) -> str | None:
-    """The file that a link in a simulation's own folder shows; None for the simulation's own file, else `path`."""
-    simulation = running_simulation()
-    if simulation is None or not simulation.place or not path.startswith(simulation.place + os.sep):
-        return path
-    with contextlib.suppress(OSError):
-        return os.readlink(path).replace(_mirror.hop, _mirror.base, 1)
-    path = os.path.realpath(path)  # a link among its folders
-    return None if path.startswith(simulation.place + os.sep) else path
-
-
-def keep_folder(place: Path, folder: str | Path, reason: str, most: int = _MOST_KEPT) -> Path | None:
+def keep_folder(place: Path, folder: str | Path, reason: str) -> Path | None:
     """Move what a failed simulation has left in `place` into a new folder in `folder`, with a file ``reason.txt``.
 
-    None if `most` folders are there already, or it fails: a full disk must not hide the reason of the failure.
+    None if 20 folders are there already, or it fails: a full disk must not hide the reason of the failure.
     """
     folder = Path(folder)
     with contextlib.suppress(OSError), of_this_library():
         folder.mkdir(parents=True, exist_ok=True)
-        if len(list(folder.glob("failure_*"))) < most:
+        if len(list(folder.glob("failure_*"))) < _MOST_KEPT:
             for link in [path for path in place.rglob("*") if path.is_symlink()]:  # the links of a mirror end with it
                 target = os.path.realpath(link)
                 link.unlink()
@@ -265,7 +289,7 @@ class _Mirror:
 
     def __init__(self, sender: Sender) -> None:
         self.base, self.owner = sender.folder, os.getpid()
-        place = sender.place if os.path.isdir(sender.place) and not _is_remote(sender) else _place(os.getpid())
+        place = sender.place if os.path.isdir(sender.place) else _place(os.getpid())  # on another machine
         _places.add(place)
         self._place = os.path.join(place, str(os.getpid()))
         shutil.rmtree(self._place, ignore_errors=True)  # of a mirror of another folder

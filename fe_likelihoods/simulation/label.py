@@ -9,13 +9,14 @@ known label, many for an unknown label. So a label may be incomplete, and may ch
 * the source files of the user modules among them, without comments, and the versions of installed packages,
 * environment variables whose names occur in this code,
 * the source files of this library that simulations depend on,
-* what simulations of the model opened while they ran (`fe_likelihoods.simulation.opened`).
+* what simulations of the model opened while they ran (`fe_likelihoods.simulation.files`).
 
 Pickles by cloudpickle are not used, because their bytes differ between processes: they contain random class
 identifiers, sets in varying order, and file names of notebook cells.
 """
 
 import ast
+import contextlib
 import functools
 import logging
 import os
@@ -31,7 +32,8 @@ from typing import Any
 
 import numpy as np
 
-from .opened import Opened, file_digest
+from .by_value import names_in
+from .files import Opened, file_digest
 from .user_code import LIBRARY, SCRIPTS, is_of_user, package_version, sources_digest
 
 __all__ = [
@@ -71,7 +73,6 @@ _OF_SHELLS = {"_", "PWD", "OLDPWD", "SHLVL"}  # changes are irrelevant for simul
 _PARTS = {"function", "class", "output", "statistic", "library", "python"}
 _first: dict[str, str] = {}  # first digests of values that running code changes
 _opened: dict[str, Opened] = {}  # by code, in this process
-_sources: dict[tuple[str, int], tuple[str, frozenset[str]]] = {}
 
 
 class ModelLabel:
@@ -162,10 +163,15 @@ def _has_user_code(model: Any) -> bool:
     return hasattr(model, "code_parts") or is_of_user(type(model).__module__)
 
 
+@functools.cache
 def cpu_name() -> str:
-    """Name of the processor that simulations run on; on another processor, the last digits of results may differ."""
+    """Name and features of the processor; on another processor, the last digits of results may differ."""
+    import llvmlite.binding as llvm  # late, because it is slow
+
     asked = [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE")]
-    return " ".join(filter(None, [_processor(), *asked]))
+    with contextlib.suppress(RuntimeError):  # features are not known everywhere
+        asked.append(llvm.get_host_cpu_features().flatten())
+    return " ".join([llvm.get_host_cpu_name(), *filter(None, asked)])
 
 
 def value_digest(value: Any) -> str:
@@ -327,7 +333,7 @@ class _Walk:
             self._add_all((function.__code__, function.__defaults__, function.__kwdefaults__, function.__closure__))
             self._add_all({name: value for name, value in vars(function).items() if name != "__wrapped__"}.items())
             self._add(_attribute(function, "__wrapped__"))
-            for name in sorted(_global_names(function.__code__) & function.__globals__.keys()):
+            for name in sorted(names_in(function.__code__).all & function.__globals__.keys()):
                 self._waiting.setdefault(f"{_name_of(module)}.{name}", function.__globals__[name])
 
     def _add_class(self, cls: type) -> None:
@@ -417,27 +423,14 @@ def _attribute(value: Any, name: str) -> Any:
         return None
 
 
-def _global_names(code: types.CodeType) -> set[str]:
-    """Names in a code object and in the code objects inside it."""
-    names = set(code.co_names)
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            names |= _global_names(constant)
-    return names
-
-
 def _source(module: types.ModuleType) -> tuple[str, frozenset[str]]:
     """Digest of a module's source file when it was first read, and the words in it."""
     file = getattr(module, "__file__", None)
-    if file is None:
-        return "", frozenset()
-    known = _sources.get((file, id(module)))
-    if known is None:
-        known = _sources[file, id(module)] = _read_source(file)
-    return known
+    return ("", frozenset()) if file is None else _read_source(file, id(module))
 
 
-def _read_source(file: str) -> tuple[str, frozenset[str]]:
+@functools.cache
+def _read_source(file: str, module: int) -> tuple[str, frozenset[str]]:
     try:
         content = Path(file).read_bytes()
         if not file.endswith(".py"):
@@ -449,17 +442,3 @@ def _read_source(file: str) -> tuple[str, frozenset[str]]:
         text = content.decode("utf-8", "replace")
     words = frozenset(re.findall(r"\w+", content.decode("utf-8", "replace")))
     return blake2b(text.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest(), words
-
-
-@functools.cache
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    patterns = (rf"^(?:{key})\s*:\s*(.+)$" for key in ("model name|CPU part", "flags|Features"))
-    name, flags = (re.search(pattern, text, re.MULTILINE) for pattern in patterns)
-    if name is None:
-        return f"{platform.machine()} {platform.processor()}"
-    # virtual machines may give different processors the same name, so the flags are added
-    return name.group(1) + (f" {blake2b(flags.group(1).encode(), digest_size=4).hexdigest()}" if flags else "")

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, Future
 from concurrent.futures import wait as wait_for
+from numbers import Integral
 from typing import Any
 
 from .by_value import Pickled
@@ -48,13 +49,6 @@ class _Job(Future):
         self.given_up = False
 
 
-def _is_positive_whole(value: Any) -> bool:
-    try:
-        return not isinstance(value, bool) and int(value) == value and value >= 1
-    except (TypeError, ValueError, OverflowError):
-        return False
-
-
 class LocalPool:
     """Pool of local processes.
 
@@ -79,7 +73,7 @@ class LocalPool:
     submits = True
 
     def __init__(self, workers: int) -> None:
-        if not _is_positive_whole(workers):
+        if not isinstance(workers, Integral) or isinstance(workers, bool) or workers < 1:
             raise ValueError(
                 "pool must be None, a positive number of processes, or an object with map(function, items); "
                 f"got {workers!r}"

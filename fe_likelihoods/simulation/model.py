@@ -1,10 +1,10 @@
 """Protocol of a structural model, and functions that run a batch of its simulations.
 
 A model is any object with named parameters, named channels and a method `simulate` for one parameter set, which raises
-`SimulationFailed` if a simulation is impossible. `simulate_batch` and `misfit_batch` use the model's own batch methods
-if it has them (compiled kernels that share work or threads); otherwise, and always with a pool, they run the sets one
-by one. A failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape,
-becomes a reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
+`SimulationFailed` if a simulation is impossible. `simulate_batch` uses the model's own method of this name if it has
+one (compiled kernels that share work or threads); otherwise, and always with a pool, the sets are run one by one. A
+failing simulation never raises here: an exception, or a response that is not finite or has a wrong shape, becomes a
+reason in words and a row of NaN. Ctrl-C and ``sys.exit`` are no failures.
 """
 
 import logging
@@ -24,10 +24,9 @@ from ..noise.statistics import Statistic, reduce_response, statistic_width, sums
 from ..signals.channels import Channel
 from ..signals.comparison import Comparison
 from .faults import FailedRun, MisfitReason, is_transient, reason_of, shortened
-from .folder import Sender, run_in_folder
+from .files import note, refuse_shared
+from .folder import Observed, Sender, run_in_folder, unpack
 from .interrupts import raise_if_it_ends_the_run
-from .opened import Observed, note, unpack
-from .shared_files import warn_or_refuse
 
 __all__ = [
     "MisfitBatch",
@@ -104,10 +103,9 @@ class MisfitBatch(NamedTuple):
 class Model(Protocol):
     """What a likelihood needs of a model.
 
-    A model may also have ``simulate_batch(thetas) -> SimulationBatch`` and
-    ``misfit_batch(thetas, measured) -> MisfitBatch``, whose rows must be the results of `simulate`, and
-    ``with_record(record)``, which returns the same model under another excitation, for predictions. A part of a model
-    with several responses has ``simulate_together(thetas, pool)`` (`fe_likelihoods.models.one_run`). An attribute
+    A model may also have ``simulate_batch(thetas) -> SimulationBatch``, whose rows must be the results of `simulate`,
+    and ``with_record(record)``, which returns the same model under another excitation, for predictions. A part of a
+    model with several responses has ``simulate_together(thetas, pool)`` (`fe_likelihoods.models.one_run`). An attribute
     ``time_limit`` is the largest duration of a simulation [s], or None. An attribute ``path_dependent`` is False if the
     response to an excitation does not depend on earlier excitations. Some predictions start from the end of the model's
     excitation. They need a `Record` in the attribute ``record``, with one response sample per sample of the record, or
@@ -166,7 +164,7 @@ class Model(Protocol):
 
 def has_batch_method(model: Model) -> bool:
     """Whether a model has a batch method."""
-    return hasattr(model, "misfit_batch") or hasattr(model, "simulate_batch")
+    return getattr(model, "simulate_batch", None) is not None
 
 
 def most_responses(model: Model) -> int:
@@ -200,7 +198,7 @@ def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> Simula
     shape = (len(model.channels), model.n_steps)
     if getattr(model, "simulate_together", None) is not None:
         return model.simulate_together(thetas, pool)
-    if pool is None and getattr(model, "simulate_batch", None) is not None:
+    if pool is None and has_batch_method(model):
         with _one_by_one_if_it_fails(model):
             return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
     return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
@@ -249,22 +247,16 @@ def misfit_batch(
 ) -> MisfitBatch:
     """Sums of squared residuals, or another residual statistic, for many parameter sets; responses are not kept.
 
-    Measured values are (n_channels, n_steps) [SI]. The model's own ``misfit_batch`` is not used with a `Comparison` or
-    a statistic; pools are as for `simulate_batch`.
+    Measured values are (n_channels, n_steps) [SI]; pools are as for `simulate_batch`.
     """
+    if pool is None or hasattr(model, "simulate_together"):
+        size, parts = most_responses(model), []
+        for start in range(0, max(1, len(thetas)), size):
+            batch = simulate_batch(model, thetas[start : start + size], pool)
+            parts.append(misfit_of_responses(model, batch, measured, statistic))
+        reasons = [reason for part in parts for reason in part.reasons]
+        return MisfitBatch(np.concatenate([part.misfit for part in parts]), reasons)
     shape = (statistic_width(measured, statistic),)
-    if getattr(model, "simulate_together", None) is not None:
-        return misfit_of_responses(model, simulate_batch(model, thetas, pool), measured, statistic)
-    own = (
-        statistic is None and not isinstance(measured, Comparison) and getattr(model, "misfit_batch", None) is not None
-    )
-    if pool is None and (own or hasattr(model, "simulate_batch")):
-        with _one_by_one_if_it_fails(model):
-            if own:
-                batch = model.misfit_batch(thetas, measured)
-            else:
-                batch = _misfit_from_responses(model, thetas, measured, statistic or sums_of_squares)
-            return MisfitBatch(*_checked_batch(model, batch, (len(thetas), *shape)))
     return MisfitBatch(*_run_each(sent_simulation(model, measured, statistic), thetas, shape, pool))
 
 
@@ -294,19 +286,6 @@ def misfit_of_responses(
     reasons = [reason or not_finite(model, row) for row, reason in zip(misfit, reasons, strict=True)]
     misfit[[bool(reason) for reason in reasons]] = np.nan
     return MisfitBatch(misfit, reasons)
-
-
-def _misfit_from_responses(
-    model: Model, thetas: np.ndarray, measured: np.ndarray | Comparison, reduce: Statistic
-) -> MisfitBatch:
-    """Statistics from the model's own ``simulate_batch``, in parts that limit the memory."""
-    misfits, reasons = [], []
-    rows = most_responses(model)
-    for start in range(0, len(thetas), rows):
-        batch = simulate_batch(model, thetas[start : start + rows])
-        misfits += [reduce_response(response, measured, reduce) for response in batch.response]
-        reasons += batch.reasons
-    return MisfitBatch(np.reshape(misfits, (len(thetas), statistic_width(measured, reduce))), reasons)
 
 
 def _response(model: Model, theta: np.ndarray) -> np.ndarray:
@@ -387,7 +366,7 @@ def _run_each(
     """Run simulations one by one, in this process or in the pool's workers."""
     if pool is None:
         if is_worker():  # of the pool of a sampler
-            run = partial(_in_folder, run, Sender.of_this_worker())
+            run = partial(_in_folder, run, Sender.here()._replace(process=b""))
         outcomes = [run(theta) for theta in thetas]
     else:
         outcomes = []
@@ -404,7 +383,7 @@ def _run_each(
 
 def _in_folder(run: Callable[[np.ndarray], tuple], sender: Sender, theta: np.ndarray) -> tuple:
     result, shared = run_in_folder(run, theta, sender)
-    warn_or_refuse(shared, None)
+    refuse_shared(shared, None)
     return result
 
 

@@ -9,11 +9,11 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from .shared_files import of_this_library
+from .files import of_this_library
 
 __all__ = ["run_program"]
 
@@ -22,7 +22,6 @@ _WATCH = 'trap "" TERM; read -r _; kill -TERM 0; rm -rf "$0"; kill -KILL 0'
 
 def run_program(
     command: Sequence[str],
-    environment: Mapping[str, str],
     folder: Path,
     stdout: Path,
     stderr: Path,
@@ -31,7 +30,7 @@ def run_program(
 ) -> int:
     """Run a program to its end, kill all processes that it leaves behind, and return its exit code, as in `subprocess`.
 
-    The command has an absolute path; no shell is used, standard input is empty, and `environment` has all variables.
+    The command has an absolute path; no shell is used, standard input is empty.
     `place` is the folder of the run, which is removed if this process is killed. `watch` is called with the time since
     the start [s] and returns the time until the next call [s], or raises an exception, which stops the program and is
     passed on. OSError if the program cannot be started.
@@ -45,7 +44,7 @@ def run_program(
         try:
             with open(stdout, "wb") as out, open(stderr, "wb") as error:
                 options = {"stdin": nothing, "stdout": out, "stderr": error, "process_group": watcher.pid}
-                program = subprocess.Popen(command, env=environment, cwd=folder, **options)
+                program = subprocess.Popen(command, cwd=folder, **options)
             start = time.monotonic()
             waiter = threading.Thread(target=program.wait, daemon=True)  # without the pauses of a wait with a limit
             waiter.start()

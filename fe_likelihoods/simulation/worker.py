@@ -29,23 +29,23 @@ from typing import Any, NamedTuple
 
 from samplers.interrupts import become_worker
 
-from . import shared_files
-from .by_value import Pickled, Recent, without_addresses
-from .faults import RunFailed, TransientReason, is_transient
+from .by_value import CannotLoad, Pickled, Recent, without_addresses
+from .faults import RunFailed, TransientReason, is_transient, reworded
+from .files import of_this_library
 from .folder import discard, working_folder
-from .shared_files import holds_lock, of_this_library, sender_holds_lock
 
-__all__ = ["Answer", "LoadingFailed", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
+__all__ = ["Answer", "LoadingFailed", "Sandbox", "Worker", "Workers", "describe_exit", "last_lines", "serve"]
 
 _BOOT = (
     "import json, sys; sys.path[:], sys.argv, *settings = json.loads(sys.argv[1]); "
     "from fe_likelihoods.simulation.worker import serve; serve(*settings)"
 )
-_WAITS = (b"goes on", b"waits")  # messages of a simulation that waits for another one
 _LOAD = bytes(16)  # in place of a function's key: the message contains a function to load
 _PR_SET_PDEATHSIG = 1
 _CHECK = 0.5  # [s] between checks that the process lives, while waiting for its answer
 _CHECK_OUTPUT = 0.1  # [s] the same for a process whose output is limited
+_START_LIMIT = 120.0  # [s] for starting the process of an isolated function and loading the function
+_MOST_OUTPUT = 2**24  # [bytes] that a call of an isolated function may print
 
 
 class LoadingFailed(RunFailed):
@@ -129,15 +129,14 @@ class Worker:
     def call(self, item: Any, seconds: float) -> "Answer":
         """The answer of the function that was loaded last, for an item.
 
-        RunFailed if the process dies, prints too much or does not answer within `seconds`, without the time in which
-        its simulation waits for another one (`fe_likelihoods.simulation.shared_files`).
+        RunFailed if the process dies, prints too much or does not answer within `seconds`.
         """
         self.calls += 1
         self.keys.use(self._key)
         if self._output is not None:
             os.ftruncate(self._output.fileno(), 0)
             os.lseek(self._output.fileno(), 0, os.SEEK_SET)
-        message = self._key + bytes([holds_lock()]) + pickle.dumps(item, protocol=5)
+        message = self._key + pickle.dumps(item, protocol=5)
         return self._ask(message, seconds, "stopped at the time limit of {:g} s")
 
     def _ask(self, message: bytes, seconds: float, slow: str) -> "Answer":
@@ -151,23 +150,18 @@ class Worker:
             reason = TransientReason(slow.format(seconds), time_limit=seconds)
         except RunFailed as error:
             reason = error.reason
-        raise RunFailed(reason.with_text(reason + self.kill(reason)), time.monotonic() - start)
+        raise RunFailed(reworded(reason, reason + self.kill(reason)), time.monotonic() - start)
 
     def _receive(self, stop: float) -> "Answer | None":
         """The answer; None if there is none until the time `stop`."""
-        waits, pause = False, _CHECK if self._output is None else _CHECK_OUTPUT
+        pause = _CHECK if self._output is None else _CHECK_OUTPUT
         try:
             while True:
-                before = time.monotonic()
-                is_ready = self._poll(1000.0 * max(0.0, min(pause, stop - before)))
-                stop += time.monotonic() - before if waits else 0.0
+                is_ready = self._poll(1000.0 * max(0.0, min(pause, stop - time.monotonic())))
                 if is_ready:
-                    message = self._connection.recv_bytes()
-                    if message not in _WAITS:
-                        return Answer(*pickle.loads(message))
-                    waits = message == _WAITS[True]
+                    return Answer(*pickle.loads(self._connection.recv_bytes()))
                 # a program that the function has started may hold the connection open
-                elif _ended(self._process) and not self._poll(0):
+                if _ended(self._process) and not self._poll(0):
                     raise EOFError
                 if self._output is not None and os.fstat(self._output.fileno()).st_size > self._most:
                     raise RunFailed(TransientReason(f"stopped because it printed more than {self._most} bytes"))
@@ -246,6 +240,41 @@ class Workers:
             self._idle.pop().kill()
 
 
+class Sandbox:
+    """Callable that runs a function of one argument in another process, whose output is not shown.
+
+    The process is replaced after a call that did not end by itself, and after `runs_per_process` calls (default:
+    never), which limits memory leaks. Concurrent calls from several threads use one process each. The function is sent
+    by value, in its state at the call; ValueError if it cannot be sent. `time_limit` [s] is for a call, without the
+    start of the process; `memory_limit` [bytes] for the address space (0: none).
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any], Any],
+        time_limit: float | None = None,
+        memory_limit: int = 0,
+        runs_per_process: int | None = None,
+    ) -> None:
+        self._arguments = function, time_limit, memory_limit, runs_per_process
+        options = {"memory_limit": memory_limit, "most_output": _MOST_OUTPUT}
+        self._workers = Workers(_START_LIMIT, runs_per_process or math.inf, **options)
+        Pickled.of(function)  # an error is raised here instead of in the first call
+
+    def __reduce__(self) -> tuple:
+        return Sandbox, self._arguments
+
+    def __call__(self, item: Any) -> Any:
+        """Result of the function for one item, or its exception; RunFailed if the process died or passed a limit."""
+        function, limit, *_ = self._arguments
+        answer = self._workers.run(Pickled.of(function), item, math.inf if limit is None else limit)
+        if isinstance(answer.error, CannotLoad):
+            raise RunFailed(TransientReason(str(answer.error))) from answer.error
+        if answer.error is not None:
+            raise answer.error
+        return answer.value
+
+
 def _ended(process: subprocess.Popen) -> bool:
     """Whether a process has ended; its exit status is not collected, so that its process id is not reused."""
     if process.returncode is not None:
@@ -297,7 +326,6 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
     become_worker()
     functions, me = Recent(), os.getpid()  # the same functions as in `Worker.keys`, used in the same order
     with Connection(fileno) as connection:
-        shared_files.when_waiting = lambda waits: connection.send_bytes(_WAITS[waits])
         while True:
             try:
                 message = memoryview(connection.recv_bytes())
@@ -311,8 +339,7 @@ def serve(fileno: int, memory_limit: int, parent: int) -> None:
                 else:
                     function = functions.use(bytes(message[:16]))
                     function.prepare()
-                    sender_holds_lock(bool(message[16]))
-                    answer = _packed(function(pickle.loads(message[17:])))
+                    answer = _packed(function(pickle.loads(message[16:])))
             except BaseException as error:
                 answer = _packed(None, error)
             if os.getpid() != me:  # the function has forked, and its copy has returned as well

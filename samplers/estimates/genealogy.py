@@ -40,11 +40,10 @@ def student_factor(freedom: float | np.ndarray) -> float | np.ndarray:
 def trace_founders(
     founders: Sequence[np.ndarray], ancestors: np.ndarray, min_share: float = MIN_FOUNDER_SHARE
 ) -> tuple[np.ndarray, ...]:
-    """Founders (n,) of each point after one more resampling, per generation, the oldest generation first.
+    """Founders (n,) of each point after one more resampling by `ancestors` (n,), per generation, the oldest first.
 
-    `founders` is the previous result, empty before the first resampling; `ancestors` (n,) are indices of the points
-    before the resampling. A generation is dropped once it has fewer founders than n times `min_share`, or fewer than
-    ten. The last generation, the points before this resampling, is always kept.
+    A generation is dropped once it has fewer founders than n times `min_share`, or fewer than ten; the last one is
+    kept.
     """
     traced = [generation[ancestors] for generation in founders] + [ancestors]
     fewest = max(min_share * len(ancestors), MIN_FOUNDERS)

@@ -77,16 +77,13 @@ def log_mean_weight(log_weights: np.ndarray) -> float:
 
 
 class EvidenceError:
-    r"""Standard error of the log-evidence, accumulated during one run.
+    r"""Standard error of the log-evidence, accumulated during one run (Chan & Lai 2013).
 
     Points are grouped by their founder. With :math:`W_{ij}` the normalised weight of point i at stage j, group k
-    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)` to the log-evidence, without the noise of resampling.
-    Groups are independent, thus :math:`\mathrm{Var}(\log Z) \approx \sum_k A_k^2` (Chan & Lai 2013). If moves mix well,
-    it tends to the variance of the mean weight, summed over the stages. If points never move, it is the error of plain
-    importance sampling: poor mixing is not hidden.
-
-    The sum is unreliable with few groups. Once fewer founders than `min_founder_share` times `n_points` are left, the
-    sums are closed and every point becomes a founder. Closed sums are treated as independent of later sums.
+    contributes :math:`A_k = \sum_j \sum_{i \in k} (W_{ij} - 1/N)`, and :math:`\mathrm{Var}(\log Z) \approx \sum_k
+    A_k^2`. Points that never move have the error of plain importance sampling. Once fewer founders than
+    `min_founder_share` times `n_points` are left, the sums are closed, as independent of later ones, and every point
+    becomes a founder.
     """
 
     def __init__(self, n_points: int, min_founder_share: float = 0.1):

@@ -1,15 +1,13 @@
 """Points that arrive in any order, so that no worker waits for the slowest point of a batch.
 
-Points are submitted as soon as they are proposed, to a pool or to the queue of a posterior. The record of the run
-contains the finished points and, for each decision of the sampler (`AsynchronousEvaluator.wait`), which points had
-arrived before it, so that an interrupted run, when repeated, makes the same decisions and continues with the same bits.
-Points that were running when the process ended are submitted again.
+The record of the run contains the finished points and, for each decision of the sampler (`AsynchronousEvaluator.wait`),
+which points had arrived before it, so that an interrupted run, when repeated, makes the same decisions. Points that
+were running when the process ended are submitted again.
 
 A queue, ``posterior.evaluation_queue()`` or `PoolQueue`, has the methods ``submit(coords)``, which returns a ticket for
-each point without waiting, ``collect()``, which waits for a finished point and returns tickets and values of all
-finished points, and ``close()``, which cancels the points that have not been started. ``workers`` is the number of
-points that are evaluated at once, None if it is not known. The method ``ended()``, if there is one, returns tickets and
-values of all points that have ended, including those that the last `collect` has returned, without waiting.
+each point, ``collect()``, which waits for a finished point and returns tickets and values of all finished ones,
+``close()``, and perhaps ``ended()``, which returns those of all that have ended without waiting. ``workers`` is the
+number of points that are evaluated at once, None if it is not known.
 """
 
 import hashlib

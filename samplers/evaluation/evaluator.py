@@ -14,7 +14,7 @@ import numpy as np
 
 from ..blobs import converted
 from ..budget import Budget, BudgetExhausted
-from ..interrupts import Ended, interrupts_end_the_run
+from ..interrupts import interrupts_end_the_run
 from ..record import EvaluatedBatch, Incomplete, Record, Remember, merge_batches
 from ..tempering.pending_points import PendingPoints
 from .user_target import Target, map_in
@@ -33,14 +33,10 @@ def most_common_reasons(failed: Sequence[tuple[np.ndarray, str]], number: int = 
 class Evaluator:
     """A posterior density that is evaluated and recorded (a `samplers.tempering.population.Density`).
 
-    Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs: a walker
-    carries all three through moves and resampling. Points outside the support of the prior are not evaluated.
-
-    `evaluations` counts the points that were asked for, `new_evaluations` those that this object has evaluated instead
-    of finding them in the record. `evaluates_parts` says whether the first points of a batch that does not fit into the
-    limit of simulations are evaluated. The sampler sets `pool`, where functions of one point are called. An `observer`
-    is told of points, as `samplers.reporting.progress.Progress` is. After `nwalkers` evaluations, at most the share
-    `failure_share` of them may fail; a batch of ndim + 2 points or more may not fail as a whole.
+    Evaluated points are structured arrays with the fields log_prob, log_prior and, if there are any, blobs.
+    `evaluations` counts the points that were asked for, `new_evaluations` those that this object has evaluated. With
+    `evaluates_parts`, the first points of a batch that does not fit into the limit of simulations are evaluated. An
+    `observer` is told of points, as `samplers.reporting.progress.Progress` is.
     """
 
     asynchronous = False
@@ -90,9 +86,8 @@ class Evaluator:
     def evaluate(self, coords: np.ndarray, observe: Callable[[np.ndarray], None] | None = None) -> np.ndarray:
         """Records (n,) of points (n, ndim): from the record of the run, or from new evaluations.
 
-        `observe` is called with known points, in the parts in which they were evaluated, and with the others directly
-        before they are evaluated. Raises ValueError if a coordinate is not finite, and BudgetExhausted if the points do
-        not fit into the limit of simulations. With `evaluates_parts`, the first points that fit are evaluated.
+        `observe` is called with points directly before they are evaluated. Raises BudgetExhausted if the points do not
+        fit into the limit of simulations.
         """
         log_prior, inside = self._prior_of(coords)
         asked, known, batches = self._look_up(coords, inside)
@@ -102,15 +97,54 @@ class Evaluator:
                 if len(part) > 0:
                     observe(part)
         if len(new) > 0:
-            with interrupts_end_the_run(), _Arriving(self, coords[new]) as arriving:
-                for answer in self.target.answers(coords[new], self.pool):
-                    arriving.add(answer)
-            batches.append(arriving.finish(whole=len(new) == sum(inside)))
+            batches.append(self._evaluate_new(coords[new], whole=len(new) == sum(inside)))
         self.evaluations += len(asked)
         records = self._pack(log_prior, np.concatenate([old, new]), batches)
         if len(asked) < sum(inside):
             raise BudgetExhausted(records[: np.flatnonzero(inside)[len(asked)]])
         return records
+
+    def _evaluate_new(self, coords: np.ndarray, whole: bool) -> EvaluatedBatch:
+        """Values of new points (n, ndim), of a `whole` batch or a part of it, entered in the record every 0.05 s.
+
+        Failures are entered when all values have arrived, since they may yet end the run.
+        """
+        results, stored, failed, noted = [], 0, [], time.perf_counter()
+
+        def store() -> tuple[int, float]:
+            """Enter the successes among the values that have arrived."""
+            if len(results) > stored:
+                part = self.as_batch(coords[stored : len(results)], results[stored:])
+                failed.extend(stored + row for row in part.reasons)
+                self.enter(_successes(part))
+            return len(results), time.perf_counter()
+
+        if self.observer is not None:
+            self.observer.submitted(len(coords))
+        try:
+            with interrupts_end_the_run():
+                for answer in self.target.answers(coords, self.pool):
+                    if self.target.vectorize:
+                        break
+                    results.append(answer)
+                    if self.observer is not None:
+                        self.observer.finished(1)
+                    if time.perf_counter() - noted > SECONDS_BETWEEN_NOTES:
+                        stored, noted = store()
+        except BaseException:  # Ctrl-C, or a pool that cannot go on
+            store()
+            raise
+        if self.observer is not None:
+            self.observer.settled()
+        batch = self.as_batch(coords, answer if self.target.vectorize else results)
+        new = batch.rows([*failed, *range(stored, len(coords))])
+        try:
+            self.check_failures(new, self.record.count, len(self.record.failed), whole=whole and stored == 0)
+        except RuntimeError:
+            self.enter(_successes(new))
+            raise
+        self.enter(new)
+        return batch
 
     def _prior_of(self, coords: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Log-prior (n,) of points (n, ndim), and which of them lie inside its support, (n,) bool."""
@@ -140,8 +174,8 @@ class Evaluator:
     ) -> None:
         """Raise RuntimeError if too many evaluations have failed with a batch that comes after the given numbers.
 
-        Failures may be quicker or slower than successes. So running points count as successes, and a batch that is not
-        `whole` may fail completely.
+        Failures may be quicker than successes, so running points count as successes, and only a `whole` batch may not
+        fail as a whole.
         """
         n, count = len(batch.coords), failures + len(batch.reasons)
         total = evaluations + n + running
@@ -204,68 +238,8 @@ class Evaluator:
 
     def compute(self, coords: np.ndarray) -> EvaluatedBatch:
         """Call the function for points (n, ndim), without counting or storing."""
-        arriving = _Arriving(self, coords)
-        for answer in self.target.answers(coords, self.pool):
-            arriving.add(answer, store=False)
-        return self.as_batch(coords, arriving.results)
-
-
-class _Arriving:
-    """The values of new points (n, ndim) as they arrive, which are entered in the record every 0.05 s.
-
-    Failures are entered when all values have arrived, since they may yet end the run.
-    """
-
-    def __init__(self, evaluator: Evaluator, coords: np.ndarray):
-        self._evaluator, self._coords, self._noted = evaluator, coords, time.perf_counter()
-        self.results: Any = []
-        self._stored, self._failed = 0, []
-
-    def __enter__(self) -> "_Arriving":
-        if self._evaluator.observer is not None:
-            self._evaluator.observer.submitted(len(self._coords))
-        return self
-
-    def __exit__(self, kind: type | None, *error: object) -> None:
-        if kind is not None:  # Ctrl-C, or a pool that cannot go on
-            self._store()
-        elif self._evaluator.observer is not None:
-            self._evaluator.observer.settled()
-
-    def add(self, answer: Any, store: bool = True) -> None:
-        """Enter the value of a point, or all values of a function of a batch."""
-        if isinstance(answer, Ended):
-            raise answer.error
-        if self._evaluator.target.vectorize:
-            self.results = answer
-            return
-        self.results.append(answer)
-        if store and self._evaluator.observer is not None:
-            self._evaluator.observer.finished(1)
-        if store and time.perf_counter() - self._noted > SECONDS_BETWEEN_NOTES:
-            self._store()
-
-    def _store(self) -> None:
-        if len(self.results) > self._stored:
-            part = self._evaluator.as_batch(
-                self._coords[self._stored : len(self.results)], self.results[self._stored :]
-            )
-            self._failed += [self._stored + row for row in part.reasons]
-            self._evaluator.enter(_successes(part))
-            self._stored = len(self.results)
-        self._noted = time.perf_counter()
-
-    def finish(self, whole: bool) -> EvaluatedBatch:
-        """All values; RuntimeError if too many of the `whole` batch, or of a part of it, have failed."""
-        batch, record = self._evaluator.as_batch(self._coords, self.results), self._evaluator.record
-        new = batch.rows([*self._failed, *range(self._stored, len(self._coords))])
-        try:
-            self._evaluator.check_failures(new, record.count, len(record.failed), whole=whole and self._stored == 0)
-        except RuntimeError:
-            self._evaluator.enter(_successes(new))
-            raise
-        self._evaluator.enter(new)
-        return batch
+        answers = list(self.target.answers(coords, self.pool))
+        return self.as_batch(coords, answers[0] if self.target.vectorize else answers)
 
 
 def unpack(records: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -83,11 +83,10 @@ def _squared_radii(points: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def spread_by_metropolis(coords: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray]) -> str:
-    """Why points (n, ndim) cannot be draws of a density; empty if they can.
+    """Why points (n, ndim) cannot be draws of a density (m, ndim) -> (m,), normalised or not; empty if they can.
 
-    `log_density` maps points (m, ndim) to values (m,), normalised or not. Each half of the points makes steps that are
-    differences between points in the other half. Signed ranks compare the distances from the mean of the other half
-    before and after the steps.
+    Each half of the points makes steps that are differences between points in the other half; signed ranks compare the
+    distances from the mean of the other half before and after.
     """
     (n, ndim), random = coords.shape, np.random.RandomState(SEED)
     if n < FEWEST_FOR_METROPOLIS:

@@ -2,14 +2,14 @@
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
 import numpy as np
 from emcee.ensemble import ndarray_to_list_of_dicts
 
-from ..interrupts import SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
+from ..interrupts import Ended, SentFunction, interrupts_end_the_run, raise_if_it_ends_the_run
 from ..record import EvaluatedBatch
 from .starts import SEED, compare_with_draws, draws_to_compare, spread_by_metropolis
 from .values import Caught, log_densities, outcomes
@@ -31,10 +31,8 @@ def map_in(pool: Any) -> Callable:
 class Target:
     """`log_prior`, values and `sample_prior` of arrays of points, from the arguments of a sampler.
 
-    `function` is the log-posterior or the log-likelihood, and `name` says which. Its optional attributes are those of
-    the class. ValueError unless exactly one of the two functions is given and a log-prior is known, if `log_prob_fn` is
-    a method called log_likelihood, or if the function states another number of parameters than `ndim`. A sampler sets
-    `parameter_names` as emcee has them; None: functions take arrays.
+    `function` is the log-posterior or the log-likelihood, and `name` says which. ValueError for functions that cannot
+    be sampled. A sampler sets `parameter_names` as emcee has them; None: functions take arrays.
     """
 
     parameter_names: Mapping[str, Any] | None = None
@@ -135,12 +133,16 @@ class Target:
             results = self.log_prior_fn(points) if self.vectorize else [self.log_prior_fn(point) for point in points]
         return log_densities(results, len(coords), "log_prior_fn")
 
-    def answers(self, coords: np.ndarray, pool: Any = None) -> Iterable:
+    def answers(self, coords: np.ndarray, pool: Any = None) -> Iterator:
         """What the function returns for each of the points (n, ndim) in turn; with `vectorize`, for all at once."""
         points = self.as_points(coords)
         if self.vectorize:
-            return map(self.caught, [points])
-        return map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points)
+            yield self.caught(points)
+            return
+        for answer in map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points):
+            if isinstance(answer, Ended):
+                raise answer.error
+            yield answer
 
     def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         """Log-posterior and blobs of points (n, ndim) from `answers`; ValueError if these are no log-densities."""

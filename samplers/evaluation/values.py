@@ -31,14 +31,9 @@ class Failed:
 class Caught:
     """A function that returns `Failed` instead of raising; it can be sent to a worker if the function can.
 
-    A function of one point, or the object of a method, may have a method ``fault(point)``. It returns a reason if a
-    fault of the infrastructure (a killed process, a full disk) prevented the evaluation of the point, else an empty
-    string. Such a point also gives `Failed`, because the records of a function in a worker are not seen in this
-    process.
-
-    An exception whose attribute ``ends_run`` is true is raised: the function cannot be used for any point, such as a
-    posterior whose model has changed. KeyboardInterrupt and SystemExit are raised, even as the cause of another
-    exception; SystemExit in a worker process gives `Failed`.
+    Its method ``fault(point)``, or the method of the object of a method, says why a fault of the infrastructure (a
+    killed process, a full disk) prevented the evaluation of a point: in this process, the records of workers are not
+    seen. KeyboardInterrupt, SystemExit in this process, and exceptions whose attribute ``ends_run`` is true are raised.
     """
 
     def __init__(self, function: Callable, args: Sequence | None, kwargs: Mapping[str, Any] | None, vectorize: bool):

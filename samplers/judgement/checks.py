@@ -19,7 +19,6 @@ from ..reports import Stage
 __all__ = [
     "check_annealing",
     "check_evidence",
-    "check_fallback",
     "check_guide_against_recycling",
     "check_likelihood",
     "check_shares",
@@ -38,16 +37,11 @@ LARGE_ERROR, LARGE_ERROR_OF_MODES = 0.4, 0.35
 # A check with even weights that is higher by more than this: of 35 such runs 6 were wrong, and 13 had standard
 # deviations that were off by a fifth, mostly too wide by moves that had not ended.
 HIGHER_CHECK = 1.5
-# Log-evidence of recycling minus log-evidence of the moves after it, above which a mode may be lost: a mode with a
-# quarter of the mass.
-LOST_EVIDENCE = 0.3
 # Log-likelihoods are equal if they differ by less than this share of their size, the rounding error of a sum of 1e4
 # terms. With 1e-9, right runs with a log-likelihood of 1e11 and a range of 100 were refused.
 ROUNDING = 1e-12
 # Smallest difference between two shares of a component that is reported if it is also significant.
 LARGE_SHARE_DIFFERENCE = 0.1
-# Error of the log-odds above which probabilities of models are called rough.
-LARGE_ERROR_OF_ODDS = 0.5
 DIFFERENT = "The two estimates of the evidence differ"
 # Differences of evidences are reported beyond this many standard errors.
 FAR = 3.0
@@ -60,9 +54,8 @@ def _collapsed(stage: Stage, nwalkers: int, ndim: int) -> bool:
 def check_likelihood(log_prob: np.ndarray, log_prior: np.ndarray) -> list[Finding]:
     """A finding if the log-likelihood has one value at all points (n,) that a run begins with: it tells nothing.
 
-    The posterior is then the prior, or it is where none of these points is, and the value is a penalty or comes from a
-    model that ignores its parameters. Beside -inf, one value may be the likelihood of uniform errors, which is right,
-    or a penalty: the finding is not severe; for a value of 0, an indicator, there is none.
+    Beside -inf, one value may be the likelihood of uniform errors, which is right: the finding is not severe; for a
+    value of 0, an indicator, there is none.
     """
     known = np.isfinite(log_prob)
     if np.count_nonzero(known) < 2:
@@ -131,12 +124,10 @@ def check_annealing(stages: Sequence[Stage], correlation: float) -> list[Finding
 def check_evidence(
     log_evidence: float, error: float, check: EvidenceCheck | None, has_several_modes: Callable[[], bool]
 ) -> list[Finding]:
-    """Findings if the two estimates of the evidence disagree, or if its error is large.
+    """Findings if the two estimates of the evidence disagree, or if its error is large; limits from 1916 known runs.
 
-    `log_evidence` and `error` belong to the stages, `check` to fresh draws. The limits come from 1619 right and 297
-    wrong runs with known posteriors: such errors go with wrong means as well. A `check` with even weights that is
-    higher than the stages has found what the stages have lost: the evidence is right by it, and where the difference is
-    large, the walkers may be too far spread. The final points are searched for modes only where these matter.
+    A `check` with even weights that is higher than the stages has found what the stages have lost. The final points are
+    searched for modes only where these matter.
     """
     found, believed = [], check is not None and check.reliable
     difference = 0.0 if check is None else abs(log_evidence - check.log_evidence)
@@ -187,37 +178,13 @@ def _both(log_evidence: float, error: float, check: EvidenceCheck) -> str:
     )
 
 
-def check_fallback(
-    stages: Sequence[Stage], check: EvidenceCheck | None, log_evidence: float, error: float, earlier: EvidenceCheck
-) -> list[Finding]:
-    """A finding if annealing by moves lost a part of the posterior that recycling before it had found.
-
-    Recycling may have found more modes although its result (`log_evidence`, `error`, and the check `earlier`) was not
-    reliable. Both its estimates of the evidence must exceed the evidence of the moves: the estimate of their `check` if
-    it is reliable, else of their `stages`.
-    """
-    now, own = sum(stage.log_evidence_increment for stage in stages), stages[-1].log_evidence_error
-    if check is not None and check.reliable:
-        now, own = check.log_evidence, check.error
-    excess = min(log_evidence, earlier.log_evidence) - now
-    if excess <= max(3.0 * float(np.hypot(own, max(error, earlier.error))), LOST_EVIDENCE):
-        return []
-    text = (
-        f"Annealing by moves gives the log-evidence {now:.2f} +- {own:.2f}, and recycling before it, which was not "
-        f"reliable, gave {log_evidence:.2f} and {earlier.log_evidence:.2f}: the moves may have lost a mode."
-    )
-    action = "Use more walkers, so that recycling is reliable, and compare two runs."
-    return [Finding("A mode may be lost", WRONG, text, action)]
-
-
 def check_shares(
     mixture: Mixture, points: np.ndarray, founders: np.ndarray, coords: np.ndarray, log_weights: np.ndarray
 ) -> list[Finding]:
-    """A finding if a part of the posterior has different shares among final points (n, ndim) and weighted draws.
+    """A finding if a part of the posterior has different shares among final points (n, ndim) and weighted draws (m,
+    ndim).
 
-    The draws `coords` (m, ndim) with `log_weights` (m,) come from a `mixture` that also covers points of earlier
-    stages; its components are the parts, and points count for them by responsibilities. A difference is reported if it
-    exceeds 0.1 and three standard errors; `founders` (n,) belong to the points.
+    The parts are the components of the `mixture` of the draws, which also covers points of earlier stages.
     """
     if len(mixture.weights) == 1 or not np.any(log_weights > -np.inf):
         return []

@@ -31,8 +31,7 @@ LARGE_SHARE_NEAR = 0.02  # of the evaluated points among the samples
 NEIGHBOURS = 5  # evaluated points about a failure, which tell scattered failures from those that fill a region
 UNLIKELY = 1e-4  # probability that so many of them fail by chance
 INSIDE = 0.99  # share of the samples inside the ellipsoid that counts as their region
-# The latest points are those near the posterior.
-KEPT_POINTS = 20_000
+KEPT_POINTS = 20_000  # the latest points are those near the posterior
 
 
 class NearFailures(NamedTuple):
@@ -136,10 +135,9 @@ def judged_failures(
 ) -> NearFailures:
     """Failures in the region of a run's final points (n, ndim), on which the verdict depends.
 
-    All evaluated points are given in order, with their `log_prob` (m,) and whether they `failed` (m,); the latest 20
-    000 are used, in the `columns` that a simulation depends on. If the log-density `counts_failures` by itself, all
-    values of -inf are failures. Points that are not `possible`, by a function (n, ndim) -> (n,), lie outside the
-    support and do not count.
+    The latest 20 000 evaluated points are compared in the `columns` that a simulation depends on. If the log-density
+    `counts_failures` by itself, all values of -inf are failures. Points that are not `possible` lie outside the
+    support.
     """
     latest = slice(-KEPT_POINTS, None)
     coords, log_prob, failed = coords[latest], log_prob[latest], failed[latest]

@@ -35,7 +35,6 @@ __all__ = [
     "CONVERGED",
     "NOT_USABLE",
     "USABLE",
-    "EvidenceEstimate",
     "RunParts",
     "Verdict",
     "describe_early_stop",
@@ -51,22 +50,8 @@ SEVERITIES = (NOTE, CARE, WRONG)
 LIMIT = "The limit of simulations ended the run"
 
 
-class EvidenceEstimate(NamedTuple):
-    """One estimate of the evidence in a run."""
-
-    source: str  # "stages" (with recycling, all evaluated points), "check" (fresh draws after the annealing) or "guide"
-    log_evidence: float
-    error: float  # standard error of `log_evidence`
-    reliable: bool  # whether the weights are even enough for the error to be meaningful
-
-
 class RunParts(NamedTuple):
-    """What `Verdict` computes its attributes from.
-
-    `get_chain`, called without arguments, returns the chain (nsteps, nwalkers, ndim) at beta = 1. `near` are the
-    failures in the region of the last walkers, or None for a chain that was read from a file. `failed_simulations` is
-    the number counted by a log-density that counts failed simulations.
-    """
+    """What `Verdict` computes its attributes from; `get_chain` returns the chain at beta = 1."""
 
     result: AnnealingResult
     get_chain: Callable[[], np.ndarray]
@@ -162,11 +147,6 @@ class Verdict(_Stored):
         """Questions that the run cannot answer."""
         return tuple(_unknown(self._parts))
 
-    @cached_property
-    def evidences(self) -> tuple[EvidenceEstimate, ...]:
-        """The independent estimates of the evidence."""
-        return tuple(_evidences(self._parts.result))
-
     @property
     def pareto_shape(self) -> float | None:
         """Largest Pareto shape of the weights from the check and from the draws of a guide; None without either.
@@ -206,17 +186,20 @@ class Verdict(_Stored):
         else:
             shares = ", ".join(f"{mode.share:.2f} +- {mode.share_error:.2g}" for mode in self.modes)
             found = f"{len(self.modes)} modes with shares {shares}"
-        estimates = ", ".join(
-            f"{estimate.source} {estimate.log_evidence:.2f} +- {estimate.error:.2g}"
-            + ("" if estimate.reliable else " (uneven weights)")
-            for estimate in self.evidences
-        )
         run = self._parts
+        result, check = run.result, run.result.check
+        estimates = [("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, "")]
+        if check is not None:
+            estimates.append(("check", *check[:2], "" if check.reliable else " (uneven weights)"))
+        if result.rounds and result.start is not None and not result.start.used:
+            last = result.rounds[-1]
+            estimates.append(("guide", last.log_evidence, last.log_evidence_error, " (uneven weights)"))
+        evidences = ", ".join(f"{source} {value:.2f} +- {error:.2g}{note}" for source, value, error, note in estimates)
         failed = f"{run.failures} of {run.evaluations} evaluations failed" if run.failures else "no failed evaluations"
         if run.failed_simulations:
             failed = f"{run.failed_simulations} simulations failed"
         return (
-            f"{self.status.capitalize()}: {found}; log-evidence by {estimates}; effective sample size "
+            f"{self.status.capitalize()}: {found}; log-evidence by {evidences}; effective sample size "
             f"{self.worst_effective_sample_size:.0f} in the worst direction; {failed}."
         )
 
@@ -248,9 +231,8 @@ def judge(
 ) -> Verdict:
     """Judge an annealing that has reached beta = 1.
 
-    `searched` is the part of the `simulations` made by the guide for its search. `missing_steps` at beta = 1 were not
-    allowed by the limit of simulations. `failures` says how many evaluations failed, empty if none did; `near` are
-    failures in the region of the final points, None if they are not known.
+    `searched` is the part of the `simulations` made by the guide for its search; `missing_steps` at beta = 1 were not
+    allowed by the limit; `failures` says how many evaluations failed.
     """
     stage = result.ladder[-1]
     found = [*result.findings, *(() if near is None else check_failed_region(near))]
@@ -379,18 +361,6 @@ def _missing_draws(rounds: tuple[GuidedRound, ...], nwalkers: int) -> float | No
         return None
     missing = max(nwalkers - last.effective_sample_size, FIRST_ROUND_SHARE * nwalkers)
     return float(np.ceil(missing / last.effective_share))
-
-
-def _evidences(result: AnnealingResult) -> list[EvidenceEstimate]:
-    """The estimates of the evidence that a run has made."""
-    found = [EvidenceEstimate("stages", result.log_evidence_ladder, result.ladder[-1].log_evidence_error, True)]
-    check = result.check
-    if check is not None:
-        found.append(EvidenceEstimate("check", check.log_evidence, check.error, check.reliable))
-    if result.rounds and result.start is not None and not result.start.used:
-        last = result.rounds[-1]
-        found.append(EvidenceEstimate("guide", last.log_evidence, last.log_evidence_error, False))
-    return found
 
 
 def _unknown(run: RunParts) -> list[str]:

@@ -1,11 +1,10 @@
-"""Extra sweeps over fast parameters, made after each move that needs a simulation.
+"""Sweeps over fast parameters, made after each move that needs a simulation.
 
 In many posteriors some parameters change the density without a new simulation: the noise standard deviations, for
-example, when the sums of squared residuals are cached. The cosmology codes CosmoMC and Cobaya call them *fast
-parameters*. A posterior declares them by an attribute ``fast_parameters``, the indices of these parameters. After each
-expensive move the ensemble makes a few random-walk steps in the fast parameters alone, with all other parameters fixed.
-This is Metropolis within Gibbs, so the target distribution is unchanged, and the fast parameters decorrelate without
-additional simulations. The equations are in ``docs/theory/tempering``.
+example, when the sums of squared residuals are cached. A posterior declares their indices by an attribute
+``fast_parameters``. After each expensive move the ensemble makes a few random-walk steps in them alone. This is
+Metropolis within Gibbs, so the target distribution is unchanged. With 24 to 80 walkers by moves, five checks of the
+tutorials fail without these sweeps; with 100 walkers, the errors of means are three times as large.
 
 References
 ----------
@@ -13,8 +12,8 @@ Lewis, A. (2013), Efficient sampling of fast and slow cosmological parameters, P
 doi:10.1103/PhysRevD.87.103529
 """
 
-import operator
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 from emcee import State
@@ -22,7 +21,7 @@ from emcee.model import Model
 from emcee.moves import Move
 
 from ..proposals.mixture import Mixture
-from .population_moves import Inside, MixtureMove, RandomWalkMove, calibrate_move
+from .population_moves import Inside, RandomWalkMove, calibrate_move
 
 __all__ = ["FastWalk", "WithFastSweeps", "with_fast_sweeps"]
 
@@ -32,20 +31,15 @@ TARGET_ACCEPTANCE = 0.35
 
 
 class FastWalk(RandomWalkMove):
-    """Random walk in the coordinates with some indices, whose covariance is conditional on the others.
-
-    ValueError for no index or an invalid one.
-    """
+    """Random walk in the parameters with some indices, whose covariance is conditional on the others."""
 
     def __init__(self, indices: Sequence[int]):
         super().__init__(adapt=True, target=TARGET_ACCEPTANCE)
-        self.indices = _checked(indices)
+        self.indices = tuple(indices)
 
     def calibrate(self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None) -> None:
         """Fit the walk to points (n, ndim) with normalised weights (n,)."""
-        ndim = coords.shape[1]
-        _checked(self.indices, ndim)
-        slow = np.setdiff1d(np.arange(ndim), self.indices)
+        slow = np.setdiff1d(np.arange(coords.shape[1]), self.indices)
         super().calibrate(coords[:, np.concatenate([slow, self.indices])], weights, inside)
         # The last diagonal block of a lower-triangular root of the covariance is a root of the covariance of the last
         # coordinates, conditional on the others.
@@ -60,56 +54,19 @@ class FastWalk(RandomWalkMove):
 class WithFastSweeps(Move):
     """A move, followed by random-walk steps (`sweeps`) of the whole ensemble in the fast parameters (`indices`).
 
-    The reported acceptance is that of the move alone. The initial scale of the walk is 2.38 / sqrt(number of fast
-    parameters) times a root of the conditional covariance; ``tune`` adapts it. ValueError for invalid indices, and for
-    less than one sweep.
+    The reported acceptance is that of the move alone. ``tune`` adapts the scale of the walk.
     """
 
-    takes_mixture = True
-
     def __init__(self, move: Move, indices: Sequence[int], sweeps: int = 2):
-        if sweeps < 1:
-            raise ValueError(f"sweeps must be at least 1, got {sweeps}; to make no fast sweeps, use the move itself")
-        self.move = move
-        self.sweeps = sweeps
-        self._walk = FastWalk(indices)
-        self.indices = self._walk.indices  # in ascending order
-        self._accepted = np.empty(0)
-
-    @property
-    def walk(self) -> FastWalk:
-        """The random walk in the fast parameters."""
-        return self._walk
-
-    @property
-    def fast_acceptance(self) -> float:
-        """Mean acceptance of the fast sweeps after the latest move; NaN before the first move."""
-        return float(np.mean(self._accepted)) if len(self._accepted) else float("nan")
+        self.move, self.sweeps = move, sweeps
+        self._walk, self._accepted = FastWalk(indices), np.empty(0)
 
     def calibrate(
         self, coords: np.ndarray, weights: np.ndarray, inside: Inside | None = None, mixture: Mixture | None = None
     ) -> None:
-        """Fit the walk, and the wrapped move if it can be fitted, to points (n, ndim) with weights (n,).
-
-        `mixture` as in `MixtureMove.calibrate`; other moves do not use it.
-        """
+        """Fit the walk, and the move if it can be fitted, as `samplers.moves.population_moves.calibrate_move` does."""
         calibrate_move(self.move, coords, weights, inside, mixture)
         self._walk.calibrate(coords, weights, inside)
-
-    def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
-        """Pass points (n, ndim) and the log-target (n,) to the move if it is a mixture move."""
-        if isinstance(self.move, MixtureMove):
-            self.move.cover_basins(coords, log_target)
-
-    def follow(self, ancestors: np.ndarray) -> None:
-        """See `samplers.moves.population_moves.MixtureMove.follow`; without effect on other moves."""
-        if isinstance(self.move, MixtureMove):
-            self.move.follow(ancestors)
-
-    def expect_independence(self) -> None:
-        """See `samplers.moves.population_moves.MixtureMove.expect_independence`; without effect on other moves."""
-        if isinstance(self.move, MixtureMove):
-            self.move.expect_independence()
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         """Make the move, then the fast sweeps; the accepted proposals (nwalkers,) are those of the move."""
@@ -128,23 +85,13 @@ class WithFastSweeps(Move):
 
 
 def with_fast_sweeps(moves: Sequence[Move], indices: Sequence[int], ndim: int, sweeps: int) -> list[Move]:
-    """The moves, each followed by sweeps over the fast parameters with these indices, if there are any of both.
+    """The moves, each followed by sweeps over the parameters with these indices, if some of `ndim`, not all, are fast.
 
-    The moves themselves if all `ndim` parameters are fast. ValueError for an invalid index.
+    ValueError for an invalid index.
     """
-    if sweeps == 0 or len(indices) == 0:
+    if invalid := [index for index in indices if not (isinstance(index, Integral) and 0 <= index < ndim)]:
+        raise ValueError(f"fast_parameters must be indices of parameters, from 0 to {ndim - 1}; got {invalid}")
+    fast = sorted({int(index) for index in indices})
+    if sweeps == 0 or not 0 < len(fast) < ndim:
         return list(moves)
-    fast = _checked(indices, ndim)
-    return list(moves) if len(fast) == ndim else [WithFastSweeps(move, fast, sweeps) for move in moves]
-
-
-def _checked(indices: Sequence[int], ndim: int | None = None) -> tuple[int, ...]:
-    """Return the distinct indices in ascending order, or raise ValueError."""
-    try:
-        fast = tuple(sorted({operator.index(index) for index in indices}))
-    except TypeError:
-        raise ValueError(f"fast_parameters must be indices of parameters (integers); got {indices!r}") from None
-    if not fast or fast[0] < 0 or (ndim is not None and fast[-1] >= ndim):
-        valid = "0, 1, ..." if ndim is None else f"0 to {ndim - 1}"
-        raise ValueError(f"fast_parameters must be indices of parameters, from {valid}; got {tuple(indices)}")
-    return fast
+    return [WithFastSweeps(move, fast, sweeps) for move in moves]

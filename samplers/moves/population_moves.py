@@ -31,7 +31,6 @@ from ..proposals.mixture import (
 from ..proposals.transforms import SupportBounds, find_support_bounds, log_abs_det_jacobian
 
 __all__ = [
-    "ConditionalMove",
     "DrawsWithDensity",
     "GuideMove",
     "MixtureMove",
@@ -42,7 +41,9 @@ __all__ = [
 
 # Probabilities of the three kernels of MixtureMove: independence, local walk, differences.
 KERNEL_PROBABILITIES = (0.5, 0.25, 0.25)
-# Probabilities while the independence kernel has a high acceptance: it decorrelates the ensemble fastest.
+# Acceptance of the local walk and of the differences; and acceptance of the independence kernel above which it is
+# preferred, since it decorrelates the ensemble fastest.
+TARGET_ACCEPTANCE, HIGH_ACCEPTANCE = 0.25, 0.5
 KERNEL_PROBABILITIES_IF_ACCEPTED = (0.8, 0.1, 0.1)
 # Parts of the fitted points, from this number of dimensions on; the points of a part are moved by a fit to the others.
 # Independent draws replace a point that the fit was made to too easily: with 500 walkers in 40 dimensions, the first
@@ -90,7 +91,7 @@ def calibrate_move(
 
     A `MixtureMove`, with fast sweeps or without, takes a given `mixture` instead.
     """
-    if mixture is not None and getattr(move, "takes_mixture", False):
+    if mixture is not None and isinstance(getattr(move, "move", move), MixtureMove):
         move.calibrate(coords, weights, inside, mixture)
     elif hasattr(move, "calibrate"):
         move.calibrate(coords, weights, inside)
@@ -221,11 +222,6 @@ class RandomWalkMove(_FittedMove):
         """Lower-triangular root (ndim, ndim) of the fitted covariance; None before the first fit."""
         return self._root
 
-    @property
-    def log_scale_factor(self) -> float:
-        """Logarithm of the factor by which ``tune`` has changed the scale so far."""
-        return self._log_factor
-
     def _draw(self, coords, random):
         ndim = coords.shape[1]
         scale = (2.38 / math.sqrt(ndim) if self.scale is None else self.scale) * math.exp(self._log_factor)
@@ -239,48 +235,13 @@ class RandomWalkMove(_FittedMove):
             self._log_factor += float(np.mean(accepted)) - target
 
 
-class ConditionalMove(MHMove):
-    r"""Steps that leave the standard normal distribution unchanged: :math:`u' = \sqrt{1 - s^2}\, u + s\, e`, e normal.
-
-    For standard normal parameters that are restricted to a region: the acceptance depends on the region, not on the
-    number of parameters.
-
-    Parameters
-    ----------
-    scale : float
-        Initial s, above 0 and at most 1. ``tune`` adapts it.
-    target : float
-        Desired acceptance; Papaioannou et al. (2015) recommend 0.44.
-
-    References
-    ----------
-    Papaioannou, I., Betz, W., Zwirglmaier, K. & Straub, D. (2015), MCMC algorithms for subset simulation, Probabilistic
-    Engineering Mechanics 41, doi:10.1016/j.probengmech.2015.06.006
-    """
-
-    def __init__(self, scale: float = 0.6, target: float = 0.44):
-        if not 0.0 < scale <= 1.0:
-            raise ValueError(f"scale must be above 0 and at most 1; got {scale}")
-        super().__init__(self._draw)
-        self.scale = scale
-        self.target = target
-
-    def _draw(self, coords, random):
-        proposed = math.sqrt(1.0 - self.scale**2) * coords + self.scale * random.standard_normal(coords.shape)
-        return proposed, 0.5 * np.sum(proposed**2 - coords**2, axis=1)
-
-    def tune(self, state: State, accepted: np.ndarray) -> None:
-        """Increase the scale when the acceptance exceeds the target, and decrease it otherwise."""
-        self.scale = min(self.scale * math.exp(float(np.mean(accepted)) - self.target), 1.0)
-
-
 class MixtureMove(_FittedMove):
     """Three kernels from one Student t mixture fitted to the stage; each sweep chooses one kernel at random.
 
     independence
         Draws from the mixture (`samplers.proposals.mixture`). They cross between modes, and replace most of the
         ensemble when the mixture fits well. Half of all sweeps use this kernel, or 80 % while its acceptance is above
-        `independence_threshold`. A draw outside the support of the prior is repeated before it is evaluated: the
+        a half. A draw outside the support of the prior is repeated before it is evaluated: the
         proposal is the mixture truncated to the support.
     local walk
         Random walk with the covariance of one component. The component is drawn from the responsibilities of the
@@ -292,16 +253,7 @@ class MixtureMove(_FittedMove):
         stage that the move was calibrated on, so a step does not depend on the ensemble that is being moved.
 
     The first sweep after each calibration uses the independence kernel. The scales of the last two kernels are adapted
-    by ``tune`` to reach the acceptance `target`.
-
-    Parameters
-    ----------
-    max_components : int
-        Largest number of components in a fitted mixture. After recycling, the mixture is the last proposal.
-    independence_threshold : float
-        Acceptance of the independence kernel above which the other two kernels are used less often.
-    target : float
-        Desired acceptance of the local walk and of the differences.
+    by ``tune``.
 
     References
     ----------
@@ -314,15 +266,8 @@ class MixtureMove(_FittedMove):
     >>> mixed = SMCSampler(100, posterior.ndim, posterior, moves=moves, vectorize=True)
     """
 
-    takes_mixture = True
-
-    def __init__(self, max_components: int = 6, independence_threshold: float = 0.5, target: float = 0.25):
-        if max_components < 1:
-            raise ValueError(f"max_components must be at least 1; got {max_components}")
+    def __init__(self):
         super().__init__()
-        self.max_components = max_components
-        self.independence_threshold = independence_threshold
-        self.target = target
         self._mixture: Mixture | None = None
         self._bounds: SupportBounds | None = None
         self._kernels = (self.draw_independence, self.draw_local_walk, self.draw_differences)
@@ -354,7 +299,7 @@ class MixtureMove(_FittedMove):
         """
         if inside is not None and self._bounds is None:
             self._bounds = find_support_bounds(inside, coords)
-        self._mixture = fit_mixture(coords, weights, self.max_components, self._bounds) if mixture is None else mixture
+        self._mixture = fit_mixture(coords, weights, bounds=self._bounds) if mixture is None else mixture
         self._inside = inside
         self._archive = to_component_space(self._mixture, coords)
         self._cumulated = np.cumsum(weights)
@@ -370,12 +315,7 @@ class MixtureMove(_FittedMove):
     def cover_basins(self, coords: np.ndarray, log_target: np.ndarray) -> None:
         """Add components for parts of the target that the fitted mixture does not cover.
 
-        Parameters
-        ----------
-        coords : ndarray, shape (n, ndim)
-            Points, also from earlier stages.
-        log_target : ndarray, shape (n,)
-            Log-target of the stage, scaled so that the target's integral is about 1.
+        `coords` (n, ndim) are points, also from earlier stages; `log_target` (n,) is scaled so that its integral is 1.
         """
         found = find_basins(self._mixture, coords, log_target)
         self._mixture = with_components(self._mixture, found)
@@ -394,9 +334,9 @@ class MixtureMove(_FittedMove):
         super().tune(state, accepted)
         share = float(np.mean(accepted))
         if self._current == 0:
-            self._independence_accepted = share > self.independence_threshold
+            self._independence_accepted = share > HIGH_ACCEPTANCE
         else:
-            self._log_factors[self._current] += share - self.target
+            self._log_factors[self._current] += share - TARGET_ACCEPTANCE
 
     def _draw_all(self, coords, random):
         # A random choice, not a counter: a resumed run continues identically from the stored random state alone.
@@ -421,15 +361,7 @@ class MixtureMove(_FittedMove):
         return proposed, log_ratios
 
     def draw_independence(self, coords: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Propose independent draws from the mixture for points (n, ndim).
-
-        Returns
-        -------
-        proposed : ndarray, shape (n, ndim)
-            Proposed points.
-        log_ratio : ndarray, shape (n,)
-            Log-ratio of proposal densities q(x | x') / q(x' | x), for the acceptance probability.
-        """
+        """Independent draws from the mixture for points (n, ndim), and log-ratios (n,) q(x | x') / q(x' | x)."""
         proposed = draw(self._mixture, len(coords), random)
         if self._inside is not None:
             for _ in range(REDRAWS):

@@ -169,15 +169,10 @@ def fit_mixture(
     bounds: SupportBounds | None = None,
     dof: float = DOF,
 ) -> Mixture:
-    """Fit a mixture to points (n, ndim); the number of components minimises the Bayesian information criterion.
+    """Fit a mixture to points (n, ndim) with weights (n,) of sum 1; the Bayesian information criterion chooses.
 
-    Components are added one at a time, each by splitting an existing component, as long as the criterion improves. Each
-    covariance is shrunk towards the mean covariance of the components, with the weight of ``ndim`` points. Then fewer
-    degrees of freedom than `dof` (above 2) are tried, 4, 3 and 2.5, for points with heavier tails. If shears
-    (`samplers.proposals.transforms`), or a transformation that removes `bounds` near the population, improve the
-    criterion, the components are fitted to the transformed points.
-
-    `weights` (n,) have sum 1; points with less than 1e-3 of the mean weight are left out.
+    Components are added by splits as long as the criterion improves. Then fewer degrees of freedom than `dof` (above 2)
+    are tried for heavier tails, and so are shears and a transformation that removes `bounds` near the population.
     """
     mixture, criterion = _fit_with_shears(coords, weights, max_components, dof)
     near = None if bounds is None else near_bounds(bounds, coords, weights)
@@ -322,10 +317,9 @@ def _criterion(count: int, ndim: int, effective: float, log_likelihood: float) -
 def _splits(mixture: Mixture, white: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
     """Starting assignments (n, K + 1) with one more component: each component is split in two, along two directions.
 
-    The component's points have their smallest and largest fourth moments in these directions. Two groups of similar
-    size are visible along the first direction, and a small group beside a large group along the second direction, in
-    any number of dimensions (invariant coordinate selection: Tyler, D. E., Critchley, F., Duembgen, L. & Oja, H.
-    (2009), J. R. Stat. Soc. B 71(3), doi:10.1111/j.1467-9868.2009.00706.x).
+    The component's points have their smallest and largest fourth moments there: groups of similar size, or a small
+    group, show (invariant coordinate selection: Tyler et al. 2009, J. R. Stat. Soc. B 71(3),
+    doi:10.1111/j.1467-9868.2009.00706.x).
     """
     owner = log_responsibilities(mixture, white).argmax(axis=1)
     count, ndim = len(mixture.weights), white.shape[1]
@@ -412,9 +406,7 @@ def _components(
 def location_and_root(coords: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean (ndim,) and a lower-triangular, non-singular root (ndim, ndim) of the weighted covariance.
 
-    `weights` (n,) have sum 1. The root is the standard deviations times the root of the correlation matrix. With fewer
-    than five effective points per dimension the correlations are poorly determined and are shrunk towards zero. If the
-    matrix is still singular, its diagonal is increased until it is not.
+    With fewer than five effective points per dimension the correlations are shrunk towards zero.
     """
     mean = weights @ coords
     centred = coords - mean

@@ -229,9 +229,8 @@ def invert_shears(shears: Sequence[Shear], coords: np.ndarray) -> np.ndarray:
 def find_shears(coords: np.ndarray, weights: np.ndarray) -> tuple[Shear, ...]:
     """Find at most 2 ndim shears that remove the curvature of weighted points (n, ndim), the most curved pair first.
 
-    A pair is curved if the squared source explains at least a tenth of the target variance that the linear term leaves,
-    and if the gain in likelihood exceeds the penalty of the Bayesian information criterion. The penalty includes the
-    number of pairs that were searched.
+    The squared source must explain a tenth of the target variance that the linear term leaves, and improve the Bayesian
+    information criterion, whose penalty includes the number of pairs that were searched.
     """
     effective = 1.0 / (weights @ weights)
     ndim = coords.shape[1]

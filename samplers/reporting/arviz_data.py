@@ -212,16 +212,9 @@ def _statistics_of_runs(runs: Sequence[Any]) -> dict[str, Any]:
     if len(runs) == 1:
         attributes["beta"] = np.array([stage.beta for stage in runs[0].ladder])
     attributes["settings"] = "\n".join(repr(run.settings) for run in runs)
-    attributes["verdict"] = "\n".join(map(_verdict, runs))
+    attributes["verdict"] = "\n".join(str(run.verdict) for run in runs)
     failures = (Counter(failure["reason"] for failure in run.failures) for run in runs)
     return attributes | {"failures": "\n".join(map(json.dumps, failures))}
-
-
-def _verdict(run: Any) -> str:
-    try:
-        return str(run.verdict)
-    except ValueError:  # of a file without a verdict
-        return "The run has no stored verdict."
 
 
 def _time_coordinate(times: Mapping[str, np.ndarray]) -> tuple[dict[str, str], dict[str, Any]]:

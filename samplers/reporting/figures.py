@@ -27,6 +27,7 @@ RED = "#b03a48"
 COLOURS = (BLUE, ORANGE, "#5b8c5a", "#7b5ea7", "#3aa0a8", "#6b4a2f")  # of several samplers, repeated after the last
 LEVELS = (0.5, 0.9)
 FEW_POINTS = 150  # fewer distinct samples are drawn as points, since a contour through them shows chance
+MOST_PARAMETERS = 12  # of a corner plot without names
 PRIOR_DRAWS = 20_000  # for densities of parameters without a distribution and for the width of a prior
 LARGEST_PANEL = 2.5  # largest panel width in `plot_marginals`, as a multiple of the range of the samples
 
@@ -34,9 +35,8 @@ LARGEST_PANEL = 2.5  # largest panel width in `plot_marginals`, as a multiple of
 class _Drawn(NamedTuple):
     """The k parameters of a figure; all values in the units of the labels, NaN for a value that is not marked.
 
-    `samples` (n, k) are given by the label of the sampler, which may be empty. `prior_draws` has the shape (m, k),
-    `limits` of the panels (k, 2). `densities` are functions of values (m,); the list is empty without a prior. `note`
-    says what the figure leaves out.
+    `samples` (n, k) by the label of the sampler; `limits` of the panels (k, 2); `densities` are functions of values
+    (m,), none without a prior.
     """
 
     labels: list[str]
@@ -64,11 +64,8 @@ def plot_corner(
     posterior: Any = None,
     *,
     truths: Values | None = None,
-    nominal: Values | None = None,
-    prior: bool = True,
     names: Sequence[str] | None = None,
     labels: Sequence[str] | None = None,
-    max_parameters: int = 12,
     title: str = "",
 ) -> "Figure":
     """Plot the posterior for all pairs of parameters by `corner.corner`, with the prior on the diagonal.
@@ -82,22 +79,15 @@ def plot_corner(
         Samples of the posterior, as ``get_chain(flat=True)`` returns, or samples of several samplers by their labels,
         which are drawn over each other. At least as many samples as parameters.
     posterior : Posterior, optional
-        Gives units, labels and nominal values (``posterior.parameters``) and the prior (``posterior.prior``). A
-        function of your own may have ``parameter_names`` and ``prior``.
+        Gives units, labels and nominal values (``posterior.parameters``, as grey dashed lines) and the prior
+        (``posterior.prior``). A function of your own may have ``parameter_names`` and ``prior``.
     truths : sequence of float, shape (ndim,), or mapping of str to float, optional
         True values in the units of the samples, as red lines; NaN for none. The panels are widened by up to half their
         size to show a true value; otherwise it is written at the edge.
-    nominal : sequence of float, shape (ndim,), or mapping of str to float, optional
-        Values before the update, as grey dashed lines, or written at the edge. Default: the nominal values of
-        ``posterior.parameters``; an empty mapping for none.
-    prior : bool
-        Whether the density of the prior is drawn.
     names : sequence of str, optional
-        Names of the parameters to draw. Default: all, or the first `max_parameters`.
+        Names of the parameters to draw. Default: all, or the first 12; the figure says how many are left out.
     labels : sequence of str, shape (ndim,), optional
         Labels for all parameters, instead of the posterior's labels.
-    max_parameters : int
-        Largest number of parameters drawn without `names`; the figure says how many are left out.
     title : str
         Title of the figure.
 
@@ -113,7 +103,7 @@ def plot_corner(
     import corner
     import matplotlib.pyplot as plt
 
-    drawn = _choose(samples, posterior, truths, nominal, prior, names, labels, max_parameters)
+    drawn = _choose(samples, posterior, truths, labels, names, MOST_PARAMETERS)
     k, several = len(drawn.labels), len(drawn.samples) > 1
     panel = float(np.clip(9.0 / k, 1.1, 2.0))  # [in]
     texts = _wrapped(drawn.labels, int(12.0 * panel))
@@ -209,7 +199,7 @@ def plot_marginals(
     """
     import matplotlib.pyplot as plt
 
-    drawn = _choose(samples, posterior, truths, None, True, None, labels, None)
+    drawn = _choose(samples, posterior, truths, labels)
     k = len(drawn.labels)
     columns = min(4, k)
     rows = -(-k // columns)
@@ -248,11 +238,9 @@ def _choose(
     samples: Any,
     posterior: Any,
     truths: Values | None,
-    nominal: Values | None,
-    prior: bool,
-    names: Sequence[str] | None,
     labels: Sequence[str] | None,
-    max_parameters: int | None,
+    names: Sequence[str] | None = None,
+    most: int | None = None,
 ) -> _Drawn:
     """Check the arguments of a figure, and convert what it shows to the units of its labels."""
     given = samples if isinstance(samples, Mapping) else {"": samples}
@@ -267,9 +255,9 @@ def _choose(
     if labels is not None and len(labels) != ndim:
         raise ValueError(f"expected one label for each of {ndim} parameters; got {len(labels)}: {list(labels)}")
     known = list(labels) if labels is not None and posterior is None else [each.name for each in parameters]
-    wanted, note = known[:max_parameters] if names is None else names, ""
+    wanted, note = known[:most] if names is None else names, ""
     if names is None and len(wanted) < ndim:
-        note = f"the first {max_parameters} of {ndim} parameters; names= chooses others"
+        note = f"the first {most} of {ndim} parameters; names= chooses others"
     unknown = [name for name in wanted if name not in known]
     if unknown or not len(wanted):
         what = f"unknown: {', '.join(map(str, unknown))}" if unknown else "got none"
@@ -277,12 +265,9 @@ def _choose(
     columns = [known.index(name) for name in wanted]
     factors = np.array([parameters[i].factor for i in columns])
     arrays = {label: x[:, columns] / factors for label, x in arrays.items()}
-    if nominal is None:
-        nominal = [parameter.nominal for parameter in parameters]
-    truths, nominal = (
-        _values(each, known, what)[columns] / factors for each, what in ((truths, "truths"), (nominal, "nominal"))
-    )
-    densities, draws = _priors(posterior if prior else None, wanted, columns, factors)
+    nominal = np.array([parameters[i].nominal for i in columns], dtype=float) / factors
+    truths = _true_values(truths, known)[columns] / factors
+    densities, draws = _priors(posterior, wanted, columns, factors)
     return _Drawn(
         [parameters[i].label if labels is None else labels[i] for i in columns],
         arrays,
@@ -308,17 +293,17 @@ def _checked(samples: Any, label: str) -> np.ndarray:
     return samples
 
 
-def _values(given: Values | None, known: list[str], what: str) -> np.ndarray:
-    """Values to mark, one per parameter."""
+def _true_values(given: Values | None, known: list[str]) -> np.ndarray:
+    """True values to mark, one per parameter, NaN for none."""
     if given is None or isinstance(given, Mapping):
         given = given or {}
         if unknown := [name for name in given if name not in known]:
-            raise ValueError(f"{what}: unknown parameters {', '.join(unknown)}; known are {', '.join(known)}")
+            raise ValueError(f"truths: unknown parameters {', '.join(unknown)}; known are {', '.join(known)}")
         given = [given.get(name) for name in known]
     values = np.array([np.nan if value is None else value for value in given], dtype=float)
     if values.shape != (len(known),):
         raise ValueError(
-            f"{what} must have one value for each of {len(known)} parameters (NaN for no mark), or be a mapping of "
+            f"truths must have one value for each of {len(known)} parameters (NaN for no mark), or be a mapping of "
             f"names to values; got shape {values.shape}"
         )
     return values

@@ -2,8 +2,8 @@
 
 With prior probabilities pi_k and evidences Z_k, the posterior probability of model k is pi_k Z_k / sum_j pi_j Z_j
 (Kass & Raftery 1995, Bayes factors, Journal of the American Statistical Association 90(430),
-doi:10.1080/01621459.1995.10476572). Errors of the log-evidences are propagated to first order. Intervals are computed
-for the log-odds, for which first-order propagation is more accurate. See ``docs/theory/evidence``.
+doi:10.1080/01621459.1995.10476572). Errors of the log-evidences are propagated to first order to the log-odds, from
+which intervals of the probabilities follow. See ``docs/theory/evidence``.
 """
 
 import math
@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import expit, logsumexp
 from scipy.stats import norm
 
-from ..judgement.checks import LARGE_ERROR_OF_ODDS
 from .summary import aligned, log_posterior_of, verdict_summary_of
 
 __all__ = ["ModelComparison", "compare_models"]
@@ -29,14 +28,12 @@ class ModelComparison(NamedTuple):
         Names of the models.
     log_evidence, log_evidence_error : ndarray, shape (n,)
         Log-evidences and their standard errors.
-    prior, probability, probability_error : ndarray, shape (n,)
-        Prior and posterior probabilities of the models, and standard errors of the posterior probabilities.
+    prior, probability : ndarray, shape (n,)
+        Prior and posterior probabilities of the models.
     lower, upper : ndarray, shape (n,)
         95 % intervals of the posterior probabilities, from the log-odds.
     log_bayes_factor, log_bayes_factor_error : ndarray, shape (n,)
         Log-evidence minus the largest log-evidence, and its standard error, which is zero for the best model.
-    rough : bool
-        Whether the error of any log-odds exceeds 0.5, so that `probability_error` is only an order of magnitude.
     summaries : tuple of str
         ``sampler.verdict.summary`` of each model; empty for a pair of numbers.
     """
@@ -46,12 +43,10 @@ class ModelComparison(NamedTuple):
     log_evidence_error: np.ndarray
     prior: np.ndarray
     probability: np.ndarray
-    probability_error: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     log_bayes_factor: np.ndarray
     log_bayes_factor_error: np.ndarray
-    rough: bool
     summaries: tuple[str, ...]
 
     @property
@@ -74,13 +69,11 @@ class ModelComparison(NamedTuple):
                     f"{self.log_evidence[k]:.3f} +- {self.log_evidence_error[k]:.3f}",
                     f"{self.log_bayes_factor[k]:.3f} +- {self.log_bayes_factor_error[k]:.3f}",
                     f"{self.prior[k]:.3g}",
-                    f"{self.probability[k]:.4g} +- {self.probability_error[k]:.2g}",
+                    f"{self.probability[k]:.4g}",
                     f"{self.lower[k]:.4g} ... {self.upper[k]:.4g}",
                 )
             )
         rows = aligned(table)
-        if self.rough:
-            rows.append("the errors of the log-evidences are large, so the probabilities are rough: make longer runs")
         rows += [f"{name}: {text}" for name, text in zip(self.names, self.summaries, strict=True) if text]
         return "\n".join(rows)
 
@@ -108,9 +101,9 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
     >>> comparison.best
     'inelastic'
     >>> print(comparison)
-    model           log evidence  log Bayes factor  prior      probability      95 % interval
-    inelastic  -118.900 +- 0.100    0.000 +- 0.000    0.5  0.8022 +- 0.022  0.7545 ... 0.8425
-    elastic    -120.300 +- 0.100   -1.400 +- 0.141    0.5  0.1978 +- 0.022  0.1575 ... 0.2455
+    model           log evidence  log Bayes factor  prior  probability      95 % interval
+    inelastic  -118.900 +- 0.100    0.000 +- 0.000    0.5       0.8022  0.7545 ... 0.8425
+    elastic    -120.300 +- 0.100   -1.400 +- 0.141    0.5       0.1978  0.1575 ... 0.2455
     """
     if not isinstance(models, Mapping) or len(models) < 2:
         raise ValueError(f"compare_models needs a mapping with two models or more, by name; got {models!r}")
@@ -128,9 +121,6 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         score = np.log(before) + log_evidence
     probability = np.exp(score - logsumexp(score))
 
-    # d p_k / d log Z_j = p_k (delta_kj - p_j)
-    jacobian = probability[:, None] * (np.eye(len(names)) - probability)
-    probability_error = np.sqrt(jacobian**2 @ error**2)
     # d logit(p_k) / d log Z_j = delta_kj - (1 - delta_kj) p_j / (1 - p_k)
     odds, odds_error = np.empty((2, len(names)))
     for k in range(len(names)):
@@ -147,12 +137,10 @@ def compare_models(models: Mapping[str, Any], prior: Mapping[str, float] | None 
         log_evidence_error=error,
         prior=before,
         probability=probability,
-        probability_error=probability_error,
         lower=expit(odds - reach),
         upper=expit(odds + reach),
         log_bayes_factor=log_evidence - log_evidence[best],
         log_bayes_factor_error=factor_error,
-        rough=bool(np.any(odds_error[(before > 0.0) & (before < 1.0)] > LARGE_ERROR_OF_ODDS)),
         summaries=tuple(map(verdict_summary_of, models.values())),
     )
 

@@ -4,8 +4,6 @@ The bar of the annealing counts evaluated points and names the latest stage. The
 because a narrow terminal cuts off the rest. All counts are whole numbers and start with the bar.
 """
 
-import contextlib
-import logging
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -66,27 +64,12 @@ def get_progress_bar(display: bool | str, total: int | None, **kwargs: Any) -> A
     return tqdm(total=total, **{"miniters": 0, "bar_format": counted} | kwargs)
 
 
-@contextlib.contextmanager
-def _log_above(bar: Any) -> Iterator[None]:
-    """Write messages of the log above a bar of a terminal."""
-    file = getattr(bar, "fp", None)
-    if not (hasattr(file, "isatty") and file.isatty()) or hasattr(bar, "container"):  # a notebook has no terminal
-        yield
-        return
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    loggers = [logging.getLogger(name) for name in ("", "fe_likelihoods", "samplers")]
-    with logging_redirect_tqdm([each for each in loggers if each.handlers]):
-        yield
-
-
 class Progress:
     """Shows a run in a bar: a context manager that observes an `Evaluator`.
 
-    `bar` is a tqdm bar, or emcee's silent bar, and `label` its description outside the phases of a guide. `function` is
-    the posterior. Its optional methods are ``report()``, with the keys ``simulations`` and ``failure_count``, and
-    ``when_simulated(callback)``, which announces the simulations of a batch as they end. The bar counts points, or
-    without `counts_points` the steps of `step`.
+    `label` describes it outside the phases of a guide. The posterior `function` may have ``report()``, with the keys
+    ``simulations`` and ``failure_count``, and ``when_simulated(callback)``, which announces simulations as they end.
+    The bar counts points, or without `counts_points` the steps of `step`.
     """
 
     def __init__(self, bar: Any, evaluator: Evaluator, label: str, function: Callable, counts_points: bool = True):
@@ -98,12 +81,10 @@ class Progress:
         self._done = self._running = self._shown = 0
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
-        self._messages = contextlib.ExitStack()
         self._before = self._counts()
 
     def __enter__(self) -> "Progress":
         if not self._silent:
-            self._messages.enter_context(_log_above(self._bar))
             self._evaluator.observer = self
             if self._announce is not None and not self._evaluator.asynchronous:
                 self._announce(self._simulated)
@@ -114,7 +95,6 @@ class Progress:
             self._evaluator.observer = None
             if self._announce is not None:
                 self._announce(None)
-            self._messages.close()
             self._draw()
 
     # called by the evaluator

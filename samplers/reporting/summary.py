@@ -1,7 +1,6 @@
-"""Results of finished runs as tables: moments, tempering stages, and a comparison of samplers."""
+"""Results of finished runs as tables: moments and tempering stages."""
 
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,11 +8,8 @@ import numpy as np
 from ..reports import Stage
 
 __all__ = [
-    "SamplerComparison",
     "Summary",
     "aligned",
-    "comparison_table",
-    "describe_sampler",
     "described_parameters_of",
     "finished_ladder",
     "is_tempered",
@@ -118,7 +114,6 @@ def names_of_parameters(names: Sequence[str] | None, ndim: int) -> tuple[str, ..
 def summary(
     samples: np.ndarray,
     names: Sequence[str] | None = None,
-    weights: np.ndarray | None = None,
     mean_error: np.ndarray | None = None,
     sd_error: np.ndarray | None = None,
 ) -> Summary:
@@ -130,8 +125,6 @@ def summary(
         Samples of the posterior.
     names : sequence of str, optional
         One name per parameter; theta_0, theta_1, ... by default.
-    weights : array_like, shape (n,), optional
-        Non-negative weights of the samples, normalised or not.
     mean_error, sd_error : array_like, shape (ndim,), optional
         Standard errors of mean and standard deviation, from ``sampler.mean_error()`` and ``sampler.sd_error()``, since
         copies made by resampling are correlated; NaN where they are unknown.
@@ -160,14 +153,7 @@ def summary(
         if error.shape != samples.shape[1:] or np.any(error < 0.0):
             raise ValueError(f"{name} must be {samples.shape[1]} numbers, each non-negative or NaN; got {given}")
         errors.append(error)
-    weights = np.ones(len(samples)) if weights is None else np.asarray(weights, dtype=float)
-    if weights.shape != (len(samples),) or not np.all(weights >= 0.0) or not 0.0 < weights.sum() < np.inf:
-        raise ValueError(
-            f"weights must be {len(samples)} non-negative numbers with a positive sum; got shape {weights.shape}"
-        )
-    weights = weights / weights.sum()
-    mean = weights @ samples
-    sd = np.sqrt(weights @ (samples - mean) ** 2)
+    mean, sd = samples.mean(axis=0), samples.std(axis=0)
     cv = np.divide(sd, np.abs(mean), out=np.where(sd > 0.0, np.inf, 0.0), where=mean != 0.0)
     return Summary(names_of_parameters(names, samples.shape[1]), mean, sd, cv, *errors)
 
@@ -236,103 +222,3 @@ def ladder_table(sampler: Any) -> str:
     if text := verdict_summary_of(sampler):
         rows.append(text)
     return "\n".join(rows)
-
-
-class SamplerComparison(NamedTuple):
-    """Cost and results of several samplers, one entry per sampler. ``str`` gives a table.
-
-    `evaluations` is the number of points for which ``log_prob_fn`` was called, and `effective_sample_size` the number
-    of independent draws with the same error of the mean, for the worst parameter. `seconds` (wall time) is None if it
-    was not measured; `log_evidence` and its standard error are None for samplers without an evidence.
-    """
-
-    names: tuple[str, ...]
-    evaluations: tuple[int, ...]
-    seconds: tuple[float | None, ...]
-    effective_sample_size: tuple[float, ...]
-    log_evidence: tuple[float | None, ...]
-    log_evidence_error: tuple[float | None, ...]
-
-    def __str__(self) -> str:
-        rows = [("sampler", "evaluations", "seconds", "ESS", "ESS/evaluation", "log evidence")]
-        for name, n, seconds, ess, value, error in zip(*self, strict=True):
-            time = "-" if seconds is None else f"{seconds:.3g}"
-            evidence = "-" if value is None else f"{value:.3f} +- {error:.3f}"
-            rows.append((name, str(n), time, f"{ess:.0f}", f"{ess / n:.2e}", evidence))
-        return "\n".join(aligned(rows))
-
-    __repr__ = __str__
-
-
-def comparison_table(
-    samplers: Mapping[str, Any], seconds: Mapping[str, float] | None = None, discard: int = 0
-) -> SamplerComparison:
-    """Compare the cost and the effective sample size of several samplers on one posterior.
-
-    The effective sample size is computed for the worst parameter. For tempered samplers it is (standard deviation /
-    Monte Carlo error)^2; for emcee's sampler it is the chain length divided by the autocorrelation time, which is
-    underestimated for short chains. Modes that were never visited have no effect on it.
-
-    Parameters
-    ----------
-    samplers : mapping of str to sampler
-        Samplers that have run in this process, by name. The evaluations of `emcee.EnsembleSampler` are iterations times
-        walkers, which holds without thinning and for moves with one proposal per walker.
-    seconds : mapping of str to float, optional
-        Wall times [s] of samplers that do not measure them, by name.
-    discard : int
-        Burn-in of emcee's sampler: number of initial iterations that are left out.
-
-    Examples
-    --------
-    >>> print(comparison_table({"SMC": sampler}))  # doctest: +ELLIPSIS
-    sampler  evaluations  seconds  ESS  ESS/evaluation      log evidence
-    SMC ...
-    """
-    given = {} if seconds is None else dict(seconds)
-    if not samplers:
-        raise ValueError("no samplers to compare: pass a mapping of names to samplers")
-    if unknown := set(given) - set(samplers):
-        raise ValueError(f"seconds are given for {sorted(unknown)}, but the samplers are {list(samplers)}")
-    rows = []
-    for name, sampler in samplers.items():
-        tempered = is_tempered(sampler)
-        evaluations = sampler.evaluations if tempered else sampler.iteration * sampler.nwalkers
-        if evaluations == 0 or sampler.iteration == 0:
-            raise ValueError(
-                f"sampler {name!r} has made no chain in this process: run it first (the cost of a chain that was read "
-                "from a file is not known)"
-            )
-        if tempered:
-            spread, error = sampler.get_chain(flat=True).std(axis=0), sampler.mean_error()
-            ess = float(np.min((spread / error)[error > 0.0] ** 2, initial=np.inf))
-        else:
-            chain = sampler.get_chain(discard=discard)
-            time = sampler.get_autocorr_time(discard=discard, tol=0)
-            ess = chain.shape[0] * chain.shape[1] / float(np.max(time))
-        ess = ess if np.isfinite(ess) else 0.0
-        evidence = (sampler.log_evidence, sampler.log_evidence_error) if tempered else (None, None)
-        rows.append((name, evaluations, given.get(name, sampler.seconds if tempered else None), ess, *evidence))
-    return SamplerComparison(*zip(*rows, strict=True))
-
-
-def describe_sampler(sampler: Any) -> str:
-    """HTML of a tempered sampler before or after runs: size, cost, evidence, verdict and moments of its chain."""
-    lines, moments = [], ""
-    if not sampler.ladder:
-        lines.append("Not run yet: run_mcmc(None, 4) anneals draws of the prior and makes 4 sweeps of the posterior.")
-    else:
-        stages = f"{len(sampler.ladder)} stages to beta = {sampler.ladder[-1].beta:.3g}"
-        failed = f", {sampler.failure_count} failed" if sampler.failure_count else ""
-        lines.append(f"{stages}, {sampler.iteration} sweeps stored, {sampler.evaluations} evaluations{failed}")
-        if sampler.ladder[-1].beta == 1.0:
-            lines.append(f"Log-evidence {sampler.log_evidence:.2f} +- {sampler.log_evidence_error:.2g}")
-            lines.append(str(sampler.verdict))
-        if sampler.iteration > 0:
-            described = described_parameters_of(log_posterior_of(sampler), sampler.ndim)
-            labels, factors = [each.label for each in described], np.array([each.factor for each in described])
-            errors = sampler.mean_error() / factors, sampler.sd_error() / factors
-            moments = summary(sampler.get_chain(flat=True) / factors, labels, None, *errors)
-    title = f"{type(sampler).__name__} of {sampler.nwalkers} walkers and {sampler.ndim} parameters"
-    text = "".join(f"<div>{escape(line)}</div>" for line in lines)
-    return f"<div><strong>{escape(title)}</strong>{text}<pre>{escape(str(moments))}</pre></div>"

@@ -31,7 +31,6 @@ from ..estimates.weights import WHERE_TO_LOOK, coarse_weights, effective_sample_
 from ..finding import WRONG, Finding
 from ..judgement.checks import (
     check_annealing,
-    check_fallback,
     check_guide_against_recycling,
     check_shares,
     describe_unused_guide,
@@ -68,9 +67,8 @@ def anneal(
 ) -> Steps:
     """Carry draws of the prior to beta = 1 by moves, recycling or a guide.
 
-    Draws without records are evaluated. Yields the points as they are now with a report (`samplers.reports`); in the
-    last pair, they are at beta = 1 and equally weighted. There is at most one `EvidenceCheck`, before or after the last
-    stage.
+    Yields the points as they are now with a report (`samplers.reports`); in the last pair, they are at beta = 1 and
+    equally weighted.
     """
     size, rounds = len(population.coords), None
     try:
@@ -92,7 +90,7 @@ def anneal(
             if recycled is not None:
                 visited.add(recycled.coords, recycled.records)
             moved = yield from anneal_by_moves(population, density, random, schedule, settings, visited)
-            yield from _check_moves(*moved, recycled, density, random, settings, visited)
+            yield from _check_moves(*moved, density, random, settings, visited)
     except StoppedEarly as stop:
         searched = 0.0 if guidance is None else guidance.budget.of_guides
         yield from _finish_early(stop if rounds is None else better_of(stop, rounds), size, random, searched)
@@ -102,26 +100,22 @@ def _check_moves(
     population: Population,
     stages: Sequence[Stage],
     correlation: float,
-    recycled: Recycled | None,
     density: Density,
     random: np.random.RandomState,
     settings: Settings,
     visited: VisitedPoints,
 ) -> Steps:
-    """The evidence check after annealing by moves, and findings; `recycled`: an unreliable result before the moves."""
+    """The evidence check after annealing by moves, and findings."""
     yield from ((population, each) for each in check_annealing(stages, correlation))
-    check = None
-    if settings.check_draws != 0:
-        log_evidence = sum(stage.log_evidence_increment for stage in stages)
-        try:
-            check, found = check_population(population, density, visited, log_evidence, random, settings.check_draws)
-        except BudgetExhausted:
-            raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
-        yield population, check
-        yield from ((population, each) for each in found)
-    if recycled is not None and recycled.check is not None:
-        value, error = recycled.log_evidence, recycled.log_evidence_error
-        yield from ((population, each) for each in check_fallback(stages, check, value, error, recycled.check))
+    if settings.check_draws == 0:
+        return
+    log_evidence = sum(stage.log_evidence_increment for stage in stages)
+    try:
+        check, found = check_population(population, density, visited, log_evidence, random, settings.check_draws)
+    except BudgetExhausted:
+        raise StoppedEarly(population, 0.0, 0.0, 1.0, complete=True) from None
+    yield population, check
+    yield from ((population, each) for each in found)
 
 
 def check_population(
@@ -132,11 +126,11 @@ def check_population(
     random: np.random.RandomState,
     draws: int | None = None,
 ) -> tuple[EvidenceCheck, list[Finding]]:
-    """Estimate the evidence and the shares of the posterior's parts by fresh draws of a fitted mixture.
+    """Evidence, and findings about the shares of the posterior's parts, by fresh draws of a mixture fitted to the final
+    points.
 
-    `population` are the final points, `visited` the points of all stages, and `log_evidence` belongs to the stages.
-    There are as many draws as final points by default. Returns the check, and findings about shares
-    (`samplers.judgement.checks.check_shares`).
+    `visited` are the points of all stages, whose `log_evidence` is given. There are as many draws as final points by
+    default.
     """
     coords, n = population.coords, len(population.coords)
     mixture = fit_mixture(coords, np.full(n, 1.0 / n), bounds=find_support_bounds(density.inside, coords))

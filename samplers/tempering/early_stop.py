@@ -16,9 +16,8 @@ class NothingToReport(ValueError):
 class StoppedEarly(Exception):
     """The limit of simulations has ended an annealing at `beta`; the known points have log-weights at beta = 1.
 
-    `log_evidence` and `error` belong to these weights; `log_evidence_of_stages` is the part that was already reported.
-    If `complete`, beta = 1 was reached and the population is equally weighted. `from_guide`: the points are draws of a
-    guide.
+    `log_evidence_of_stages` is the part that was already reported. If `complete`, beta = 1 was reached and the
+    population is equally weighted. `from_guide`: the points are draws of a guide.
     """
 
     def __init__(

@@ -1,18 +1,15 @@
 """Chains of transitional Markov chain Monte Carlo, which grow from the resampled points, the leaders.
 
-Ching & Chen (2007) draw a leader by the weights for every new point, and move the chain of this leader by one step:
-a leader that is drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long
-chains have large weights, so the new points have a bias that does not decrease with their number. The bias decreases
-with the steps that every chain makes before its points count (burn-in; Betz, Papaioannou & Straub 2016).
+Ching & Chen (2007) draw a leader by the weights for every new point, and move its chain by one step: a leader that is
+drawn n times has a chain of n points. Its first points have made few steps, and the leaders of long chains have large
+weights, so the new points have a bias, which decreases with the steps that every chain makes before its points count
+(burn-in; Betz, Papaioannou & Straub 2016). Weights that are computed again after every single step, as in the paper,
+would leave a pool idle.
 
-The same paper also computes the weight of a leader from the present point of its chain, after every single step. This
-needs chains that move one after another, and leaves a pool idle. With a fifth of the chains moved between two updates
-of the weights, the bias was larger than without updates, so the weights are not updated here.
-
-Points of one chain are one step apart. If many points are copies, as with few walkers for many parameters, the next fit
-and the next weights see too few distinct points: with 100 walkers and 12 parameters, the means were wrong by 1 to 6
-standard deviations. So all points are swept together after the burn-in and the chains, until they are nearly
-uncorrelated with the resampled points. Without a burn-in, the algorithm is as published.
+If many points are copies, the next fit and the next weights see too few distinct points: with 100 walkers and 12
+parameters, the means were wrong by 1 to 6 standard deviations. So all points are swept together after the burn-in and
+the chains, until they are nearly uncorrelated with the resampled points. Without a burn-in, the algorithm is as
+published.
 
 References
 ----------
@@ -51,13 +48,11 @@ def grow_chains(
     settings: Settings,
     visited: VisitedPoints | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Grow a chain from each distinct point (leader), one step per copy of it.
+    """Grow a chain from each distinct point (leader), one step per copy of it, after ``settings.burn_in`` steps of all.
 
-    All chains first make ``settings.burn_in`` steps; then every step of a chain is a point of the new population. The
-    first step moves all chains together, later steps only the chains that are long enough, so the moves must be able to
-    move any number of points. The moves are tuned after each step. With a burn-in, sweeps over all points follow if the
-    points are still correlated with the resampled points (`samplers.tempering.mutation.move_together`). `ancestors`
-    (n,) are equal for copies of one point.
+    The first step moves all chains together, later ones those that are long enough. With a burn-in, sweeps over all
+    points follow if these are still correlated with the resampled points. `ancestors` (n,) are equal for copies of one
+    point.
     """
     beta, coords, records = population.beta, population.coords, population.records
     model = tempered_model(density, beta, random, visited)

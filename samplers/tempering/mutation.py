@@ -16,7 +16,6 @@ from emcee.moves import DESnookerMove, Move, RedBlueMove
 from ..budget import BudgetExhausted
 from ..estimates.weights import LOWEST
 from ..judgement.checks import ROUNDING
-from ..moves.fast_parameters import WithFastSweeps
 from ..moves.population_moves import MixtureMove, calibrate_move
 from ..proposals.mixture import Mixture
 from ..reports import Sweep
@@ -48,9 +47,8 @@ def needs_many_walkers(moves: Any) -> bool:
 def check_moves(moves: Sequence[Move], chains: str) -> None:
     """Raise ValueError for moves that cannot move chains from leaders (setting `chains`), or do not keep the target.
 
-    The acceptance of ``emcee.moves.DESnookerMove`` (emcee 3.1.6 and earlier) has the exponent (ndim - 1) / 2 instead of
-    ndim - 1 for the ratio of the distances from the third walker (ter Braak & Vrugt 2008, Statistics and Computing 18,
-    doi:10.1007/s11222-008-9104-9).
+    ``emcee.moves.DESnookerMove`` (3.1.6 and earlier) has the exponent (ndim - 1) / 2 instead of ndim - 1 (ter Braak &
+    Vrugt 2008, doi:10.1007/s11222-008-9104-9).
     """
     if any(type(move) is DESnookerMove for move in moves):
         raise ValueError(
@@ -93,28 +91,29 @@ class MoveSchedule(NamedTuple):
         `coords` (n, ndim) are points, also from earlier stages; `log_target` (n,) is scaled so that its integral is
         about 1.
         """
-        for move in self.moves:
-            if isinstance(move, MixtureMove | WithFastSweeps):
-                move.cover_basins(coords, log_target)
+        for move in self._mixture_moves():
+            move.cover_basins(coords, log_target)
 
     def follow(self, ancestors: np.ndarray) -> None:
         """Tell mixture moves from which of the points of the last calibration (by indices) each walker descends."""
-        for move in self.moves:
-            if isinstance(move, MixtureMove | WithFastSweeps):
-                move.follow(ancestors)
+        for move in self._mixture_moves():
+            move.follow(ancestors)
 
     def expect_independence(self) -> None:
         """Tell mixture moves that the points are already independent draws of the target."""
-        for move in self.moves:
-            if isinstance(move, MixtureMove | WithFastSweeps):
-                move.expect_independence()
+        for move in self._mixture_moves():
+            move.expect_independence()
+
+    def _mixture_moves(self) -> list[MixtureMove]:
+        """The mixture moves, with fast sweeps or without."""
+        return [each for move in self.moves if isinstance(each := getattr(move, "move", move), MixtureMove)]
 
 
 class Mutated(NamedTuple):
     """A population after its moves at one beta, with the acceptance over all sweeps and their number.
 
-    `correlation` is the largest one left with the resampled population (`StartCorrelation`), 1 without a sweep;
-    `stopped` says whether the limit of simulations ended the moves.
+    `correlation` is the largest one left with the resampled population; `stopped`: the limit of simulations ended the
+    moves.
     """
 
     population: Population
@@ -132,11 +131,9 @@ def tempered_log_prob(records: np.ndarray, beta: float) -> np.ndarray:
 
 
 class VisitedPoints:
-    """Possible points that the annealing has evaluated, as far as they may still reveal a part of the target.
+    """Possible points that the annealing has evaluated, with rejected proposals, which may reveal a narrow mode.
 
-    While beta is small, a narrow mode has few points, and the next resampling replaces most of them. These points are
-    kept here, with rejected proposals, so that `samplers.proposals.basins` can propose draws there, and the result can
-    be compared with them.
+    The next resampling replaces most of them; `samplers.proposals.basins` proposes draws there.
     """
 
     def __init__(self) -> None:
@@ -183,8 +180,8 @@ def tempered_model(
 class StartCorrelation:
     """Correlation over the walkers between points (n, ndim) after resampling and their values after each sweep.
 
-    `values` has one entry per sweep: the largest absolute correlation over all parameters and the log-likelihood, on
-    which the next weights depend.
+    `values`: after each sweep, the largest one over all parameters and the log-likelihood, on which the next weights
+    depend.
     """
 
     def __init__(self, coords: np.ndarray, records: np.ndarray):
@@ -227,10 +224,10 @@ def move_together(
     visited: VisitedPoints | None = None,
     correlation: StartCorrelation | None = None,
 ) -> Generator[tuple[Population, Sweep], None, Mutated]:
-    """Move equally weighted points equally often, until they are nearly uncorrelated with their start.
+    """Move equally weighted points equally often, until they are nearly uncorrelated with their start; yields each
+    sweep.
 
-    Yields the population after each sweep. Points that are evaluated are added to `visited`. A given `correlation`
-    belongs to an earlier start, from which the points have already been moved.
+    Points that are evaluated are added to `visited`. A given `correlation` belongs to an earlier start.
     """
     beta, records = population.beta, population.records
     model = tempered_model(density, beta, random, visited)

@@ -12,12 +12,9 @@ BISECTIONS = 20
 def next_beta(log_likelihood: np.ndarray, beta: float, target: float, base: np.ndarray | None = None) -> float:
     """Largest next exponent in (beta, 1] whose incremental weights keep the effective sample size at `target`.
 
-    Points of zero likelihood are lost at any larger exponent, so the target is multiplied by the share of finite
-    log-likelihoods (n,). The step is halved until the target is met, and then bisected to a relative tolerance of 1e-6.
-    The bisection uses a fixed dyadic grid, so that rounding errors of the log-likelihood do not change the exponent.
-    With the log-weights `base` (n,) at `beta`, the target is not scaled, and it must be met at `beta`. Raises
-    ValueError if no log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300
-    are.
+    The target is multiplied by the share of finite log-likelihoods (n,), but not with log-weights `base` (n,) at
+    `beta`. The bisection uses a fixed dyadic grid, so that rounding errors do not change the exponent. ValueError if no
+    log-likelihood is finite, or all are so low that rounding errors exceed 1, as penalties of -1e300 are.
     """
     top = np.max(log_likelihood)
     if top < LOWEST:

@@ -15,9 +15,8 @@ BASE_FIELDS = [("log_prob", np.float64), ("log_prior", np.float64)]
 class PendingPoints:
     """Points (n, ndim) that were submitted, and their known records.
 
-    `refused` says whether the limit of simulations refused further points. `base` (n,) are records with log_prior,
-    which is -inf outside the support, and log_prob = -inf, known from the beginning; `arrived` (n,) bool are the points
-    with all records.
+    `refused`: the limit of simulations refused further points. `base` (n,) are records with log_prior, and log_prob =
+    -inf; `arrived` (n,) bool are the points with all records.
     """
 
     def __init__(self, coords: np.ndarray, log_prior: np.ndarray, refused: bool = False):

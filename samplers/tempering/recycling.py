@@ -104,12 +104,9 @@ class StartingDensity(NamedTuple):
 class Recycled(NamedTuple):
     """Result of recycling: the draws made at beta = 1 with those of the check, their records and log-weights (n,).
 
-    `reason` says why the result is not reliable; it is empty if it is. Each draw is weighted relative to the mixture of
-    its round, which was not fitted to it. Rounds are combined by `samplers.estimates.importance.round_shares`, which
-    does not depend on the weights of the same round: otherwise a round with a few large weights in a tail would get a
-    small share, and cut the tail. `log_evidence` and its error use all points except the draws of the check, which is
-    None if beta = 1 was not reached. `log_evidence_below_one` belongs to the last beta below 1. `independent` says
-    whether as many points as walkers, resampled from the draws, are as good as independent draws of the posterior.
+    `reason` says why the result is not reliable; empty if it is. Each draw is weighted by the mixture of its round,
+    which was not fitted to it. `log_evidence` and its error use all points except the draws of the check. `independent`
+    says whether as many points as walkers, resampled from the draws, are as good as independent draws of the posterior.
     """
 
     reason: str
@@ -143,11 +140,9 @@ def recycle(
 ) -> Generator[tuple[Population, Report], None, Recycled]:
     """Anneal draws of the prior, or of another starting density, to beta = 1 by adaptive importance sampling.
 
-    The path to the posterior is start^(1 - beta) posterior^beta; the start is the prior by default. `size` is the
-    wanted effective sample size at beta = 1 and the number of draws for the check, by default the number of starting
-    points. Yields, for each beta below 1 before its draws are made, all weighted points with the stage, whose
-    acceptance is the efficiency of the latest draws; then a `Sweep`, as a tick of the progress bar. Raises StoppedEarly
-    if the limit of simulations is exceeded.
+    The path is start^(1 - beta) posterior^beta. `size` is the wanted effective sample size at beta = 1 and the number
+    of draws for the check, by default the number of starting points. Yields all weighted points with a `Stage` for each
+    beta below 1 before its draws are made, then a `Sweep`. Raises StoppedEarly at the limit of simulations.
     """
     n, ndim = pending.coords.shape
     size = n if size is None else size
@@ -399,11 +394,7 @@ class _Search:
 
 
 def _stopped_at(points: WeightedPoints, beta: float, of_stages: float, inherited: float) -> StoppedEarly:
-    """All points, weighted by the posterior over the mixture of their densities, when the limit is exceeded at `beta`.
-
-    `of_stages`: part of the log-evidence from stages already reported. `inherited`: variance of the log-evidence from
-    the weights by which the proposals were chosen.
-    """
+    """All points, weighted by the posterior over the mixture of their densities, at the limit of simulations."""
     log_weights = points.log_weights(1.0)
     n, effective = len(log_weights), effective_sample_size(log_weights)
     known = Population(1.0, points.coords, points.records, effective, (), log_weights)

@@ -57,10 +57,8 @@ def anneal_by_moves(
 ) -> Generator[tuple[Population, Stage | Sweep | Finding], None, tuple[Population, list[Stage], float]]:
     """Carry evaluated draws of the prior to beta = 1; points that are evaluated here are added to `visited`.
 
-    Yields the points as they are now with a report: a `Sweep` when they have been moved once, a `Stage` when a stage is
-    finished, a `Finding` if it is collapsed or stuck. Returns the points at beta = 1, all stages, and the correlation
-    of the points with their start after the moves of the last stage. Raises StoppedEarly if the limit of simulations is
-    exceeded.
+    Yields the points as they are now with a report. Returns the points at beta = 1, all stages, and the correlation of
+    the points with their start after the last moves. Raises StoppedEarly at the limit of simulations.
     """
     n, ndim = population.coords.shape
     target, stages, error = float(n), [], EvidenceError(n)

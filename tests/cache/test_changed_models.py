@@ -16,8 +16,8 @@ from fe_likelihoods.cache.simulation_cache import rows_to_compare
 from fe_likelihoods.cache.verification import StaleCache, choose_rows
 from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.faults import ChangedModel
+from fe_likelihoods.simulation.folder import Observed
 from fe_likelihoods.simulation.label import ModelLabel, items_of, value_digest
-from fe_likelihoods.simulation.opened import Observed
 from tests.covering import covering
 
 CHANNELS = (Channel("u", "displacement", "m"),)

@@ -203,41 +203,25 @@ def _pymc_nuts(posterior: Posterior, seed: int) -> Found:
     return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
 
 
-def _uqpy(posterior: Posterior, seed: int) -> Found:
-    from UQpy.sampling.mcmc import Stretch
-
-    sampler = Stretch(
-        log_pdf_target=posterior.log_prob,
-        seed=posterior.sample_start(24, seed).tolist(),
-        burn_length=100,
-        concatenate_chains=False,
-        random_state=seed,
-    )
-    sampler.run(nsamples_per_chain=700)
-    return chains(sampler.samples.swapaxes(0, 1))
-
-
 class Client(NamedTuple):
-    """The module to import, the distribution that provides it, the command that installs it, and the run."""
+    """The module to import, the command that installs it, and the run."""
 
     module: str
-    distribution: str
     install: str
     run: Callable[[Posterior, int], Found]
 
 
 _TEST, _CLIENTS, _MAKE = "pip install '.[test]'", "pip install '.[clients]'", "make clients"
 CLIENTS = {
-    "emcee": Client("emcee", "emcee", "pip install .", _emcee),
-    "zeus": Client("zeus", "zeus-mcmc", _TEST, _zeus),
-    "dynesty": Client("dynesty", "dynesty", _TEST, _dynesty),
-    "nautilus": Client("nautilus", "nautilus-sampler", _TEST, _nautilus),
-    "pints": Client("pints", "pints", _TEST, _pints),
-    "bilby": Client("bilby", "bilby", _TEST, _bilby),
-    "ultranest": Client("ultranest", "ultranest", _CLIENTS, _ultranest),
-    "pymc-smc": Client("pymc", "pymc", _CLIENTS, _pymc_smc),
-    "pymc-mcmc": Client("pymc", "pymc", _CLIENTS, _pymc_mcmc),
-    "pymc-nuts": Client("pymc", "pymc", _CLIENTS, _pymc_nuts),
-    "pocomc": Client("pocomc", "pocomc", _MAKE, _pocomc),
-    "uqpy": Client("UQpy", "UQpy", _MAKE, _uqpy),
+    "emcee": Client("emcee", "pip install .", _emcee),
+    "zeus": Client("zeus", _TEST, _zeus),
+    "dynesty": Client("dynesty", _TEST, _dynesty),
+    "nautilus": Client("nautilus", _TEST, _nautilus),
+    "pints": Client("pints", _TEST, _pints),
+    "bilby": Client("bilby", _TEST, _bilby),
+    "ultranest": Client("ultranest", _CLIENTS, _ultranest),
+    "pymc-smc": Client("pymc", _CLIENTS, _pymc_smc),
+    "pymc-mcmc": Client("pymc", _CLIENTS, _pymc_mcmc),
+    "pymc-nuts": Client("pymc", _CLIENTS, _pymc_nuts),
+    "pocomc": Client("pocomc", _MAKE, _pocomc),
 }

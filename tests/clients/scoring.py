@@ -9,7 +9,7 @@ from .problem import Exact
 
 arviz = lazy_loader.load("arviz")  # its import takes seconds
 
-__all__ = ["Found", "Score", "chains", "check", "replicates", "score", "weighted"]
+__all__ = ["Found", "chains", "check", "replicates", "weighted"]
 
 STANDARD_ERRORS = 5.0  # of a moment: the errors come from a few hundred draws and are uncertain themselves
 EVIDENCE_ERRORS = 4.0
@@ -24,17 +24,6 @@ class Found(NamedTuple):
     sd_error: np.ndarray
     log_evidence: float | None = None
     log_evidence_error: float | None = None
-
-
-class Score(NamedTuple):
-    """Errors of means, standard deviations (sd, as ratios) and evidence; z are errors in standard errors."""
-
-    mean: np.ndarray
-    mean_z: np.ndarray
-    sd_ratio: np.ndarray
-    sd_z: np.ndarray
-    log_evidence: float | None
-    log_evidence_z: float | None
 
 
 def _found(samples, weights, mean_size, square_size, log_evidence=None, log_evidence_error=None) -> Found:
@@ -85,26 +74,14 @@ def replicates(runs: list[Found]) -> Found:
     )
 
 
-def score(found: Found, exact: Exact) -> Score:
-    """Errors of `found`."""
-    evidence = None if found.log_evidence is None else float(found.log_evidence - exact.log_evidence)
-    return Score(
-        (found.mean - exact.mean) / exact.sd,
-        (found.mean - exact.mean) / found.mean_error,
-        found.sd / exact.sd,
-        (found.sd - exact.sd) / found.sd_error,
-        evidence,
-        None if evidence is None else evidence / found.log_evidence_error,
-    )
-
-
 def check(found: Found, exact: Exact) -> None:
     """Raise AssertionError unless all errors are within tolerance and the standard errors are small enough."""
-    result = score(found, exact)
+    mean, sd = (found.mean - exact.mean) / found.mean_error, (found.sd - exact.sd) / found.sd_error
     assert np.all(found.mean_error < 0.1 * exact.sd), f"too few draws for a comparison: {found}"
-    assert np.all(np.abs(result.mean_z) < STANDARD_ERRORS), f"means: {result}"
-    assert np.all(np.abs(result.sd_z) < STANDARD_ERRORS), f"standard deviations: {result}"
+    assert np.all(np.abs(mean) < STANDARD_ERRORS), f"means: {mean}"
+    assert np.all(np.abs(sd) < STANDARD_ERRORS), f"standard deviations: {sd}"
     if found.log_evidence is not None:
         # a log-evidence that ignores points of probability zero is too large by 0.9, more than four of these errors
         assert 0.0 < found.log_evidence_error < 0.22, f"an evidence without a usable error: {found}"
-        assert abs(result.log_evidence_z) < EVIDENCE_ERRORS, f"evidence: {result}"
+        error = (found.log_evidence - exact.log_evidence) / found.log_evidence_error
+        assert abs(error) < EVIDENCE_ERRORS, f"evidence: {error}"

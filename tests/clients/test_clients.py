@@ -11,7 +11,7 @@ from .runs import CLIENTS
 from .scoring import Found, check
 
 # emcee and ultranest are quick: test_adapters and test_protocol compare what the others call with the posterior
-SLOW = {"bilby", "dynesty", "nautilus", "pints", "pymc-smc", "pymc-mcmc", "pymc-nuts", "pocomc", "uqpy", "zeus"}
+SLOW = {"bilby", "dynesty", "nautilus", "pints", "pymc-smc", "pymc-mcmc", "pymc-nuts", "pocomc", "zeus"}
 
 
 def test_quadrature_has_converged_and_is_of_this_posterior(answer):

@@ -7,8 +7,6 @@ import random
 import numpy as np
 import pytest
 
-from fe_likelihoods.adapters import to_bilby
-
 from .problem import make_posterior
 
 
@@ -42,56 +40,3 @@ def test_ensemble_through_a_pool_is_the_same_chain(name, client_named, pool):
         return sampler.get_chain()
 
     np.testing.assert_array_equal(chain(pool=pool), chain(vectorize=True))
-
-
-@pytest.mark.slow
-def test_dynesty_through_a_pool(client_named, pool):
-    client_named("dynesty")
-    import dynesty
-
-    posterior = make_posterior()
-    sampler = dynesty.NestedSampler(
-        posterior.log_likelihood,
-        posterior.prior_transform,
-        posterior.ndim,
-        nlive=40,
-        pool=pool,
-        queue_size=2,
-        rstate=np.random.default_rng(1),
-    )
-    sampler.run_nested(maxiter=60, print_progress=False, add_live=False)
-    found = sampler.results
-    assert posterior.report()["simulations"] == 0, "all simulations run in the processes"
-    expected = posterior.finite_log_likelihood(found.samples)
-    possible = expected > -1e99
-    np.testing.assert_array_equal(found.logl[possible], expected[possible])
-    assert possible.any() and np.all(found.logl[~possible] <= -1e99)
-
-
-@pytest.mark.slow
-def test_bilby_with_npool(client_named, monkeypatch, tmp_path):
-    client_named("bilby")
-    import bilby
-
-    monkeypatch.setattr(multiprocessing, "Pool", multiprocessing.get_context("spawn").Pool)
-    posterior = make_posterior()
-    likelihood, priors = to_bilby(posterior)
-    result = bilby.run_sampler(
-        likelihood,
-        priors,
-        sampler="dynesty",
-        npool=2,
-        nlive=30,
-        sample="unif",
-        bound="multi",
-        maxiter=50,
-        outdir=str(tmp_path),
-        save=False,
-        resume=False,
-        check_point=False,
-        check_point_plot=False,
-        print_progress=False,
-    )
-    samples = result.nested_samples
-    points = samples[posterior.parameter_names].to_numpy()
-    np.testing.assert_array_equal(samples["log_likelihood"], posterior.finite_log_likelihood(points))

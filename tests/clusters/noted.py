@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.contract.targets import Gaussian
 from tests.faults.treacherous import Treacherous, line
 
 _lock, _running, most = threading.Lock(), 0, 0
@@ -21,30 +20,12 @@ class EndsItsJob(Treacherous):
         self.folder = folder
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
-        end_job_once(self.folder)
-        return line(theta)
-
-
-class GaussianEndsItsJob(Gaussian):
-    """A log-density whose first evaluation ends the job that it is a part of."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(2, sd=0.05)
-        self.folder = folder
-
-    def __call__(self, x: np.ndarray) -> float:
-        end_job_once(self.folder)
-        return super().__call__(x)
-
-
-def end_job_once(folder: Path) -> None:
-    """End the job of this process, at the first call."""
-    try:
-        (folder / "ended").touch(exist_ok=False)
-    except FileExistsError:
-        return
-    os.kill(os.getppid(), signal.SIGKILL)  # of both workers, which end with it
-    time.sleep(3600)
+        try:
+            (self.folder / "ended").touch(exist_ok=False)
+        except FileExistsError:
+            return line(theta)
+        os.kill(os.getppid(), signal.SIGKILL)  # of both workers, which end with it
+        time.sleep(3600)
 
 
 def counted(item: int) -> tuple[int, str]:

@@ -18,7 +18,6 @@ import pytest
 
 from fe_likelihoods import DaskExecutor
 from fe_likelihoods.simulation import dask_executor
-from samplers import SMCSampler
 from samplers.record import Record
 from tests.clusters import noted
 from tests.faults.treacherous import Treacherous, posterior_of
@@ -192,23 +191,6 @@ def test_a_job_with_several_workers_that_has_ended_is_submitted_again(jobs, tmp_
     assert len(names) == 2
     np.testing.assert_array_equal(values, posterior_of(Treacherous())(points))
     assert posterior.report()["failure_count"] == 0
-
-
-@pytest.mark.slow
-@needs("dask_jobqueue")
-@pytest.mark.parametrize("asynchronous", [True, False])
-def test_an_executor_as_pool_of_a_sampler_replaces_jobs_as_well(asynchronous, jobs, tmp_path, caplog):
-    """A log-density that is no posterior of this library; a bare client has an advice instead."""
-    client, names = jobs
-    posterior = noted.GaussianEndsItsJob(tmp_path)
-    settings = {"seed": 3, "recycle": True, "asynchronous": asynchronous}
-    sampler = SMCSampler(40, 2, posterior, pool=DaskExecutor(client), **settings)
-    sampler.run_mcmc(None, 1)
-    assert len(names) == 2 and sampler.failure_count == 0
-    assert abs(sampler.log_evidence - posterior.log_evidence) < 4 * sampler.log_evidence_error
-    assert "DaskExecutor(client)" not in caplog.text
-    SMCSampler(40, 2, posterior, pool=client, **settings)
-    assert "pass pool=fe_likelihoods.DaskExecutor(client)" in caplog.text
 
 
 @needs("distributed")

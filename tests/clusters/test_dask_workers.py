@@ -55,6 +55,11 @@ def test_workers_that_are_still_starting_are_not_called_lost(cluster, caplog):
     assert "given up" not in caplog.text
 
 
+def test_a_cluster_that_stays_without_workers_ends_the_run(cluster):
+    with pytest.raises(RuntimeError, match="the dask cluster has had no worker for 0.3 s: start workers"):
+        DaskExecutor(cluster(0.0), longest_wait=0.3).map(abs, [1, 2, 3])
+
+
 def test_workers_that_the_cluster_has_given_up_are_started_again(cluster, caplog, tmp_path):
     """The negative control: both workers are closed while a simulation runs."""
     client = cluster(0.0)

@@ -5,7 +5,6 @@ of the prior, or only near the posterior.
 """
 
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 
 import emcee
 import numpy as np
@@ -108,11 +107,6 @@ def test_another_type_in_later_values_is_stored_exactly_or_refused(pair, where, 
         run(posterior, path, vectorize=vectorize)
 
 
-@pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair != "longer array"])
-def test_objects_may_be_declared_in_memory(pair):
-    assert exact(run(Changing(*PAIRS[pair], LATER), blobs_dtype=object))
-
-
 def test_a_refused_run_goes_on_with_a_wider_type(tmp_path):
     """Nothing is evaluated again, and the run is the one with this type from the start."""
     path = tmp_path / "run.h5"
@@ -180,14 +174,6 @@ def test_blobs_of_some_points_only_are_refused(where, first, tmp_path):
     )  # fmt: skip
     with pytest.raises(ValueError, match="must return blobs with every point or with none"):
         run(posterior, tmp_path / "run.h5" if where == "file" else None)
-
-
-@pytest.mark.parametrize("asynchronous", [False, True])
-def test_types_with_a_pool(asynchronous):
-    with ThreadPoolExecutor(2) as pool:
-        settings = {"recycle": True, "asynchronous": True} if asynchronous else {}
-        sampler = run(Changing(*PAIRS["longer text"], FIRST), pool=pool, **settings)
-    assert exact(sampler)
 
 
 def test_arrays_of_batches():

@@ -254,35 +254,6 @@ def test_pickle(Sampler, make_backend):
 
 
 @stored
-def test_random_state(Sampler, make_backend):
-    sampler = run(Sampler, make_backend())
-    kept = sampler.random_state
-    state = sampler.get_last_sample()
-    for ours, stored in zip(kept, state.random_state, strict=True):
-        assert np.all(ours == stored)
-    first = sampler.run_mcmc(state, 2, store=False).coords
-    sampler.random_state = kept
-    assert np.array_equal(sampler.run_mcmc(state, 2, store=False).coords, first)
-
-
-@stored
-def test_reopened_backend_goes_on_bit_by_bit(Sampler, make_backend):
-    posterior, whole = Gaussian(), None
-    for pieces in ([6], [2, 4]):  # two equal calls would be the same script, started again
-        backend = make_backend()
-        backend.reset(N, 3)
-        if hasattr(backend, "ladder"):
-            del backend.ladder
-        for number, steps in enumerate(pieces):
-            np.random.seed(7)  # noqa: NPY002
-            sampler = Sampler(N, 3, posterior, backend=make_backend(), moves=emcee.moves.StretchMove())
-            sampler.run_mcmc(start(posterior) if number == 0 else None, steps)
-        chain = sampler.get_chain()
-        whole = chain if whole is None else whole
-        assert np.array_equal(chain, whole)
-
-
-@stored
 def test_sample_is_a_generator_that_stores_as_it_goes(Sampler, make_backend):
     posterior = Gaussian()
     sampler = Sampler(N, 3, posterior, backend=make_backend())
@@ -328,3 +299,15 @@ def test_progress_bar(Sampler, capfd):
             assert word in shown, word
     Sampler(N, 3, posterior).run_mcmc(start(posterior), 3)
     assert capfd.readouterr().err == ""
+
+
+@stored
+def test_random_state(Sampler, make_backend):
+    sampler = run(Sampler, make_backend())
+    kept = sampler.random_state
+    state = sampler.get_last_sample()
+    for ours, stored in zip(kept, state.random_state, strict=True):
+        assert np.all(ours == stored)
+    first = sampler.run_mcmc(state, 2, store=False).coords
+    sampler.random_state = kept
+    assert np.array_equal(sampler.run_mcmc(state, 2, store=False).coords, first)

@@ -10,12 +10,9 @@ import pytest
 from samplers import SamplingWarning, SMCSampler, TemperedSampler, TMCMCSampler
 from samplers.moves.population_moves import RandomWalkMove
 from samplers.presets import CHING_CHEN_2007, RAMANCHA_2022_CONSTANT, RAMANCHA_2022_LITERAL
-from samplers.reporting.arviz_data import to_arviz
-from samplers.reporting.run_figure import plot_run
-from samplers.reporting.summary import comparison_table, ladder_table, summary
+from samplers.reporting.summary import ladder_table, summary
 from samplers.reports import AnnealingResult
-from samplers.resampling import stratified
-from samplers.settings import Settings
+from samplers.resampling import multinomial
 from tests.contract.targets import Box, Gaussian
 
 N = 40
@@ -86,15 +83,6 @@ def test_two_estimates_that_disagree_widen_the_error_unless_the_higher_one_is_tr
     assert unreliable.evidence[0] == sampler.log_evidence_ladder
 
 
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_recycling_needs_walkers():
-    """By default, since with few walkers a mode can be lost unnoticed."""
-    posterior = Gaussian()
-    assert [SMCSampler(n, 3, posterior).settings.recycle for n in (149, 150)] == [False, True]
-    assert SMCSampler(N, 3, posterior, recycle=True).settings.recycle
-    assert not SMCSampler(500, 3, posterior, moves=emcee.moves.StretchMove()).settings.recycle
-
-
 def test_recycling_that_fails_falls_back_to_moves(caplog):
     """A ring in two dimensions and an exponential corner in six, which no mixture fits."""
 
@@ -124,7 +112,7 @@ def test_presets_targets_and_moves():
     assert RAMANCHA_2022_LITERAL["moves"]._root is None  # the sampler works on copies
 
 
-@pytest.mark.parametrize("resampling", ["multinomial", "residual", "stratified", "systematic", stratified])
+@pytest.mark.parametrize("resampling", ["multinomial", "systematic", multinomial])
 def test_resampling_by_name_or_function(resampling):
     assert annealed(resampling=resampling).ladder[-1].beta == 1.0
 
@@ -147,14 +135,6 @@ def test_annealing_is_done_once():
     assert sampler.ladder == ladder == sampler._output.result.ladder
 
 
-def test_annealing_without_steps_then_steps():
-    sampler = annealed(nsteps=0)
-    ladder = sampler.ladder
-    assert isinstance(sampler.run_mcmc(None, 2), emcee.State)
-    assert sampler.ladder == ladder
-    assert sampler.iteration == 2
-
-
 def test_a_state_with_log_prob_saves_evaluations():
     posterior = Gaussian()
     draws = posterior.sample_prior(N, np.random.default_rng(0))
@@ -172,14 +152,6 @@ def test_samplers_without_a_seed_have_different_streams():
     assert not np.array_equal(first, second)
     np.random.seed(5)  # noqa: NPY002
     assert np.array_equal(annealed(seed=None).get_chain(), first)
-
-
-def test_a_finished_run_is_not_seeded_again(tmp_path):
-    backend = emcee.backends.HDFBackend(str(tmp_path / "a.h5"))
-    sampler = annealed(backend=backend)
-    again = SMCSampler(N, 3, Gaussian(), backend=backend, vectorize=True, seed=3)
-    for ours, theirs in zip(again.random_state, sampler.random_state, strict=True):
-        assert np.all(ours == theirs)
 
 
 def test_published_tmcmc_grows_chains_from_leaders():
@@ -200,95 +172,7 @@ def test_published_tmcmc_grows_chains_from_leaders():
     assert 5 * stage.distinct_ancestors + 200 <= stage.evaluations < 6 * 200
 
 
-def test_points_of_a_chain_follow_each_other():
-    """Every point of the new population is one step away from the previous point of its chain."""
-    from samplers.tempering.leaders import grow_chains
-    from samplers.tempering.mutation import MoveSchedule
-    from samplers.tempering.population import Population
-
-    random = np.random.RandomState(0)
-    ancestors = np.sort(random.randint(5, size=30))[random.permutation(30)]
-    founders = 100.0 * random.standard_normal((5, 2))
-    records = np.zeros(30, dtype=[("log_prob", float), ("log_prior", float)])
-
-    class Flat:
-        """A density that is the same everywhere."""
-
-        map = map
-
-        def evaluate(self, coords):
-            return np.zeros(len(coords), dtype=records.dtype)
-
-    move = RandomWalkMove(scale=1.0)
-    move.calibrate(random.standard_normal((100, 2)), np.full(100, 0.01))
-    population = Population(1.0, founders[ancestors], records, 30.0)
-    settings = Settings(chains="leaders", burn_in=0)
-    steps = grow_chains(population, ancestors, Flat(), random, MoveSchedule([move], [1.0]), settings)
-    *_, (last, sweep) = steps
-    assert sweep.acceptance == 1.0
-    grown = last.coords
-    assert len(np.unique(grown, axis=0)) == 30
-    for leader in range(5):
-        chain = np.concatenate([founders[leader : leader + 1], grown[ancestors == leader]])
-        assert np.max(np.abs(np.diff(chain, axis=0))) < 6.0  # the founders are hundreds apart
-
-
 # ---------------------------------------------------------------- storage
-
-
-def test_ladder_beside_the_chain(tmp_path):
-    import h5py
-
-    path = str(tmp_path / "run.h5")
-    sampler = annealed(backend=emcee.backends.HDFBackend(path, name="column"))
-    with h5py.File(path) as file:
-        assert {"tempering", "chain"} <= set(file["column"]) and "nothing" not in file
-        assert file["column/chain"].shape == (3, N, 3)
-    again = SMCSampler(N, 3, Gaussian(), backend=emcee.backends.HDFBackend(path, name="column"), vectorize=True)
-    assert again.ladder == sampler.ladder
-    assert again.log_evidence_check == sampler.log_evidence_check is not None
-    assert (again.log_evidence, again.log_evidence_error) == (sampler.log_evidence, sampler.log_evidence_error)
-    again.run_mcmc(None, 2)
-    assert again.iteration == 5 and again.ladder == sampler.ladder
-
-
-def test_a_new_annealing_replaces_the_ladder(tmp_path):
-    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-    sampler = annealed(Gaussian(sd=0.01), backend=backend)
-    long = len(sampler.ladder)
-    backend.reset(N, 3)
-    sampler = SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True)
-    sampler.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 1)
-    assert SMCSampler(N, 3, Gaussian(sd=0.5), backend=backend, vectorize=True).ladder == sampler.ladder
-    assert len(sampler.ladder) < long
-
-
-class Interrupted(Gaussian):
-    """Raises an error after a number of calls."""
-
-    def __init__(self, error, after, **kwargs):
-        super().__init__(**kwargs)
-        self.error, self.after = error, after
-
-    def __call__(self, x):
-        if self.calls > self.after:
-            raise self.error
-        return super().__call__(x)
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("solver died")])
-def test_an_exception_leaves_the_finished_stages(tmp_path, error):
-    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-    posterior = Interrupted(error, after=8 * N, sd=0.01)
-    sampler = SMCSampler(N, 3, posterior, backend=backend, vectorize=True, seed=2)
-    with pytest.raises(type(error)):
-        sampler.run_mcmc(None, 5)
-    assert 0 < len(sampler.ladder) and sampler.ladder[-1].beta < 1
-    with pytest.raises(ValueError, match="the ladder ends at beta"):
-        _ = sampler.log_evidence
-    posterior.after = np.inf
-    sampler.run_mcmc(None, 1)
-    assert sampler.ladder[-1].beta == 1 and sampler.iteration == 1
 
 
 # ---------------------------------------------------------------- errors, warnings
@@ -302,74 +186,38 @@ def test_no_evidence_before_a_run():
             getattr(sampler, name)
 
 
+BOX = Box([0, 0], [1, 1], lambda x: 0.0 * x[..., 0])
+INSIDE = BOX.sample_prior(N, np.random.default_rng(0))
+
+
+def changed(row, value):
+    """The starting points with another point."""
+    points = INSIDE.copy()
+    points[row] = value
+    return points
+
+
 @pytest.mark.parametrize(
-    "settings",
+    ("log_prob", "start", "arguments", "message"),
     [
-        {"ess_ratio": 0.0},
-        {"ess_ratio": 1.0},
-        {"ess_ratio": np.nan},
-        {"ess_rule": "sometimes"},
-        {"ess_floor": N},
-        {"ess_floor": -1.0},
-        {"resampling": "wheel"},
-        {"min_moves": 0},
-        {"min_moves": 5, "max_moves": 4},
-        {"max_correlation": 0.0},
-        {"check_draws": -1},
-        {"fast_sweeps": -1},
-        {"fast_sweeps": 1.5},
+        (BOX, changed(7, 2.0), {}, "1 of 40 initial points lie outside the prior's support"),
+        (BOX, INSIDE[:-1], {}, "incompatible input dimensions"),
+        (BOX, np.ones((N, 2)), {}, "condition number"),
+        (BOX, changed(3, [np.nan, 0.5]), {}, "condition number"),
+        (Box([0, 0], [1, 1], lambda x: -np.inf), INSIDE, {}, "no point of the population has a finite log-likelihood"),
+        (BOX, INSIDE, {"thin_by": 0}, "thinning"),
+        (BOX, INSIDE, {"iterations": None}, "iterations"),
+        (lambda x: 0.0, INSIDE, {}, "log_prior_fn"),
+        (0.0, INSIDE, {}, "callable"),
+        (BOX.__call__, None, {"log_prior_fn": BOX.log_prior}, "sample_prior"),
+        (BOX, INSIDE, {"nwalkers": 3}, "at least 2 ndim walkers"),
     ],
-    ids=str,
 )
-def test_impossible_settings(settings):
-    with pytest.raises(ValueError, match=next(iter(settings)).replace("min_moves", "moves")):
-        SMCSampler(N, 3, Gaussian(), **settings)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [{"coefficient_of_variation": 0.0}, {"coefficient_of_variation": np.inf}, {"chains": "long"}, {"burn_in": -1}],
-)
-def test_impossible_settings_of_tmcmc(settings):
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        TMCMCSampler(N, 3, Gaussian(), **settings)
-
-
-def test_impossible_problems():
-    posterior = Gaussian()
-    with pytest.raises(ValueError, match="at least 2 ndim walkers"):
-        SMCSampler(5, 3, posterior)
-    with pytest.raises(ValueError, match="log_prior_fn"):
-        SMCSampler(N, 3, lambda x: 0.0)
-    with pytest.raises(ValueError, match="callable"):
-        SMCSampler(N, 3, 0.0, log_prior_fn=posterior.log_prior)
-    unsampled = SMCSampler(N, 3, posterior.__call__, log_prior_fn=posterior.log_prior)
-    with pytest.raises(ValueError, match="sample_prior"):
-        unsampled.run_mcmc(None, 1)
-    assert posterior.calls == 0
-
-
-def test_impossible_starts():
-    box = Box([0, 0], [1, 1], lambda x: 0.0 * x[..., 0])
-    inside = box.sample_prior(N, np.random.default_rng(0))
-    outside = inside.copy()
-    outside[7] = 2.0
-    nan = inside.copy()
-    nan[3, 0] = np.nan
-    for start, message in (
-        (outside, r"1 of 40 initial points lie outside the prior's support"),
-        (inside[:-1], "incompatible input dimensions"),
-        (np.ones((N, 2)), "condition number"),
-        (nan, "condition number"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            SMCSampler(N, 2, box).run_mcmc(start, 1)
-    with pytest.raises(ValueError, match="no point of the population has a finite log-likelihood"):
-        SMCSampler(N, 2, Box([0, 0], [1, 1], lambda x: -np.inf)).run_mcmc(inside, 1)
-    with pytest.raises(ValueError, match="iterations"):
-        next(SMCSampler(N, 2, box).sample(inside, iterations=None))
-    with pytest.raises(ValueError, match="thinning"):
-        SMCSampler(N, 2, box).run_mcmc(inside, 1, thin_by=0)
+def test_impossible_problems_and_starts(log_prob, start, arguments, message):
+    made = {name: arguments.pop(name) for name in ("nwalkers", "log_prior_fn") if name in (arguments := {**arguments})}
+    with pytest.raises(ValueError, match=message):
+        sampler = SMCSampler(made.pop("nwalkers", N), 2, log_prob, **made)
+        next(sampler.sample(start, **arguments))
 
 
 def test_a_chain_of_another_sampler_is_no_start():
@@ -420,18 +268,6 @@ def test_nan_counts_as_a_failure_and_is_reported():
     chain = sampler.get_chain(flat=True)
     assert chain[:, 0].min() >= 0.25
     assert np.all(np.isfinite(sampler.get_log_prob()))
-
-
-def test_nothing_is_evaluated_outside_the_prior():
-    seen = []
-
-    def log_likelihood(x):
-        seen.append(np.array(x))
-        return -50.0 * np.sum(x, axis=-1)  # piles up at the corner
-
-    annealed(Box([0, 0], [1, 1], log_likelihood))
-    seen = np.concatenate(seen)
-    assert seen.min() >= 0 and seen.max() <= 1
 
 
 def test_collapse_is_reported():
@@ -487,36 +323,7 @@ def test_moves_too_short_are_reported():
 # ---------------------------------------------------------------- reporting
 
 
-def test_to_arviz_writes_netcdf(tmp_path):
-    import json
-
-    import arviz
-
-    runs = [annealed(seed=s) for s in (1, 2)]
-    data = to_arviz(runs)
-    assert data["posterior"]["x2"].shape == (2, 3 * N)
-    in_order = np.sort(data["posterior"]["x2"][1])  # the draws are those of the chain, in another order
-    assert np.array_equal(in_order, np.sort(runs[1].get_chain(flat=True)[:, 2]))
-    data.to_netcdf(str(tmp_path / "run.nc"))
-    stored = arviz.from_netcdf(str(tmp_path / "run.nc"))["sample_stats"]
-    step, walker = (np.asarray(stored[name][0]) for name in ("step", "walker"))
-    assert np.array_equal(stored["lp"][0], runs[0].get_log_prob()[step, walker])
-    assert np.array_equal(data["posterior"]["x2"][0], runs[0].get_chain()[step, walker, 2])
-    assert np.allclose(stored.attrs["log_evidence"], [run.log_evidence for run in runs])
-    assert [row["beta"] for row in json.loads(stored.attrs["ladder"])[0]] == [s.beta for s in runs[0].ladder]
-    plain = emcee.EnsembleSampler(N, 3, Gaussian())
-    plain.run_mcmc(Gaussian().sample_prior(N, np.random.default_rng(0)), 2)
-    assert to_arviz(plain, parameter_names=["a", "b", "c"])["posterior"]["a"].shape == (1, 2 * N)
-    with pytest.raises(ValueError, match="one name per parameter"):
-        to_arviz(plain, parameter_names=["a"])
-
-
-def test_table_and_figures():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+def test_the_table_of_the_stages():
     sampler = annealed()
     table = ladder_table(sampler).splitlines()
     assert len(table) == len(sampler.ladder) + 4
@@ -524,27 +331,11 @@ def test_table_and_figures():
     assert f"{sampler.log_evidence_ladder:.3f}" in table[-2]
     assert f"{sampler.log_evidence_check.log_evidence:.3f}" in table[-2]
     assert table[-1] == sampler.verdict.summary
-    figure = plot_run(sampler)
-    assert len(figure.axes[1].lines[0].get_xdata()) == len(sampler.ladder)
-    plt.close("all")
-    with pytest.raises(ValueError, match="call run_mcmc first"):
-        plot_run(SMCSampler(N, 3, Gaussian()))
-
-
-def test_summary_with_weights():
-    values = np.array([[0.0, 1.0], [2.0, 1.0], [9.0, 1.0]])
-    result = summary(values, ["a", "b"], weights=[1, 1, 0])
-    assert np.array_equal(result.mean, [1, 1]) and np.array_equal(result.sd, [1, 0])
-    assert np.array_equal(result.cv, [1, 0])
-    assert str(result).splitlines()[1].split() == ["a", "1", "-", "1", "-", "1"]
-    for weights in ([1, 1], [0, 0, 0], [1, -1, 1]):
-        with pytest.raises(ValueError, match="weights"):
-            summary(values, weights=weights)
 
 
 def test_summary_with_errors_of_mean_and_standard_deviation():
     sampler = annealed()
-    result = summary(sampler.get_chain(flat=True), None, None, sampler.mean_error(), sampler.sd_error())
+    result = summary(sampler.get_chain(flat=True), None, sampler.mean_error(), sampler.sd_error())
     assert np.array_equal(result.mean_error, sampler.mean_error())
     assert np.array_equal(result.sd_error, sampler.sd_error())
     rows = str(result).splitlines()
@@ -558,37 +349,6 @@ def test_summary_with_errors_of_mean_and_standard_deviation():
     for name in ("mean_error", "sd_error"):
         with pytest.raises(ValueError, match=f"{name} must be 3"):
             summary(sampler.get_chain(flat=True), **{name: [0.1, 0.1]})
-
-
-def test_samplers_side_by_side():
-    posterior = Gaussian()
-    tmcmc = TMCMCSampler(N, 3, posterior, vectorize=True, seed=1)
-    tmcmc.run_mcmc(None, 4)
-    plain = emcee.EnsembleSampler(N, 3, posterior, vectorize=True)
-    plain.random_state = np.random.RandomState(1).get_state()
-    plain.run_mcmc(posterior.sample_prior(N, np.random.default_rng(0)), 600)
-    samplers = {"SMC": annealed(), "TMCMC": tmcmc, "emcee": plain}
-    table = comparison_table(samplers, seconds={"emcee": 12.5}, discard=100)
-    assert table.names == tuple(samplers)
-    assert table.evaluations == (samplers["SMC"].evaluations, tmcmc.evaluations, 600 * N)
-    assert 0 < table.seconds[0] == samplers["SMC"].seconds and table.seconds[2] == 12.5
-    assert sum(s.seconds for s in tmcmc.ladder) < tmcmc.seconds < 60
-    worst = (tmcmc.get_chain(flat=True).std(axis=0) / tmcmc.mean_error()).min() ** 2
-    assert table.effective_sample_size[1] == pytest.approx(worst)
-    assert N / 3 < worst < 8 * N
-    # the autocorrelation time of the stretch move in three dimensions is some 30 to 50 sweeps
-    assert 500 * N / 80 < table.effective_sample_size[2] < 500 * N / 15
-    assert table.log_evidence == (samplers["SMC"].log_evidence, tmcmc.log_evidence, None)
-    rows = str(table).splitlines()
-    assert len(rows) == 4 and len({len(row) for row in rows}) == 1
-    assert rows[3].split()[0] == "emcee" and rows[3].split()[-1] == "-"
-    assert str(comparison_table({"emcee": plain})).splitlines()[1].split()[2] == "-"
-    with pytest.raises(ValueError, match="seconds are given"):
-        comparison_table(samplers, seconds={"dynesty": 1.0})
-    again = SMCSampler(N, 3, posterior, backend=tmcmc.backend)
-    for nothing in (again, SMCSampler(N, 3, posterior)):
-        with pytest.raises(ValueError, match="has made no chain in this process"):
-            comparison_table({"nothing": nothing})
 
 
 def test_the_base_class_samples():

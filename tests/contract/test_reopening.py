@@ -118,15 +118,6 @@ def test_steps_are_added_after_the_last_stored_one(kind, tmp_path, whole_run):
 
 
 @pytest.mark.parametrize("kind", MARKED)
-def test_equal_calls_add_steps_too(kind, tmp_path, whole_run):
-    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
-    for _ in range(2):
-        reopened = make(kind, tmp_path / "run.h5", Counted())
-        reopened.run_mcmc(None, 2)
-    assert same(reopened, whole_run(kind, 2, 2, 2))
-
-
-@pytest.mark.parametrize("kind", MARKED)
 def test_a_loop_over_sample_adds_steps(kind, tmp_path, whole_run):
     begin(make(kind, tmp_path / "run.h5", Counted()), 2)
     reopened = make(kind, tmp_path / "run.h5", Counted())
@@ -240,17 +231,6 @@ def test_another_function_on_a_backend_in_memory_is_refused(kind):
     other = Sampler(N, NDIM, Counted(None, centre=0.3), backend=backend, **settings)
     with pytest.raises(ValueError, match="the backend in memory contains another run"):
         other.run_mcmc(None, 1)
-
-
-@pytest.mark.parametrize(("kind", "finished"), covering(list(KINDS), [True, False], strength=1))
-def test_reset_of_a_backend_with_another_number_of_walkers(kind, finished, tmp_path):
-    path = tmp_path / "run.h5"
-    begin(make(kind, path, Counted()), 3) if finished else interrupted(kind, path)
-    emcee.backends.HDFBackend(str(path)).reset(N + 4, NDIM)
-    Sampler, settings = KINDS[kind]
-    sampler = Sampler(N + 4, NDIM, Counted(), backend=emcee.backends.HDFBackend(str(path)), **settings)
-    sampler.run_mcmc(np.random.default_rng(1).standard_normal((N + 4, NDIM)), 2)
-    assert sampler.get_chain().shape == (2, N + 4, NDIM)
 
 
 # ---------------------------------------------------------------- the record makes the file again
@@ -373,42 +353,6 @@ def test_a_file_that_is_only_read(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ONE)
-def test_a_script_that_draws_its_start_goes_on(kind, tmp_path):
-    """``np.random.seed``, a sampler, a start from the global generator: the same start after a restart."""
-
-    def script(steps):
-        sampler = make(kind, tmp_path / "run.h5", Counted(), seed=42)
-        sampler.run_mcmc(np.random.standard_normal((N, NDIM)), max(0, steps - sampler.iteration))  # noqa: NPY002
-        return sampler
-
-    script(2)
-    np.random.seed(1)  # noqa: NPY002
-    again = script(5)
-    assert again.iteration == 5 and again.log_prob_fn.f.evaluated
-
-
-@pytest.mark.parametrize("kind", ONE)
-def test_the_same_draws_go_on_after_an_interrupt(kind, tmp_path, whole_run):
-    annealing = whole_run(kind, 0).evaluations
-    posterior = Counted(interrupt_at=annealing + int(2.5 * N))
-    sampler = make(kind, tmp_path / "run.h5", posterior)
-    with pytest.raises(KeyboardInterrupt):
-        begin(sampler, 4)
-    begin(sampler, 4 - sampler.iteration)  # the same cell
-    assert same(sampler, whole_run(kind, 4))
-
-
-@pytest.mark.parametrize("kind", ONE)
-def test_reset_of_a_reopened_run_goes_on(kind, tmp_path, whole_run):
-    whole = whole_run(kind, 2, 2)
-    begin(make(kind, tmp_path / "run.h5", Counted()), 2)
-    again = make(kind, tmp_path / "run.h5", Counted())
-    again.reset()
-    again.run_mcmc(None, 2)
-    assert np.array_equal(again.get_chain(), whole.get_chain()[2:])
-
-
-@pytest.mark.parametrize("kind", ONE)
 def test_a_negative_number_of_steps_is_refused(kind, tmp_path):
     sampler = begin(make(kind, tmp_path / "run.h5", Counted()), 3)
     for each in (sampler, make(kind, tmp_path / "run.h5", Counted())):
@@ -444,19 +388,3 @@ def test_a_run_with_other_bits_goes_on_from_its_population(kind, steps, tmp_path
     assert np.array_equal(again.random_state[1], first.random_state[1])
     again.run_mcmc(None, 2)
     assert again.iteration == steps + 2 and len(posterior.evaluated) <= 2 * N
-
-
-@pytest.mark.parametrize("Sampler", [SMCSampler, TMCMCSampler])
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"log_prior": None}, TypeError, "did you mean log_prior_fn"),
-        ({"pool": 4}, ValueError, "pool must be an object with a method map"),
-        ({"backend": "run.h5"}, ValueError, "backend must be a backend of emcee"),
-        ({"seed": 1.5}, ValueError, "seed must be a whole number"),
-    ],
-    ids=str,
-)
-def test_arguments_of_the_wrong_kind_are_named(Sampler, arguments, error, message):
-    with pytest.raises(error, match=message):
-        Sampler(N, NDIM, Counted(), **arguments)

@@ -42,14 +42,6 @@ def test_a_ball_is_refused_without_draws_of_the_prior(Sampler):
     assert posterior.calls == 0
 
 
-def test_states_with_log_prob_and_copies_are_tested():
-    posterior = Gaussian()
-    points = ball(posterior)
-    for start in (emcee.State(points, log_prob=posterior(points)), posterior.sample_prior(30, np.random)[[0, 1] * 30]):
-        with pytest.raises(ValueError, match="must consist of draws of the prior"):
-            SMCSampler(N, 3, posterior, vectorize=True, seed=1).run_mcmc(start, 1, skip_initial_state_check=True)
-
-
 @every
 def test_draws_pass_and_the_test_changes_no_run(Sampler, monkeypatch):
     posterior = Gaussian()
@@ -64,18 +56,6 @@ def test_draws_pass_and_the_test_changes_no_run(Sampler, monkeypatch):
     monkeypatch.setattr(Target, "check_start", lambda *args: None)
     for a, b in zip(tested, chain(), strict=True):
         assert np.array_equal(a, b)
-
-
-def test_a_prior_that_uses_the_global_generator():
-    """Its fresh draws leave the generator as it was."""
-    posterior = Gaussian()
-    posterior.sample_prior = lambda n, random: np.random.standard_normal((n, 3))  # noqa: NPY002
-    np.random.seed(5)  # noqa: NPY002
-    draws, expected = np.random.standard_normal((N, 3)), np.random.uniform()  # noqa: NPY002
-    np.random.seed(5)  # noqa: NPY002
-    np.random.standard_normal((N, 3))  # noqa: NPY002
-    SMCSampler(N, 3, posterior, vectorize=True, seed=1).run_mcmc(draws, 1)
-    assert np.random.uniform() == expected  # noqa: NPY002
 
 
 @pytest.mark.parametrize(
@@ -130,3 +110,15 @@ def test_control_a_start_that_is_not_of_the_prior_would_be_wrong(monkeypatch):
     sampler = SMCSampler(100, 3, posterior, vectorize=True, seed=1, check_draws=0)
     sampler.run_mcmc(ball(posterior, 100, 0.02), 1)
     assert sampler.log_evidence - posterior.log_evidence > 10.0 * sampler.log_evidence_error
+
+
+def test_a_prior_that_uses_the_global_generator():
+    """Its fresh draws leave the generator as it was."""
+    posterior = Gaussian()
+    posterior.sample_prior = lambda n, random: np.random.standard_normal((n, 3))  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    draws, expected = np.random.standard_normal((N, 3)), np.random.uniform()  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    np.random.standard_normal((N, 3))  # noqa: NPY002
+    SMCSampler(N, 3, posterior, vectorize=True, seed=1).run_mcmc(draws, 1)
+    assert np.random.uniform() == expected  # noqa: NPY002

@@ -23,9 +23,6 @@ from fe_likelihoods import (
     Varying,
     propagate,
 )
-from fe_likelihoods.events.scales import scales_of
-from fe_likelihoods.events.stored_posterior import describe
-from tests.events.hierarchy_problems import RIGHT, WRONG, problem, solve
 
 DATA = np.array([[0.7, -0.2], [1.4, 0.1], [1.0, 0.4], [1.5, -0.1]])  # measured (a, b) of four tests
 ERRORS = np.array([[0.04, 0.03], [0.03, 0.09]])  # their covariance
@@ -125,8 +122,6 @@ def test_common_parameter_has_one_value_in_all_tests():
     draws = hierarchy.draw_test("T1", 1)
     np.testing.assert_array_equal(draws["b"], hierarchy.samples[:, 2])
     assert abs(draws["a"].mean() - 1.4) < 0.15
-    with pytest.raises(ValueError, match="exact value of b.*draw_test"):
-        hierarchy.weights("T1")
 
 
 def test_logarithmic_scale_and_weighted_samples(rng):
@@ -157,21 +152,6 @@ def test_extreme_hyper_parameters_have_a_density(two):
     assert np.isfinite(found).all()
 
 
-def test_thinned_samples_give_nearly_the_same():
-    test = stored(DATA[0], ERRORS, 1500, 1)
-    few, all_of_them = (describe(test, ["a", "b"], scales_of(["linear", "linear"]), size) for size in (500, 1500))
-    assert len(few.points) == 500 and few.effective_sample_size == 500
-    np.testing.assert_allclose(few.points.mean(axis=0), all_of_them.points.mean(axis=0), atol=0.05)
-
-
-def test_scales_have_their_inverse_and_their_derivative(rng):
-    scales, points, h = scales_of(["log", "linear"]), 2.0 * rng.standard_normal((50, 2)), 1e-5
-    np.testing.assert_allclose(scales.to_scale(scales.from_scale(points)), points, atol=1e-12)
-    slope = (scales.from_scale(points + h) - scales.from_scale(points - h)) / (2.0 * h)
-    np.testing.assert_allclose(scales.log_jacobian(points), np.log(slope), atol=1e-8)
-    np.testing.assert_allclose(scales.first(1).from_scale(points[:, :1]), np.exp(points[:, :1]))
-
-
 def test_values_of_a_common_parameter_beyond_the_bounds_of_a_test_are_impossible(rng):
     prior = Prior({"a": normal(3.0), "b": Uniform(0.0, 1.0)})
     tests = {"T": StoredPosterior(np.column_stack([rng.standard_normal(300), rng.random(300)]), prior)}
@@ -181,16 +161,13 @@ def test_values_of_a_common_parameter_beyond_the_bounds_of_a_test_are_impossible
     assert not np.isnan(values).any()
 
 
-def test_weights_and_draws_of_a_test_are_its_shrunk_posterior(one, result, grid):
+def test_draws_of_a_test_are_its_shrunk_posterior(one, result, grid):
     assert result.checks.findings == ()
     mean, sd = grid.T
     conditional = 1.0 / (1.0 / 0.04 + 1.0 / sd**2)
     centers = conditional * (DATA[0, 0] / 0.04 + mean / sd**2)
     expected, spread = centers.mean(), np.sqrt(conditional.mean() + centers.var())
-    weights, samples = result.weights("T0"), one.tests["T0"].samples[:, 0]
-    assert weights.sum() == pytest.approx(1.0)
-    assert weights @ samples == pytest.approx(expected, abs=0.02)
-    assert np.sqrt(weights @ (samples - weights @ samples) ** 2) == pytest.approx(spread, rel=0.1)
+    samples = one.tests["T0"].samples[:, 0]
     draws = result.draw_test("T0", 1)["a"]
     assert draws.mean() == pytest.approx(expected, abs=4.0 * spread / 20.0)
     assert draws.std() == pytest.approx(spread, rel=0.15)
@@ -229,22 +206,6 @@ def test_draws_of_a_new_test_beyond_the_bounds_are_a_warning(rng):
 
 
 # ------------------------------------------------------------------ checks
-
-
-@pytest.mark.slow
-def test_stated_errors_are_those_of_other_samples():
-    """Standard errors from resampling against the scatter over independent stored samples."""
-    points = np.random.default_rng(1).normal([1.1, 0.3], [0.1, 0.05], (60, 2))
-    values, stated = [], []
-    for seed in range(10):
-        tests = {f"T{k}": stored(DATA[k, :1], ERRORS[:1, :1], 150, 100 * seed + k) for k in range(1)}
-        posterior = HierarchicalPosterior(tests, {"a": LINEAR})
-        values.append(posterior.log_marginals(points))
-        if seed < 4:
-            checks = Hierarchy(posterior, points).checks
-            stated += [each.error for each in checks.tests.values()]
-    scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)))
-    assert 0.5 < np.mean(stated) / scatter < 2.0
 
 
 def test_test_beside_the_population_is_a_warning(one):
@@ -288,23 +249,6 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
     weights = np.exp(change - change.max())
     shift = abs((weights @ points[:, 0] / weights.sum() - points[:, 0].mean()) / points[:, 0].std())
     assert (shift > 0.3) == is_named and (checks.mean_errors["mean_a"] > 0.2) == is_named
-
-
-# the seeds of problems of study `hierarchy_warnings` of docs/results.rst
-@pytest.mark.parametrize("seed", [328, 359, 415])
-def test_right_results_have_no_warning(seed):
-    """Weighted samples, a chain, many samples: the population is narrow, and the result right all the same."""
-    found = solve(problem(seed), seed)
-    assert found.error < RIGHT
-    assert min(each.effective_samples for each in found.checks.tests.values()) < 20
-    assert found.kinds == ()
-
-
-@pytest.mark.parametrize("seed", [366, 382, 401])
-def test_wrong_results_have_a_warning(seed):
-    found = solve(problem(seed), seed)
-    assert found.error > WRONG
-    assert found.kinds
 
 
 # ------------------------------------------------------------------ interface
@@ -352,7 +296,6 @@ def test_stored_posterior_refuses(arguments, message):
         ({"common": ["b"]}, "common must be a mapping"),
         ({"varying": {"c": LINEAR}}, "test 'T': the stored samples have no parameters c; they have a, b"),
         ({"varying": {"a": Varying(HalfNormal(1.0), HalfNormal(1.0))}}, "needs positive samples of a; use scale"),
-        ({"max_samples": 10}, "100 or more"),
     ],
 )
 def test_hierarchical_posterior_refuses(arguments, message, rng):
@@ -392,7 +335,7 @@ def test_hierarchy_refuses(one, grid):
 
 def test_unknown_tests_and_numbers_are_refused(result):
     with pytest.raises(ValueError, match="no test 'EQ9'; the tests are 'T0'"):
-        result.weights("EQ9")
+        result.draw_test("EQ9")
     with pytest.raises(ValueError, match="1 or more; got 0"):
         result.new_test(0)
 

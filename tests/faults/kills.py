@@ -1,9 +1,9 @@
 """Kills by signal 9, after which the same script is started again until it ends: ``python -m tests.faults.kills``.
 
 Most kills come at a chosen event of a forked process: before, within or after a write to the record or to the HDF5 file
-(whose writes go through a Python file), or in an evaluation. Pools, threads and the console command are killed at
-random times, with their workers. Chain, log-probabilities, blobs, counts, failures, ladder, evidence and verdict must
-be those of a run that was not killed, and no evaluation may be made again but those that were running.
+(whose writes go through a Python file), or in an evaluation. Pools and threads are killed at random times, with their
+workers. Chain, log-probabilities, blobs, counts, failures, ladder, evidence and verdict must be those of a run that was
+not killed, and no evaluation may be made again but those that were running.
 """
 
 import argparse
@@ -15,8 +15,6 @@ import pickle
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 import traceback
@@ -32,7 +30,7 @@ from tests.faults.resumable_run import BURN_IN, SAMPLERS, STEPS, WAYS, N, calls,
 
 AT_RANDOM_TIMES = ("pool", "threads")
 WORKERS = 2
-KINDS = (*SAMPLERS, *WAYS, "command")
+KINDS = (*SAMPLERS, *WAYS)
 COMPARED = 2  # points by which a new sampler compares its function with the record
 
 
@@ -224,54 +222,6 @@ def trial(kind, folder, whole, count, seconds, choose, number):
     return kills, ""
 
 
-# ---------------------------------------------------------------------- the console command
-
-
-def command_trial(folder, expected, seconds, choose, number):
-    """Kill ``fe-likelihoods run`` and start it again."""
-    kills = 0
-    for _ in range(number):
-        process = start_command(folder)
-        try:
-            process.wait(choose.uniform(0.3 * seconds, seconds))
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            kills += 1
-        process.communicate()
-    process = start_command(folder)
-    said = process.communicate()[0]
-    if process.returncode != 0:
-        return kills, f"stuck: {said[-1500:]}"
-    return kills, "" if chain_of(folder) == expected else "wrong: another chain"
-
-
-def start_command(folder):
-    """The command in a folder with its template."""
-    folder.mkdir(exist_ok=True)
-    if not (folder / "run.toml").exists():
-        from tests.command.test_command import OSCILLATOR
-        from tests.faults.command_data import write_data
-
-        write_data(folder)
-        (folder / "run.toml").write_text(OSCILLATOR)
-    code = "from fe_likelihoods.command.main import main; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "run", str(folder / "run.toml"), "--out", str(folder / "out")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-
-
-def chain_of(folder):
-    """Chain and ladder that the command has stored."""
-    with h5py.File(folder / "out" / "run.h5") as file:
-        group = file["mcmc"]
-        steps = group.attrs["iteration"]
-        return steps, group["chain"][:steps].tobytes(), group["log_prob"][:steps].tobytes()
-
-
 # ---------------------------------------------------------------------- the campaign
 
 
@@ -284,22 +234,10 @@ def kill(number, kinds=KINDS, seed=1, show=print):
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
     try:
         for kind in kinds:
-            if kind == "command":
-                start = time.perf_counter()
-                process = start_command(folder / "whole")
-                said = process.communicate()[0]  # also empties the pipe
-                assert process.returncode == 0, said
-                seconds = time.perf_counter() - start
-                whole, count = chain_of(folder / "whole"), 0
-            else:
-                whole, count, seconds = whole_outcomes(kind, folder / f"whole {kind}")
+            whole, count, seconds = whole_outcomes(kind, folder / f"whole {kind}")
             while counts[kind, "kills"] < number:
                 where = folder / "trial"
-                plan = choose.randint(1, 3)
-                if kind == "command":
-                    kills, wrong = command_trial(where, whole, seconds, choose, plan)
-                else:
-                    kills, wrong = trial(kind, where, whole, count, seconds, choose, plan)
+                kills, wrong = trial(kind, where, whole, count, seconds, choose, choose.randint(1, 3))
                 counts[kind, "kills"] += kills
                 counts[kind, "runs"] += 1
                 if wrong:

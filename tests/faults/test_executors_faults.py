@@ -5,7 +5,6 @@ import importlib.util
 import os
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import as_completed
 from pathlib import Path
@@ -14,9 +13,8 @@ import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.simulation import dask_executor, executors
+from fe_likelihoods.simulation import dask_executor
 from fe_likelihoods.simulation.executors import LocalPool
 from fe_likelihoods.simulation.model import simulate_batch
 from samplers import SMCSampler
@@ -28,12 +26,10 @@ from tests.faults.treacherous import (
     N_STEPS,
     DiesLoading,
     DiesOnce,
-    Gated,
     LoadsOnce,
     Treacherous,
     descendants,
     gone,
-    line,
     posterior_of,
 )
 
@@ -73,24 +69,6 @@ def theta(what, n=1):
 
 
 # workers that die ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_an_item_that_kills_its_worker_fails_alone(workers):
-    thetas = np.concatenate([theta(bad.FINE, 8), theta(bad.CRASHES), theta(bad.FINE, 8), theta(bad.LEAVES)])
-    with LocalPool(workers) as pool:
-        batch = simulate_batch(Treacherous(), thetas, pool)
-        fine = [row for row in range(18) if row not in (8, 17)]
-        np.testing.assert_array_equal(batch.response[fine], [line(thetas[row]) for row in fine])
-        assert np.isnan(batch.response[[8, 17]]).all()
-        assert [batch.reasons[row] for row in (8, 17)] == [
-            "the worker process died (signal 11)",
-            "the worker process ended with exit code 3",
-        ]
-        assert [batch.reasons[row] for row in fine] == [""] * 16
-        again = simulate_batch(Treacherous(), thetas[fine], pool)  # the pool still works
-        np.testing.assert_array_equal(again.response, batch.response[fine])
 
 
 def test_processes_may_die_while_they_load_the_function(tmp_path):
@@ -153,88 +131,6 @@ def _interrupts(item):
     return _Interrupt()
 
 
-class Cluster:
-    """A client of a cluster that has lost its workers, and the cluster: a map ends when it is asked for them."""
-
-    def __init__(self, restarts):
-        self.cluster, self.worker_spec, self.workers = self, {0: {}, 1: {}}, {1: {}}
-        self.restarts, self.asked, self.cancelled, self.ended = restarts, [], [], threading.Event()
-
-    def nthreads(self):
-        return dict.fromkeys(self.workers, 1)
-
-    def scale(self, n):
-        self.asked.append(n)
-        if self.restarts:
-            self.workers = dict.fromkeys(self.worker_spec)
-            self.ended.set()
-
-    def map(self, function, items, pure):
-        self.workers = {}
-        self.futures = [Waiting(function(item)) for item in items]
-        threading.Thread(target=self._end, daemon=True).start()
-        return self.futures
-
-    def _end(self):
-        assert self.ended.wait(10.0), "the map waits for ever"
-        for future in self.futures:
-            future.end("cancelled" if self.cancelled else "finished")
-
-    def gather(self, futures):
-        return [future.answer for future in futures]
-
-    def cancel(self, futures, force=False):
-        self.cancelled = futures
-        self.ended.set()
-
-
-class Waiting:
-    """A future of such a cluster."""
-
-    def __init__(self, answer):
-        self.answer, self.status, self.callbacks = answer, "pending", []
-
-    def add_done_callback(self, callback):
-        self.callbacks.append(callback)
-
-    def end(self, status):
-        self.status = status
-        for callback in self.callbacks:
-            callback(self)
-
-    def result(self):
-        raise OSError("cancelled")
-
-
-@pytest.mark.parametrize("restarts", [True, False])
-def test_a_map_never_waits_for_workers_that_dask_has_given_up(restarts, monkeypatch):
-    monkeypatch.setattr(dask_executor, "SECONDS_BETWEEN_CHECKS", 0.01)
-    monkeypatch.setattr(dask_executor, "LONGEST_WITHOUT_WORKER", 10.0 if restarts else 0.1)
-    monkeypatch.setattr(dask_executor, "wait_for_nanny", lambda: None)
-    client = Cluster(restarts)
-    pool = executors.DaskExecutor(client)
-    if restarts:
-        assert pool.map(lambda item: (item, ""), [1, 2, 3]) == [(1, ""), (2, ""), (3, "")]
-    else:
-        with pytest.raises(RuntimeError, match="the dask cluster has had no worker for 0.1 s: start workers"):
-            pool.map(lambda item: (item, ""), [1, 2, 3])
-        assert len(client.cancelled) == 3
-    assert client.asked == [2]  # once
-
-
-@pytest.mark.parametrize(("seconds", "asked"), [(0.0, [2, 2]), (60.0, [2])])
-def test_a_worker_that_dies_before_it_was_seen_again_is_started_once_more(seconds, asked, monkeypatch):
-    monkeypatch.setattr(dask_executor, "SECONDS_TO_RETURN", seconds)
-    cluster = Cluster(restarts=False)
-    cluster.workers = dict.fromkeys(cluster.worker_spec)
-    workers = dask_executor._Workers()
-    workers.start_lost(cluster)
-    cluster.workers = {}
-    for _ in range(2):
-        workers.start_lost(cluster)
-    assert cluster.asked == asked
-
-
 @pytest.mark.slow
 @needs("dask")
 @needs("distributed")
@@ -291,29 +187,6 @@ def test_dask_retries_and_gives_up_on_the_item_that_kills_its_worker_only(tmp_pa
         values = posterior(many)
         assert np.isneginf(values[3])
         np.testing.assert_array_equal(np.delete(values, 3), np.delete(expected, 3))
-        # points that are collected as they end
-        posterior = posterior_of(Gated(tmp_path), top=20.0, pool=client, cache=tmp_path / "cache.sqlite")
-        client.wait_for_workers(2)  # the killed one is replaced
-        with posterior.evaluation_queue() as queue:
-            assert queue.workers == 2
-            tickets, done = queue.submit(many), {}
-            while len(done) < len(many):
-                done.update(queue.collect())
-            np.testing.assert_array_equal([done[ticket] for ticket in tickets], values)
-            (long,) = queue.submit([[0.95, 0.1, 0.5]])
-            short = queue.submit(many[:3] * [1.0, 0.5, 1.0])
-            done = {}
-            while len(done) < 3:
-                done.update(queue.collect())
-            assert set(done) == set(short)
-            waiting = queue.submit([[0.96, 0.1, 0.5], [0.97, 0.1, 0.5], [0.98, 0.1, 0.5], [0.99, 0.1, 0.5]])
-        stored, key = posterior.likelihood.simulator.cache, posterior.likelihood.simulator.simulation_key
-        (tmp_path / "go").touch()  # the queue is closed: what runs is cached, what waits is cancelled
-        stop = time.monotonic() + 60.0
-        while not stored.are_stored(key, np.array([[0.95, 0.1]]))[0]:
-            assert time.monotonic() < stop
-            time.sleep(0.05)
-        assert posterior.likelihood.simulations < len(many) + 3 + 1 + len(waiting)
 
 
 @needs("mpi4py")
@@ -382,9 +255,8 @@ def third(**options):
     return posterior_of(FunctionModel(bad.third, NAMES, CHANNELS, DT, N_STEPS), **options)
 
 
-@pytest.mark.parametrize("pool", [None, pytest.param(2, marks=pytest.mark.slow)])
-def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
-    posterior = third(pool=pool)
+def test_sampler_with_nan_in_a_third_of_the_prior(seed):
+    posterior = third()
     sampler = SMCSampler(60, posterior.ndim, posterior, vectorize=True, seed=seed)
     sampler.run_mcmc(None, 2)
     assert np.isfinite(sampler.get_log_prob()).all()
@@ -398,52 +270,17 @@ def test_sampler_with_nan_in_a_third_of_the_prior(pool, seed):
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:emcee")  # emcee subtracts -inf from -inf
-@pytest.mark.parametrize("kind", ["smc", "emcee"])
-def test_too_many_failures_stop_the_run_and_keep_finished_simulations(kind, tmp_path, seed):
+def test_too_many_failures_stop_the_run_and_keep_finished_simulations(tmp_path, seed):
     """A third of the prior fails where 0.25 is allowed: the run stops with an error."""
+    for share in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match="max_failure_share must be in"):
+            third(max_failure_share=share)
     posterior = third(max_failure_share=0.25)
-    if kind == "smc":
-        backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-        sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed, backend=backend)
-        with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*allowed is 0.25"):
-            sampler.run_mcmc(None, 2)
-        assert sampler.evaluations >= 200
-    else:
-        sampler = emcee.EnsembleSampler(200, posterior.ndim, posterior, vectorize=True)
-        with pytest.raises(TooManyFailures, match=r"\d+ of \d+ simulations failed"):
-            sampler.run_mcmc(posterior.sample_prior(200, seed), 2)
+    backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
+    sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed, backend=backend)
+    with pytest.raises(RuntimeError, match=r"TooManyFailures: \d+ of \d+ simulations failed.*allowed is 0.25"):
+        sampler.run_mcmc(None, 2)
+    assert sampler.evaluations >= 200
     report = posterior.report()
     assert report["simulations"] >= 200
     assert report["failure_count"] == len(report["failures"]) > 0.25 * report["simulations"]
-    known = posterior.sample_prior(200, seed)
-    if kind == "emcee":  # cached points can still be evaluated
-        assert np.isfinite(posterior(known)).sum() == 200 - report["failure_count"]
-
-
-def test_allowed_share_of_failures_does_not_stop_the_run(seed):
-    posterior = third(max_failure_share=0.5)
-    for _ in range(3):
-        posterior(posterior.sample_prior(60, seed))
-    assert 0.2 < posterior.report()["failure_count"] / 60 < 0.5
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_invalid_share_is_refused(share):
-    with pytest.raises(ValueError, match="max_failure_share must be in"):
-        third(max_failure_share=share)
-
-
-@pytest.mark.slow
-def test_sampler_with_a_sandboxed_model_that_crashes_and_hangs(seed):
-    """Parts of the prior crash or hang: the run ends, and the report has both reasons."""
-    posterior = posterior_of(FunctionModel(bad.deadly, NAMES, CHANNELS, DT, N_STEPS, time_limit=0.3))
-    sampler = SMCSampler(
-        20, posterior.ndim, posterior, vectorize=True, seed=seed, check_draws=0, ess_ratio=0.2, max_moves=2
-    )
-    start = posterior.sample_prior(20, seed)
-    start[:2, 0] = 0.01, 0.03
-    sampler.run_mcmc(start, 1)
-    assert np.isfinite(sampler.get_log_prob()).all()
-    reasons = posterior.report()["failure_reasons"]
-    assert set(reasons) == {"the worker process died (signal 11)", "stopped at the time limit of 0.3 s"}
-    assert sum(reasons.values()) == posterior.report()["failure_count"]

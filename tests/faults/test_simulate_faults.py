@@ -25,9 +25,8 @@ import sys
 from fe_likelihoods import SimulationCache
 from tests.faults import cached_run, test_simulate_faults
 
-path, responses = sys.argv[1:]
 os.environ["SECONDS_PER_SIMULATION"] = "0.01"
-posterior = cached_run.make(SimulationCache(path, responses=bool(int(responses))))[1]
+posterior = cached_run.make(SimulationCache(sys.argv[1], responses=True))[1]
 posterior.likelihood.simulate(test_simulate_faults.requested())
 """
 
@@ -38,10 +37,9 @@ def requested():
     return np.column_stack([random.uniform(0.5, 1.5, 300), random.uniform(-0.1, 1.0, 300)])
 
 
-@pytest.mark.parametrize("responses", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
+def test_a_killed_program_has_stored_what_it_finished(tmp_path):
     path = tmp_path / "killed.sqlite"
-    command = [sys.executable, "-c", PROGRAM, str(path), str(int(responses))]
+    command = [sys.executable, "-c", PROGRAM, str(path)]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         watched = None
         while watched is None or watched.info().simulations < 20:
@@ -55,9 +53,9 @@ def test_a_killed_program_has_stored_what_it_finished(tmp_path, responses):
     assert 20 <= stored.simulations < 300
 
     thetas = requested()
-    whole = cached_run.make(SimulationCache(tmp_path / "whole.sqlite", responses=responses))[1].likelihood
+    whole = cached_run.make(SimulationCache(tmp_path / "whole.sqlite", responses=True))[1].likelihood
     expected = whole.simulate(thetas)
-    again = cached_run.make(SimulationCache(path, responses=responses))[1].likelihood
+    again = cached_run.make(SimulationCache(path, responses=True))[1].likelihood
     batch = again.simulate(thetas)
     np.testing.assert_array_equal(batch.response, expected.response)
     assert batch.reasons == expected.reasons
@@ -76,8 +74,7 @@ def guided(path, log):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [60, 120])
-def test_a_guide_that_is_killed_repeats_no_stored_simulation(tmp_path, stop):
+def test_a_guide_that_is_killed_repeats_no_stored_simulation(tmp_path, stop=120):
     """Started again from scratch: ``cache="path"`` has the responses, of short parts of the record as well.
 
     Only the few rows of every part are simulated again by which a new program verifies what is stored.

@@ -6,7 +6,7 @@ import pytest
 from samplers.judgement.checks import check_shares
 from samplers.proposals.mixture import Mixture, draw, invert_roots, log_density
 from samplers.tempering.anneal import check_population
-from samplers.tempering.mutation import MOST_POINTS, VisitedPoints
+from samplers.tempering.mutation import VisitedPoints
 from samplers.tempering.population import Population
 
 N, NDIM = 500, 3
@@ -46,13 +46,6 @@ def test_different_shares_are_reported(points, truth):
         assert doubt.severity == "care" and "a mode has been lost or has a wrong weight" in doubt.text
 
 
-def test_one_component_has_no_shares():
-    one = Mixture(np.ones(1), MEANS[:1], WIDE[:1], invert_roots(WIDE[:1]), 6.0)
-    random = np.random.RandomState(1)
-    drawn = draw(one, N, random)
-    assert check_shares(one, population(1.0, random).coords, np.arange(N), drawn, np.zeros(N)) == []
-
-
 class Modes:
     """Density of two modes with equal shares and a flat prior."""
 
@@ -86,14 +79,3 @@ def test_a_mode_that_only_earlier_points_show_is_reported(seen):
     assert bool(found) == seen
     truth = 1.5 * np.log(2.0 * np.pi) - (0.0 if seen else np.log(2.0))
     assert check.log_evidence == pytest.approx(truth, abs=0.15)
-
-
-def test_the_highest_points_are_kept():
-    random, density, visited = np.random.RandomState(3), Modes(), VisitedPoints()
-    visit(visited, density, np.full((3, NDIM), 60.0))
-    visit(visited, density, 4.0 * random.standard_normal((MOST_POINTS, NDIM)))
-    visit(visited, density, MEANS + 0.01)
-    coords, log_target = visited.at(1.0)
-    assert len(coords) == MOST_POINTS and np.all(np.isfinite(log_target))
-    assert np.sum(np.all(np.abs(coords - MEANS[0]) < 0.1, axis=1)) >= 1 and log_target.max() > np.log(0.5) - 0.01
-    assert np.all(visited.at(0.0)[1] == 0.0)

@@ -6,8 +6,6 @@ import pytest
 
 from samplers import SMCSampler, compare_models, ladder_table
 from samplers.estimates.genealogy import worst_effective_sample_size
-from samplers.judgement.clusters import find_clusters
-from samplers.judgement.verdict import Verdict
 from tests.statistics import analytic_posteriors as analytic
 
 
@@ -27,12 +25,6 @@ def sampler(two_modes):
     return run(two_modes, 400)
 
 
-def test_further_simulations_are_a_lower_bound():
-    """A run that was told of 76, 51 and 54 more needed 184."""
-    told = str(Verdict("not usable", ("the walkers are few",), 100.0, 76.0, 10.0, "the walkers"))
-    assert "At least about 76 more simulations are needed, possibly several times as many." in told
-
-
 def test_modes_have_their_shares_and_places(two_modes, sampler):
     modes = sampler.verdict.modes
     assert len(modes) == 2
@@ -49,20 +41,12 @@ def test_one_mode_stays_one(posterior):
     assert len(run(posterior).verdict.modes) == 1
 
 
-def test_walkers_that_agree_in_a_parameter_are_one_mode(rng):
-    chain = rng.standard_normal((2, 50, 3))
-    chain[:, :, 1] = 4.0
-    (mode,) = find_clusters(chain, np.arange(50))
-    assert mode.share == 1.0
-    assert mode.sd[1] == 0.0
-
-
 def test_sentence_and_what_it_is_made_of(sampler):
     found = sampler.verdict
     assert found.summary.startswith(f"{sampler.verdict.status.capitalize()}: 2 modes with shares 0.7")
     assert "no failed evaluations" in found.summary
-    values = [estimate.log_evidence for estimate in found.evidences]
-    assert values == [sampler.log_evidence_ladder, sampler.log_evidence_check.log_evidence]
+    assert f"by stages {sampler.log_evidence_ladder:.2f} +- " in found.summary
+    assert f", check {sampler.log_evidence_check.log_evidence:.2f} +- " in found.summary
     assert found.pareto_shape == sampler.log_evidence_check.pareto_shape
     assert len(found.unknown) == 1 and "another seed" in found.unknown[0]
     assert found.summary in ladder_table(sampler)
@@ -74,7 +58,7 @@ def test_without_check_and_from_a_file(two_modes, tmp_path):
     made = run(two_modes, 300, check_draws=0, backend=backend)
     sampler = SMCSampler(300, 4, two_modes, vectorize=True, backend=backend)
     found = sampler.verdict
-    assert [estimate.source for estimate in found.evidences] == ["stages"]
+    assert "check" not in found.summary
     assert found.pareto_shape is None
     np.testing.assert_array_equal(sampler.founders, made.founders)  # the file says which walkers are copies
     assert len(found.unknown) == 2

@@ -22,7 +22,7 @@ from fe_likelihoods.priors.distributions import HalfNormal, LogNormal, Truncated
 from fe_likelihoods.priors.priors import Prior
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.records import Record
-from fe_likelihoods.simulation.model import MisfitBatch, SimulationBatch, SimulationFailed, misfit_batch, simulate_batch
+from fe_likelihoods.simulation.model import SimulationBatch, SimulationFailed, misfit_batch, simulate_batch
 
 TRUTH = np.array([1.15, 0.8])
 SIGMA = np.array([0.05, 0.001])
@@ -108,12 +108,6 @@ class BatchPolynomial(Polynomial):
         self.runs += [tuple(theta) for theta in thetas]
         response[thetas[:, 0] == 3.0, 1, 5] = np.nan
         return SimulationBatch(response, ["said so" if theta[0] == 1.0 else "" for theta in thetas])
-
-
-class MisfitPolynomial(BatchPolynomial):
-    def misfit_batch(self, thetas, measured):
-        response, reasons = self.simulate_batch(thetas)
-        return MisfitBatch(((response - measured) ** 2).sum(axis=2), reasons)
 
 
 BAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 9.0)
@@ -453,11 +447,10 @@ def test_equal_structural_parameters_are_simulated_once():
 # batch methods --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [BatchPolynomial, MisfitPolynomial])
-def test_batch_methods_give_the_same_as_single_simulations(kind, rng):
+def test_batch_methods_give_the_same_as_single_simulations(rng):
     thetas = rng.normal(size=(6, 2))
     thetas[2, 0], thetas[4, 0] = 1.0, 3.0
-    model = kind()
+    model = BatchPolynomial()
     measured = np.ones((2, model.n_steps))
     single, batch = misfit_batch(Polynomial(), thetas, measured), misfit_batch(model, thetas, measured)
     np.testing.assert_array_equal(batch.misfit, single.misfit)
@@ -472,11 +465,10 @@ def test_batch_methods_give_the_same_as_single_simulations(kind, rng):
     assert response.reasons[4] == "the response of channel 'b' is not finite"
 
 
-@pytest.mark.parametrize("kind", [BatchPolynomial, MisfitPolynomial])
 @pytest.mark.parametrize("broken", ["raises", "shape"])
-def test_a_batch_that_fails_as_a_whole_is_run_row_by_row(kind, broken, caplog):
+def test_a_batch_that_fails_as_a_whole_is_run_row_by_row(broken, caplog):
     thetas = np.array([[0.5, 0.1], [1.0, 0.1], [0.6, 0.3]])
-    model = kind()
+    model = BatchPolynomial()
     model.broken = broken
     measured = np.ones((2, model.n_steps))
     with caplog.at_level(logging.WARNING):
@@ -487,7 +479,7 @@ def test_a_batch_that_fails_as_a_whole_is_run_row_by_row(kind, broken, caplog):
 
 
 def test_an_empty_batch():
-    for model in (Polynomial(), BatchPolynomial(), MisfitPolynomial()):
+    for model in (Polynomial(), BatchPolynomial()):
         assert simulate_batch(model, np.empty((0, 2))).response.shape == (0, 2, 8)
         assert misfit_batch(model, np.empty((0, 2)), np.ones((2, 8))).misfit.shape == (0, 2)
         assert model.runs == []

@@ -1,6 +1,5 @@
 """Models defined by a program: parameters and responses are exact, and failing programs are reported."""
 
-import functools
 import os
 import pickle
 import re
@@ -11,10 +10,10 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import ExecutableModel, SimulationFailed
+from fe_likelihoods.simulation import folder as folder_of_simulation
 from fe_likelihoods.simulation.label import ModelLabel
-from fe_likelihoods.simulation.local_pool import LocalPool
-from fe_likelihoods.simulation.model import simulate_batch, split_seconds
-from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line, posterior_of
+from fe_likelihoods.simulation.model import split_seconds
+from tests.faults.treacherous import CHANNELS, DT, N_STEPS, gone, line
 
 PROGRAM = Path(__file__).with_name("program.py")
 NAMES = ("offset", "slope")
@@ -97,13 +96,6 @@ def _read_everything(folder):
     return row
 
 
-def test_same_bits_on_two_processes():
-    thetas = np.random.default_rng(2).uniform(-1.0, 1.0, size=(6, 2))
-    with LocalPool(2) as pool:
-        batch = simulate_batch(model_of(), thetas, pool)
-    np.testing.assert_array_equal(batch.response, [line(theta) for theta in thetas])
-
-
 def test_runs_leave_no_files(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     model_of().simulate(THETA)
@@ -129,9 +121,9 @@ CASES = {
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_reason_and_duration_of_a_failure(what):
-    limits = {"time_limit": 0.5} if what == "hang" else {"max_output": 1_000_000}
-    reason, seconds = failure(model_of(what, **limits))
+def test_reason_and_duration_of_a_failure(what, monkeypatch):
+    monkeypatch.setattr(ExecutableModel, "max_output", 1_000_000)
+    reason, seconds = failure(model_of(what, **({"time_limit": 0.5} if what == "hang" else {})))
     assert reason.startswith(CASES[what])
     shortest = 0.5 if what == "hang" else 0.0  # the reason has three digits: 0.5003 s is written as 0.5
     assert shortest <= seconds < 60.0
@@ -148,46 +140,22 @@ def test_hanging_program_is_killed_with_its_children(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="NO /proc: background processes cannot be found")
-def test_processes_left_by_a_program_are_killed(tmp_path):
+def test_processes_left_by_a_program_are_killed(tmp_path, monkeypatch):
     """Also a process without an environment, whose parent has ended."""
-    model = model_of("leftovers", env={"FAMILY": str(tmp_path / "pids"), "PATH": os.environ["PATH"]})
-    np.testing.assert_array_equal(model.simulate(THETA), line(THETA))
+    monkeypatch.setenv("FAMILY", str(tmp_path / "pids"))
+    np.testing.assert_array_equal(model_of("leftovers").simulate(THETA), line(THETA))
     pids = family(tmp_path / "pids")
     assert len(pids) == 4
     assert gone(pids)
 
 
-# environment --------------------------------------------------------------------------------------------------------
-
-
-def test_a_program_has_the_stated_environment(monkeypatch):
-    monkeypatch.setenv("SEEN", "1")
-    show = [sys.executable, "-S", "-c", "import os; print(*sorted(os.environ))", "in.txt"]
-
-    def names(**options):
-        seen = []
-        model_of(command=show, output=functools.partial(_names, seen), version="1", **options).simulate(THETA)
-        return {name for name in seen if name != "LC_CTYPE"}
-
-    assert names() >= {"SEEN", "PATH"}
-    assert names(env={"LICENCE": "1"}) == {"LICENCE"}
-    assert names(env={}) == set()
-    prints = [model_of(env=env).fingerprint for env in (None, {}, {"A": "1", "B": "2"}, {"A": "2", "B": "2"})]
-    assert len(set(prints)) == 4
-    assert model_of(env={"B": "2", "A": "1"}).fingerprint == prints[2]
-    monkeypatch.setenv("SEEN", "2")
-    assert model_of().fingerprint == prints[0]
-
-
-def _names(seen, folder):
-    seen += (folder.parent / "stdout.txt").read_text().split()
-    return line(THETA)
-
-
-def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path):
-    model = model_of("fail", keep_failures=tmp_path / "kept", max_kept=2)
+def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder_of_simulation, "_MOST_KEPT", 2)
+    monkeypatch.setenv(folder_of_simulation.KEEP, str(tmp_path / "kept"))
+    model_of().simulate(THETA)
+    assert not (tmp_path / "kept").exists()
     for _ in range(3):
-        failure(model)
+        failure(model_of("fail"))
     kept = list((tmp_path / "kept").iterdir())
     assert len(kept) == 2
     for folder in kept:
@@ -195,17 +163,6 @@ def test_folders_of_failed_runs_are_kept_up_to_a_limit(tmp_path):
         assert "matrix is singular" in (folder / "stderr.txt").read_text()
         assert "matrix is singular" in (folder / "reason.txt").read_text()
         assert f"slope = {float(THETA[1])!r}" in (folder / "reason.txt").read_text()
-    good = model_of(keep_failures=tmp_path / "none")
-    good.simulate(THETA)
-    assert not (tmp_path / "none").exists()
-
-
-def test_failures_are_counted_by_the_posterior():
-    posterior = posterior_of(model_of("fail"))
-    assert np.isneginf(posterior([0.3, 0.1, 0.5]))
-    report = posterior.report()
-    assert report["failure_reasons"] == {CASES["fail"]: 1}
-    assert report["failures"][0]["seconds"] > 0.0
 
 
 # settings and fingerprint -------------------------------------------------------------------------------------------
@@ -220,8 +177,6 @@ def test_failures_are_counted_by_the_posterior():
         ({"command": []}, "command must be a list"),
         ({"time_limit": 0.0}, "time_limit must be a positive number of seconds"),
         ({"time_limit": None}, "time_limit"),
-        ({"max_output": 0}, "max_output must be a positive number of bytes"),
-        ({"max_kept": -1}, "max_kept must be"),
         ({"templates": {"in.txt": "$offset $slope $damping"}}, "template in.txt has placeholders for damping"),
         ({"templates": {"in.txt": "$offset"}}, "has a placeholder for slope"),
         ({"templates": {"in.txt": "$offset $slope costs 5 $"}}, "starts no placeholder"),
@@ -231,9 +186,6 @@ def test_failures_are_counted_by_the_posterior():
         ({"files": {"in.txt": PROGRAM}}, "in.txt is more than one of a template, a file"),
         ({"output": 3}, "output must be a file name or a function"),
         ({"columns": [0, 1]}, "one column, 0 or more, for each of the 1 channels"),
-        ({"env": ["PATH"]}, "env must be a mapping of names to values"),
-        ({"env": {"A": 1}}, "env must map names without '=' to values, both str; got 'A': 1"),
-        ({"env": {"A=B": "1"}}, "env must map"),
     ],
     ids=str,
 )
@@ -255,22 +207,19 @@ def test_fingerprint_and_label_depend_on_everything_that_is_run(tmp_path):
         return model.fingerprint, ModelLabel(model).code
 
     first = fingerprint()
-    assert first == fingerprint() == fingerprint(time_limit=1.0, keep_failures=tmp_path)
+    assert first == fingerprint() == fingerprint(time_limit=1.0)
     prints = {
         first,
         fingerprint(command=[str(script), "-y"]),
         fingerprint(output="other.txt"),
         fingerprint(version="2"),
     }
-    prints |= {fingerprint(columns=[2]), fingerprint(output=_read_everything), fingerprint(hash_executable=False)}
+    prints |= {fingerprint(columns=[2]), fingerprint(output=_read_everything)}
     for path, text in ((script, "#!/bin/sh\necho 2\n"), (template, "$slope $offset"), (data, "2")):
         path.write_text(text)
         prints.add(fingerprint())
-    assert len(prints) == 10
+    assert len(prints) == 9
     assert len({declared for declared, _ in prints}) == 5  # output, version, columns, function
-    unhashed = fingerprint(hash_executable=False)
-    script.write_text("#!/bin/sh\necho 3\n")
-    assert fingerprint(hash_executable=False) == unhashed
 
 
 def test_a_pickled_copy_gives_the_same_response():

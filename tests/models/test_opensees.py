@@ -187,10 +187,6 @@ class Held:
         self.advance(1, HARD_DT)
 
 
-def prints(ops, sample):
-    print(sample, ops.analyze(1, HARD_DT))
-
-
 def says_so_and_goes_on(ops, sample):
     if ops.analyze(1, HARD_DT) != 0:
         print("step", sample, "failed")
@@ -221,16 +217,6 @@ def in_one_call(ops, theta):
     prepare(ops, int(theta[0]))
     ops.analyze(HARD_N, HARD_DT)
     return np.full((1, HARD_N), ops.nodeDisp(2, 1))
-
-
-def while_it_converges(ops, theta):
-    prepare(ops, int(theta[0]))
-    response, code, sample = np.zeros((1, HARD_N)), 0, 0
-    while code == 0 and sample < HARD_N:
-        code = ops.analyze(1, HARD_DT)
-        response[0, sample] = ops.nodeDisp(2, 1)
-        sample += 1
-    return response
 
 
 def collects(ops, theta):
@@ -280,7 +266,6 @@ def pushed_after_gravity(ops, theta):
 
 UNHANDLED = {
     "ignores": (step_by_step(ignores), "returned -3 at call 1 of 100 and the script did not look at it"),
-    "prints": (step_by_step(prints), "returned -3 at call 1 of 100 and the script did not look at it"),
     "imports": (step_by_step(imports), "returned -3 at call 1 of 100 and the script did not look at it"),
     "in one call": (in_one_call, "returned -3 at call 1 of 1 and the script did not look at it"),
     "says so and goes on": (
@@ -288,7 +273,6 @@ UNHANDLED = {
         "returned -3 at call 100 of 100 and the script ended there",
     ),
     "breaks": (step_by_step(breaks), "returned -3 at call 1 of 1 and the script ended there"),
-    "while it converges": (while_it_converges, "returned -3 at call 1 of 1 and the script ended there"),
     "gravity": (pushed_after_gravity, "returned -3 at call 1 of 101 and the script went on with ops.loadConst"),
 }
 HANDLED = {"repeats": step_by_step(repeats), "in turn": step_by_step(tries_in_turn), "collects": collects}

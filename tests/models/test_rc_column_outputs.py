@@ -258,10 +258,6 @@ def test_sensors_are_data_and_predictions(shaken, rng):
     sigmas = truth.values.std(axis=1) * 0.05
     at_truth, elsewhere = (likelihood(np.append(theta, sigmas)) for theta in (np.ones(5), thetas[0]))
     assert at_truth > elsewhere + 1.0
-    np.testing.assert_allclose(
-        measured.misfit_batch(thetas, truth.values).misfit,
-        np.square(measured.simulate_batch(thetas).response - truth.values).sum(axis=2),
-    )
 
 
 def test_sensors_are_read_from_a_table_with_their_units(shaken, tmp_path):

@@ -190,9 +190,6 @@ class Batch:
         rows = [wave(theta) if ok else np.full((2, 60), np.nan) for theta, ok in zip(thetas, good, strict=True)]
         return SimulationBatch(np.array(rows), ["" if ok else "too fast" for ok in good])
 
-    def misfit_batch(self, thetas, measured):
-        raise AssertionError("called with measurements that have gaps")
-
 
 @pytest.mark.parametrize("noise", [GaussianNoise, AutoregressiveNoise])
 @pytest.mark.parametrize("own", [False, True])
@@ -391,13 +388,13 @@ def test_errors_and_coverage_are_over_the_samples_that_are_there(rng):
         math.sqrt(np.square((m - y)[one]).sum() / np.square(y[one]).sum())
         for m, y, one in zip(prediction.mean, data.values, there, strict=True)
     ]
-    np.testing.assert_allclose(prediction.rrmse(data), expected)
+    np.testing.assert_allclose(prediction.score(data).rrmse, expected)
     np.testing.assert_allclose(rrmse(prediction.mean, data.values), expected)
     low, high = prediction.quantile(0.05), prediction.quantile(0.95)
     inside = [((a <= y) & (y <= b))[one].mean() for a, b, y, one in zip(low, high, data.values, there, strict=True)]
-    np.testing.assert_allclose(prediction.coverage(data), inside)
-    with pytest.raises(ValueError, match="channels top have no sample in this part"):
-        prediction.coverage(data, part=slice(0, 4))
+    np.testing.assert_allclose(prediction.score(data).coverage, inside)
+    with pytest.raises(ValueError, match="'top' is zero at all samples"):
+        prediction.score(data, part=slice(0, 4))
     assert len(plot_bands(prediction, data).axes) == len(plot_histories(data).axes) == 2
     scales = GaussianNoise(data.channels, groups="all").with_measurements(data).scales
     assert scales[0] == pytest.approx(math.sqrt(np.square(data.values[0][there[0]]).mean()))

@@ -104,7 +104,7 @@ def test_draws_have_the_stated_standard_deviations_whatever_the_batch_and_the_ch
     samples = np.tile([1.0, 1.0, 0.3, 0.2], (400, 1)) * np.linspace(0.99, 1.01, 400)[:, None]
     options = {"noise": True, "seed": 3, "progress": False}
     whole = propagate(posterior, samples, **options)
-    one = propagate(posterior, samples, quantity="displacement", batch=7, **options)
+    one = propagate(posterior, samples, quantity="displacement", **options)
     np.testing.assert_allclose(one.quantiles[:, 0], whole.quantiles[:, 1], rtol=1e-9)
     np.testing.assert_allclose(one.variance[0], whole.variance[1], rtol=1e-9)
     spread = (whole.quantile(0.95) - whole.quantile(0.05)) / (2.0 * 1.6449 * whole.sd)

@@ -45,19 +45,6 @@ def test_pauses_of_the_calibration_are_no_gap_of_another_record():
     assert found.findings == ()
 
 
-@pytest.mark.parametrize(("missing", "n_told"), [(slice(None), 0), (slice(200, 300), 1)], ids=["whole", "gap"])
-@pytest.mark.parametrize("event", [0, 1, 2])
-def test_an_event_without_a_channel_is_no_gap(event, missing, n_told):
-    """Each event has its own mean square; samples that are missing within one are still told."""
-    events = Events([quake(1), quake(2), quake(3)], rest=10.0)
-    model = LinearOscillator(events)
-    values = model.simulate([1.0, 1.0])
-    there = events.windows[event].samples
-    values[0, np.arange(values.shape[1])[there][missing]] = np.nan
-    found = check_gaps(FELikelihood(model, Measurements(model.channels, DT, values), noise_for(model)).noise)
-    assert len(found) == n_told and all(model.channels[0].name in each.text for each in found)
-
-
 @pytest.mark.parametrize("of_events", [False, True])
 def test_a_gap_of_the_calibration_is_a_finding_of_every_prediction_with_noise(of_events):
     likelihood = with_gap()
@@ -67,10 +54,6 @@ def test_a_gap_of_the_calibration_is_a_finding_of_every_prediction_with_noise(of
     assert found[0].findings == found[1].findings == tuple(check_gaps(likelihood.noise))
     assert "CAUTION: Gaps in the data" in str(found[0])
     assert propagate(likelihood, SAMPLES, record=record, **OPTIONS | {"noise": False}).findings == ()
-
-
-def test_the_envelope_alone_has_no_finding_on_gaps():
-    assert propagate(with_gap(local=1.0), SAMPLES, record=quake(3), **OPTIONS).findings == ()
 
 
 @pytest.mark.parametrize(
@@ -90,9 +73,3 @@ def test_a_motion_without_levels_is_refused_before_it_is_simulated(record, told,
         propagate(likelihood, SAMPLES, record=record, **OPTIONS)
     with pytest.raises(ValueError, match=told):
         noise.under(LinearOscillator(record))
-
-
-def test_an_event_as_long_as_the_window_has_a_level_of_its_own():
-    events = Events([quake(3), quake(4, WINDOW), quake(5)], rest=3.0)
-    of_parts = noise_for(LinearOscillator(quake(1))).under(LinearOscillator(events)).of_parts
-    assert {1, 3, 5} <= set(of_parts)

@@ -85,14 +85,6 @@ def test_an_energy_has_its_own_name_dimension_and_unit():
         exceedance(work, 2.0, unit="kip")
 
 
-def test_energy_per_volume_of_a_stress_has_the_dimension_of_a_stress():
-    strain = np.array([0.0, 0.01, -0.01])
-    stress = Channel("sigma", "stress", "MPa")
-    energy = dissipated_energy("sigma", strain)
-    assert energy.described(stress) == Channel("energy of sigma", "stress", "MPa")
-    assert measured_quantity(energy, Measurements([stress], 1.0, [[0.0, 2e6, 4e6]])) == pytest.approx(1e4 - 6e4)
-
-
 def test_white_noise_adds_its_mean_square_to_the_arias_intensity_and_nothing_to_the_work():
     sigma = (2.0, 5e4, 1e-9)
     prior = {"gain": TruncatedNormal(1.0, 0.1)} | {f"sigma_{c.name}": HalfNormal(1.0) for c in CHANNELS}

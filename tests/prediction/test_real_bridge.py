@@ -20,7 +20,7 @@ from fe_likelihoods import (
     peak,
     read_record,
 )
-from fe_likelihoods.prediction.new_event import _event, _ratios
+from fe_likelihoods.prediction.new_event import _event, event_ratios
 from fe_likelihoods.prediction.quantities import arias_intensity
 from fe_likelihoods.priors.between_events import BETWEEN_EVENTS
 
@@ -72,10 +72,10 @@ def predicted(likelihoods, thetas, size, subsets):
         order = np.random.default_rng([size, seed]).permutation(len(likelihoods))
         at = dict(zip(NAMES, np.exp(thetas[order[:size]].mean(axis=0)), strict=True))
         known = {f"{k}": likelihoods[k] for k in order[:size]}
-        ratios, remainder = _ratios(at, known, numbers, BETWEEN_EVENTS, 6.0)
+        ratios = event_ratios(at, known, numbers)
         for k in order[size:]:
             ratio, level, variance, _ = _event(likelihoods[k], at, numbers, BETWEEN_EVENTS)
-            own = replace(ratios, new_sd=np.sqrt(variance + remainder))
+            own = replace(ratios, new_sd=np.sqrt(variance + ratios.remainder))
             for name, each in (("expected", own), ("0.12", EventRatios(ratios.values))):
                 ends = each.quantile(0.95, level) / each.quantile(0.05, level)
                 found[name].append([1.0 - each.probability_above(ratio, np.log(level)), ends])

@@ -23,9 +23,6 @@ def test_exceedance_of_a_gaussian(rng):
     k = int(round(result.probability[2] * 4000))
     interval = stats.binomtest(k, 4000).proportion_ci(0.95, method="exact")
     assert np.allclose((result.lower[2], result.upper[2]), interval, rtol=1e-6)
-    quarter = exceedance(values, limits, effective_sample_size=1000)
-    assert np.allclose(quarter.standard_error, 2.0 * result.standard_error)
-    assert np.all(quarter.upper - quarter.lower > 1.5 * (result.upper - result.lower))
 
 
 def test_none_and_all_of_the_samples_have_a_bound():

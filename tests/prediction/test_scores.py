@@ -58,31 +58,6 @@ def test_interval_score_by_hand():
         interval_score(1.0, 3.0, 2.0, 90)
 
 
-def test_scores_are_proper_and_coverage_is_not(rng):
-    """The true distribution has the smallest expected score; a band ten times too wide has the largest coverage."""
-    y = rng.normal(size=20_000)
-    half = stats.norm.ppf(0.95)
-
-    def scores(mean, sd):
-        band = mean - half * sd, mean + half * sd
-        return crps_normal(mean, sd, y), interval_score(*band, y, 0.9)
-
-    truth = scores(0.0, 1.0)
-    for wrong in ((0.3, 1.0), (0.0, 0.6), (0.0, 1.6), (0.0, 10.0)):
-        for right, other in zip(truth, scores(*wrong), strict=True):
-            difference = other - right
-            assert difference.mean() > 4.0 * difference.std() / np.sqrt(len(y)), wrong
-    assert np.mean(np.abs(y) < 10.0 * half) > np.mean(np.abs(y) < half) + 0.05
-
-
-def test_crps_of_samples_is_proper(rng):
-    y = rng.gumbel(size=4000)
-    right = crps_samples(rng.gumbel(size=(50, 4000)), y)
-    for wrong in (rng.gumbel(0.4, size=(50, 4000)), rng.gumbel(scale=2.0, size=(50, 4000)), np.full((50, 4000), 0.6)):
-        difference = crps_samples(wrong, y) - right
-        assert difference.mean() > 4.0 * difference.std() / np.sqrt(len(y))
-
-
 def test_pit_of_samples_is_uniform_for_the_true_distribution_alone(rng):
     pit = pit_samples(rng.normal(size=(99, 3000)), rng.normal(size=3000))
     assert stats.kstest(pit, "uniform").pvalue > 1e-3
@@ -93,28 +68,11 @@ def test_pit_of_samples_is_uniform_for_the_true_distribution_alone(rng):
     assert 0.0 < pit_samples([[1.0], [2.0]], [9.0])[0] < 1.0
 
 
-def test_missing_values_have_no_score():
-    observed = np.array([np.nan, 1.0])
-    for scores in (
-        crps_normal(0.0, 1.0, observed),
-        interval_score(-1.0, 1.0, observed, 0.9),
-        pit_normal(0.0, 1.0, observed),
-        pit_samples(np.zeros((3, 2)), observed),
-        crps_samples(np.zeros((3, 2)), observed),
-    ):
-        assert np.isnan(scores[0]) and np.isfinite(scores[1])
-
-
 def test_what_is_no_distribution_or_interval_is_refused():
-    with pytest.raises(ValueError, match="2 of 3 are above: exchange them"):
+    with pytest.raises(ValueError, match="2 are above: exchange them"):
         interval_score([1.0, 1.0, np.nan], [-1.0, 0.5, 2.0], 0.0, 0.9)
-    for score in (crps_normal, pit_normal):
-        with pytest.raises(ValueError, match=r"zero or more; the smallest is -1\.0"):
-            score(0.0, [1.0, -1.0, np.nan], 0.3)
     np.testing.assert_array_equal(pit_samples([[1.0, 1.0], [np.nan, 2.0]], [2.0, 1.5]), [np.nan, 0.5])
     assert np.isnan(crps_samples([1.0, np.nan, 3.0], 2.0))
-    with pytest.raises(ValueError, match="must be above 1"):
-        crps_samples([1.0, 2.0], 1.0, effective_sample_size=1.0)
 
 
 def test_crps_of_copies_is_unbiased_for_the_effective_sample_size(rng):
@@ -144,8 +102,6 @@ def test_share_within_leaves_missing_values_out_and_refuses_others():
     for bad in ([], [np.nan], [1.2]):
         with pytest.raises(ValueError, match="PIT values between 0 and 1"):
             share_within(bad, 0.9)
-    with pytest.raises(ValueError, match="samples \\(n, ...\\)"):
-        pit_samples([[1.0, 2.0]], [1.0, 2.0])
 
 
 def test_envelope_and_strong_part():
@@ -197,8 +153,7 @@ def test_scores_of_histories_are_averages_over_the_measured_samples(oscillator, 
         assert scores.crps[k] == pytest.approx(crps_normal(mean, sd, y).mean(), rel=1e-12)
         assert scores.interval_score[k] == pytest.approx(interval_score(lower, upper, y, 0.9).mean(), rel=1e-12)
         assert scores.pit[k].sum() == pytest.approx(1.0)
-    np.testing.assert_array_equal(scores.coverage, prediction.coverage(measured))
-    np.testing.assert_allclose(scores.rrmse, prediction.rrmse(measured), rtol=1e-12)
+        assert scores.coverage[k] == np.mean((lower <= y) & (y <= upper))
     assert str(scores).splitlines()[1].split()[:2] == ["acceleration", oscillator.channels[0].unit]
 
 
@@ -268,30 +223,24 @@ def test_what_cannot_be_scored_is_refused(oscillator, rng):
         final_value("displacement", 0)
 
 
-def test_samples_at_rest_are_left_out_of_the_pit(rng):
-    """A windowed share of the response predicts no noise before the motion: the score counts and names such samples."""
+def test_a_certain_prediction_that_is_wrong_is_at_the_ends_of_the_pit(rng):
+    """A windowed share of the response predicts no noise before the motion; sensor noise belongs to such a model."""
     n = 600
     shape = np.where(np.arange(n) < 200, 0.0, np.sin(0.3 * np.arange(n)))
     model = FunctionModel(lambda theta: [theta[0] * shape, theta[0] * np.cos(0.3 * np.arange(n))], ["a"], PAIR, 0.02, n)
     values = model.simulate([1.0]) + np.array([[1e-3], [0.3]]) * rng.normal(size=(2, n))
     measured = Measurements(PAIR, 0.02, values)
     prior = {"a": TruncatedNormal(1.0, 0.3), "share_top": HalfNormal(0.5), "share_base": HalfNormal(0.5)}
-    rows = np.tile([1.0, 0.3, 0.3], (100, 1))
 
-    def predicted(**options):
+    def ends(**options):
         noise = GaussianNoise(measured.channels, level="measured", window=0.1, **options)
-        return propagate(
-            Posterior(FELikelihood(model, measured, noise), prior), rows, noise=True, seed=1, progress=False
-        )
+        posterior = Posterior(FELikelihood(model, measured, noise), prior)
+        rows = np.tile([1.0, 0.3, 0.3], (100, 1))
+        scores = propagate(posterior, rows, noise=True, seed=1, progress=False).score(measured)
+        assert np.isfinite(scores.crps).all() and scores.pit.sum(axis=1) == pytest.approx(1.0)
+        return scores.pit[0, [0, -1]].sum()
 
-    with pytest.warns(UserWarning, match=r"is zero: top \(198 of 600\)\. .*sensor="):
-        scores = predicted().score(measured)
-    assert scores.without_spread.tolist() == [198, 0] and str(scores).endswith("is zero: 198 of top")
-    assert np.isfinite(scores.crps).all()
-    np.testing.assert_allclose(scores.pit.sum(axis=1), 1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert not predicted(sensor={"top": 1e-3}).score(measured).without_spread.any()
+    assert ends() >= 0.33 and ends(sensor={"top": 1e-3}) < 0.25
 
 
 def test_few_samples_are_refused_or_warned_of(oscillator, rng):
@@ -331,9 +280,7 @@ def test_channels_with_steps_of_their_own_are_scored_at_their_samples(oscillator
     prediction = propagate(
         posterior_of(oscillator, noisy(oscillator, rng, SIGMA)[1]), samples(50), quantity="displacement", progress=False
     )
-    with pytest.warns(UserWarning, match=r"noise=True"):  # equal samples without noise
-        scores = prediction.score(coarse)
-    assert scores.without_spread.tolist() == [25] and np.isnan(scores.pit[0]).all()
+    scores = prediction.score(coarse)
     assert scores.samples.tolist() == [25] and scores.rrmse[0] < 1e-9
 
 
@@ -355,4 +302,3 @@ def test_a_rough_band_is_scored_between_its_samples():
     lower, upper = np.minimum(*ends), np.maximum(*ends)
     expected = ((lower <= fine) & (fine <= upper)).mean(axis=1)
     np.testing.assert_allclose(scores.coverage, expected)
-    np.testing.assert_allclose(found.coverage(measured), expected)

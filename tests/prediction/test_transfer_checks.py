@@ -31,7 +31,6 @@ from fe_likelihoods import (
 
 TOP = Channel("top", "displacement", "mm")
 N, DT, SIGMA = 600, 0.02, 0.004
-SEEDS = 100
 
 
 class Filter:
@@ -190,29 +189,6 @@ def test_a_harmonic_is_said_and_another_broad_motion_is_not(rng):
         Record("still", 0.02, np.zeros(400)),
     ):
         assert about_harmonics(other) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("strength", "least", "most"), [(1.0, 0, 3), (3.0, 90, 100)])
-def test_peaks_are_named_in_few_of_100_runs_that_are_right_and_in_most_of_stronger_ones(strength, least, most):
-    named = 0
-    for seed in range(SEEDS):
-        rng = np.random.default_rng([7, seed])
-        posterior, samples = calibrated(rng, n=50)
-        named += bool(said(propagate, posterior, samples, record=excitation(rng, strength), noise=True, seed=seed))
-    assert least <= named <= most
-
-
-def test_the_prediction_keeps_what_was_said(rng):
-    posterior, samples = calibrated(rng)
-    options = {"record": excitation(rng, 0.1), "quantity": {"a": None, "b": peak("top")}, "noise": True}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = propagate(posterior, samples, **options, progress=False)
-    assert all(each.filename == __file__ for each in caught)
-    (kept,) = found["a"].findings
-    assert found["b"].findings == (kept,) and [str(each.message) for each in caught] == [kept.message]
-    assert kept.kind == "Beyond the calibrated amplitude" and 0.0 < kept.numbers["top"] < 0.5
 
 
 def test_a_motion_that_is_read_is_compared_by_one_simulation_that_is_counted(rng):

@@ -52,14 +52,6 @@ def test_a_mode_is_found_from_points_on_its_flank(rng, n, nearest):
         assert np.allclose(scale, np.sqrt(1.2) * NARROW, rtol=1e-2)
 
 
-def test_two_points_are_the_centre_of_a_component(rng):
-    coords = np.concatenate([cloud(rng), flank(rng, 2)])
-    mixture = fit_mixture(coords[:400], uniform(coords[:400]))
-    covered = cover_basins(mixture, coords, log_target(coords))
-    assert 2 <= len(covered.weights) <= 3
-    assert np.all(np.linalg.norm(covered.means[1:] - np.eye(5)[0] * DISTANCE, axis=1) < 5.5 * NARROW)
-
-
 def test_a_covered_target_is_left_alone(rng):
     coords = cloud(rng)
     mixture = fit_mixture(coords, uniform(coords))
@@ -93,25 +85,6 @@ def test_a_constant_and_the_units_change_nothing(rng):
     )
     assert np.allclose(scaled.means / units, plain.means, atol=1e-3)
     assert np.allclose(scaled.weights, plain.weights, rtol=1e-3)
-
-
-def test_the_number_of_components_is_limited(rng):
-    """Many scattered points above the quadratic."""
-    coords = np.concatenate([cloud(rng), 6.0 * rng.standard_normal((6, 5))])
-    values = log_target(coords, shift=False)
-    values[400:] = -6.0
-    mixture = fit_mixture(coords[:400], uniform(coords[:400]))
-    covered = cover_basins(mixture, coords, values, most=2, share=0.2)
-    assert len(covered.weights) == 3 and np.allclose(covered.weights[1:], 0.2)
-
-
-def test_impossible_points_are_ignored(rng):
-    coords = np.concatenate([cloud(rng), flank(rng, 30), 50.0 + cloud(rng, 10)])
-    values = log_target(coords)
-    values[-10:] = -np.inf
-    mixture = fit_mixture(coords[:400], uniform(coords[:400]))
-    with_them, without = (cover_basins(mixture, coords[:n], values[:n]) for n in (440, 430))
-    assert np.array_equal(with_them.means, without.means)
 
 
 def several_modes(x, centres, log_masses, width=NARROW):
@@ -157,15 +130,3 @@ def test_roughness_far_from_the_mode_is_no_basin(rng):
     mixture = fit_mixture(coords[:400], uniform(coords[:400]))
     rough = log_target(coords, shift=False) + rng.uniform(-1.5, 1.5, len(coords))
     assert cover_basins(mixture, coords, rough) is mixture
-
-
-def test_a_low_flank_is_a_basin(rng):
-    """All points of the narrow mode are far below the highest point, as after a large step of beta."""
-    coords = np.concatenate([cloud(rng), flank(rng, 80)])
-    values = 12.0 * log_target(coords)
-    mixture = fit_mixture(coords[:400] / np.sqrt(12.0), uniform(coords[:400]))
-    assert values[400:].max() < values.max() - 50.0
-    covered = cover_basins(mixture, coords, values)
-    centre = DISTANCE * np.eye(5)[0]
-    nearest = np.linalg.norm(coords[400:] - centre, axis=1).min()
-    assert min(np.linalg.norm(covered.means[1:] - centre, axis=1)) < 0.6 * nearest  # a step is limited in length

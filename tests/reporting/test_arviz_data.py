@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from fe_likelihoods import Posterior, TruncatedNormal, propagate
-from samplers import SMCSampler, TMCMCSampler, to_arviz
+from samplers import SMCSampler, to_arviz
 from tests.contract.targets import Gaussian
 from tests.likelihood.linear_gaussian import likelihood_of
 
@@ -124,18 +124,6 @@ def test_mcse_is_that_of_the_sampler():
     assert np.all(values(arviz.mcse(plain, method="mean")) < 0.9 * expected)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("Sampler, n, steps", [(SMCSampler, 600, 4), (TMCMCSampler, 200, 10)])
-def test_mcse_is_the_error_of_the_mean(Sampler, n, steps):
-    target, errors, stated = Gaussian(), [], []
-    for seed in range(40):
-        sampler = run(target, seed, n, steps, Sampler)
-        errors.append(sampler.get_chain(flat=True).mean(axis=0) - target.mean)
-        stated.append(values(arviz.mcse(to_arviz(sampler), method="mean")))
-    ratio = np.sqrt(np.mean(np.square(stated)) / np.mean(np.square(errors)))
-    assert ratio == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * 3 * 40))
-
-
 def test_chain_of_emcee_in_the_order_of_its_walkers():
     target = Gaussian()
     sampler = emcee.EnsembleSampler(32, 3, target, vectorize=True)
@@ -199,11 +187,6 @@ def test_slashes_in_names(tmp_path):
     assert again["constant_data"]["channel"].values.tolist() == ["acc/top", "acc_top"]
 
 
-def test_a_run_of_a_file_without_a_verdict(runs, monkeypatch):
-    monkeypatch.setattr(runs[0], "_verdict", None)
-    assert to_arviz(runs[0])["sample_stats"].attrs["verdict"] == "The run has no stored verdict."
-
-
 @pytest.fixture(scope="module")
 def oscillator():
     from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements
@@ -216,25 +199,6 @@ def oscillator():
     return Posterior(
         FELikelihood(model, measured), {"stiffness": TruncatedNormal(1.0, 0.3), "sigma_top": HalfNormal(0.01)}
     )
-
-
-@pytest.mark.slow
-def test_labels_and_figures(oscillator, tmp_path):
-    import matplotlib.pyplot as plt
-
-    plt.switch_backend("Agg")
-
-    data = to_arviz([run(oscillator, seed, 60, 2) for seed in (1, 2)], oscillator, draws=80)
-    assert data["posterior"]["sigma_top"].attrs["long_name"] == "sigma_top [mm]"
-    assert data["posterior"]["sigma_top"].attrs["factor"] == 1e-3
-    replicates = data["posterior_predictive"]["top"]
-    assert replicates.dims == ("chain", "draw", "time") and replicates.attrs["units"] == "m"
-    assert float(replicates.std(("chain", "draw")).mean()) == pytest.approx(0.002, rel=0.25)
-    names = ["plot_trace", "plot_forest", "plot_ppc_dist" if GENERATION else "plot_ppc"]
-    for name in [*names, "plot_dist" if GENERATION else "plot_posterior"]:
-        getattr(arviz, name)(data)
-        plt.close("all")
-    assert "r_hat" in arviz.summary(data)
 
 
 def test_what_is_refused(linear, runs, oscillator):

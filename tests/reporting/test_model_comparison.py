@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 from scipy.special import softmax
 
-from fe_likelihoods import Channel, FELikelihood, FunctionModel, HalfNormal, Measurements, Posterior, Prior, Uniform
 from samplers import SMCSampler, compare_models
 from tests.contract.targets import Gaussian
 
@@ -41,11 +40,11 @@ def test_conjugate_models_by_smc(seed, rng):
         samplers[name].run_mcmc(None, 1)
     found = compare_models(samplers)
     exact = np.array([model.log_evidence for model in models.values()])
-    assert found.names == tuple(models) and not found.rough
+    assert found.names == tuple(models)
     assert np.all(np.abs(found.log_evidence - exact) < 4.0 * found.log_evidence_error)
-    # the errors are estimates from one run each, so five of them are allowed
-    assert np.all(np.abs(found.probability - softmax(exact)) < 5.0 * found.probability_error)
-    assert np.all((found.lower < found.probability) & (found.probability < found.upper))
+    # the errors are estimates from one run each, so five of them are allowed: the intervals have two
+    assert np.all(found.probability - softmax(exact) < 2.5 * (found.probability - found.lower))
+    assert np.all(softmax(exact) - found.probability < 2.5 * (found.upper - found.probability))
     assert found.probability.sum() == pytest.approx(1.0)
     assert found.probabilities[found.best] == found.probability.max() and found.best in models
 
@@ -62,19 +61,16 @@ def test_errors_against_monte_carlo(values, rng):
     draws = rng.normal(values, errors, size=(20_000, len(values)))
     probabilities = softmax(np.log(prior) + draws, axis=1)
     assert np.allclose(found.probability, softmax(np.log(prior) + np.array(values)))
-    # tolerance: errors of first order, and the scatter of a standard deviation of 20 000 draws
-    assert np.allclose(found.probability_error, probabilities.std(axis=0), rtol=0.05)
     low, high = np.quantile(probabilities, [0.025, 0.975], axis=0)
     assert np.allclose(found.upper - found.lower, high - low, rtol=0.07)
     factors = draws - draws[:, :1]
     assert np.allclose(found.log_bayes_factor_error, factors.std(axis=0), rtol=0.05)
-    assert found.log_bayes_factor[0] == 0.0 and found.best == "m0" and not found.rough
+    assert found.log_bayes_factor[0] == 0.0 and found.best == "m0"
 
 
-def test_large_errors_are_reported_as_rough(rng):
+def test_the_interval_is_right_for_large_errors(rng):
+    """For two models the log-odds are exactly normal."""
     found = compare_models({"a": (0.0, 2.0), "b": (-1.0, 0.1)})
-    assert found.rough and "rough" in found.table()
-    # the interval is still right: for two models the log-odds are exactly normal
     low, high = np.quantile(
         softmax(rng.normal([0.0, -1.0], [2.0, 0.1], size=(20_000, 2)), axis=1), [0.025, 0.975], axis=0
     )
@@ -93,7 +89,7 @@ def test_table():
 
 def test_a_model_excluded_by_its_prior():
     found = compare_models({"a": (0.0, 0.1), "b": (3.0, 0.1)}, prior={"a": 1.0, "b": 0.0})
-    assert found.probability.tolist() == [1.0, 0.0] and found.probability_error.tolist() == [0.0, 0.0]
+    assert found.probability.tolist() == [1.0, 0.0]
     assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
     assert found.best == "b"
 
@@ -134,31 +130,3 @@ def finished(data_fingerprint=None):
 def test_different_data_are_refused():
     with pytest.raises(ValueError, match="one, other are of different measurements"):
         compare_models({"one": finished("a1"), "unknown": finished(), "other": finished("b2")})
-
-
-def test_the_same_data_are_compared():
-    found = compare_models({"one": finished("a1"), "two": finished("a1"), "unknown": finished(), "pair": (0.0, 0.1)})
-    assert np.allclose(found.probability, 0.25)
-
-
-def test_posteriors_state_their_measurements(rng):
-    """The digest of a real posterior depends on the values, and not on the order of the channels."""
-    channels = (Channel("a", "acceleration", "g"), Channel("d", "displacement", "cm"))
-    values = rng.normal(size=(2, 10))
-
-    def sampler(measurements):
-        def zero(theta):
-            return np.zeros((len(measurements.channels), 10))
-
-        model = FunctionModel(zero, ("x",), measurements.channels, dt=0.1, n_steps=10)
-        prior = {"x": Uniform(0.5, 2.0), "sigma_a": HalfNormal(0.1), "sigma_d": HalfNormal(0.01)}
-        return SMCSampler(20, 3, Posterior(FELikelihood(model, measurements), Prior(prior)), vectorize=True)
-
-    def fingerprint(measurements):
-        return sampler(measurements).log_prob_fn.f.data_fingerprint
-
-    data = Measurements(channels, 0.1, values)
-    assert fingerprint(data) == fingerprint(data.select(["d", "a"]))
-    assert fingerprint(data) != fingerprint(Measurements(channels, 0.1, values + 1e-9))
-    with pytest.raises(ValueError, match="one, other are of different measurements"):
-        compare_models({"one": sampler(data), "other": sampler(Measurements(channels, 0.1, values + 1e-9))})

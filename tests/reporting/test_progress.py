@@ -26,8 +26,6 @@ from fe_likelihoods import (
 )
 from samplers import SMCSampler
 from samplers.reporting import progress
-from samplers.reports import AnnealingResult, GuideTick
-from samplers.tempering.population import Population
 from tests.contract.targets import Gaussian
 
 RUN = [sys.executable, "-m", "tests.reporting.progress_run"]
@@ -47,11 +45,11 @@ def check_last_states(states, numbers):
     assert states[-1].startswith("sweeps at beta = 1: 100%") and "2/2 sweeps" in states[-1]
 
 
-def run_in_a_terminal(*options):
+def run_in_a_terminal():
     """What a run writes to a terminal, and the numbers that it prints to a pipe."""
     parent, terminal = os.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 250, 0, 0))
-    process = subprocess.Popen([*RUN, *options], stdout=subprocess.PIPE, stderr=terminal)
+    process = subprocess.Popen(RUN, stdout=subprocess.PIPE, stderr=terminal)
     os.close(terminal)
     shown = b""
     while True:
@@ -68,31 +66,10 @@ def run_in_a_terminal(*options):
     return shown.decode(), numbers
 
 
-def screen(written):
-    """Lines that a terminal shows at the end, after carriage returns and line feeds."""
-    lines, column = [""], 0
-    for character in written:
-        if character == "\r":
-            column = 0
-        elif character == "\n":
-            lines.append("")
-        else:
-            lines[-1] = lines[-1][:column].ljust(column) + character + lines[-1][column + 1 :]
-            column += 1
-    return [line.rstrip() for line in lines]
-
-
 def test_a_terminal_shows_a_bar():
     shown, numbers = run_in_a_terminal()
     assert "\r" in shown.replace("\r\n", "")
     check_last_states([state.strip() for state in re.split(r"[\r\n]+", shown) if state.strip()], numbers)
-
-
-@pytest.mark.slow
-def test_messages_of_the_log_do_not_break_the_bar():
-    lines = screen(run_in_a_terminal("talking")[0])
-    assert [line for line in lines if line.startswith(("stage", "sweeps"))] == lines[-3:-1]  # the last states alone
-    assert lines.count("logged by a handler") == 1, lines
 
 
 def test_a_pipe_gets_lines():
@@ -228,17 +205,6 @@ def test_parts_of_a_joint_likelihood_are_parts_of_a_point():
     assert sum(heard) == pytest.approx(5.0)
 
 
-def test_without_progress_nothing_listens():
-    posterior, heard = posterior_of(oscillating()), []
-    posterior.when_simulated(heard.append)
-    sampler = SMCSampler(20, posterior.ndim, posterior, vectorize=True, seed=1)
-    silent = emcee.pbar.get_progress_bar(False, None)
-    with progress.Progress(silent, sampler._evaluator, "", posterior):
-        assert sampler._evaluator.observer is None
-        posterior(posterior.sample_prior(2))
-    assert sum(heard) == 2  # the listener of somebody else is kept
-
-
 def test_points_of_the_record_are_shown_at_once(bars, tmp_path):
     calls = []
 
@@ -262,19 +228,3 @@ def test_points_of_the_record_are_shown_at_once(bars, tmp_path):
     counts = [n for n, _, _ in bars[1].shown]
     assert counts[-1] == sampler.evaluations > kept
     assert kept in counts
-
-
-def test_no_fraction_of_a_simulation_is_shown(bars):
-    """A guide counts the first part of a record as a part of a simulation."""
-    bar, sampler = Bar(), SMCSampler(20, 3, Gaussian(3), vectorize=True, seed=1)
-    population = Population(0.0, np.zeros((20, 3)), None, 20.0)
-    with progress.Progress(bar, sampler._evaluator, "annealing", Gaussian(3)) as shown:
-        shown.show(AnnealingResult(), population, GuideTick("search", 337.178, 100, True))
-    assert bar.figures["simulations"] == "337"
-
-
-def test_a_bar_is_closed_when_a_loop_is_left(bars):
-    sampler = SMCSampler(20, 3, Gaussian(3), vectorize=True, seed=1)
-    for _ in sampler.sample(None, iterations=5, progress=True):
-        break
-    assert sampler._evaluator.observer is None

@@ -56,15 +56,6 @@ def test_run_shows_every_stage_at_its_cost(run):
     assert evidence.get_xlabel() == "evaluations of the log-probability"
 
 
-def test_an_unfinished_run_says_so(run):
-    class Unfinished:
-        ladder, nwalkers, ended_at, rounds = run.ladder[:2], run.nwalkers, None, ()
-        evaluations, iteration = sum(stage.evaluations for stage in run.ladder[:2]), 0
-
-    title = plot_run(Unfinished()).axes[0].get_title()
-    assert "not finished" in title and f"{run.ladder[1].beta:.3g}" in title
-
-
 def test_run_shows_where_the_evaluations_went(run):
     phases, _, _, evidence, chain, _ = plot_run(run).axes
     widths = {text.rpartition(": ")[0]: int(text.rpartition(": ")[2]) for text in legend(phases)}
@@ -87,13 +78,6 @@ def test_run_shows_the_rounds_of_a_guide(guided):
     assert list(sizes.lines[0].get_ydata()) == [r.effective_sample_size for r in guided.rounds]
     assert evidence.containers[0].lines[0].get_ydata()[-1] == guided.rounds[-1].log_evidence
     assert legend(chain) == ["median and 90 % of the walkers"]
-
-
-def test_run_without_steps_says_so():
-    sampler = SMCSampler(40, 3, Gaussian(), vectorize=True, seed=1)
-    sampler.run_mcmc(None, 0)
-    chain = plot_run(sampler).axes[4]
-    assert [text.get_text() for text in chain.texts] == ["no steps at beta = 1 were made"]
 
 
 @pytest.mark.parametrize("function", [plot_run, ladder_table])

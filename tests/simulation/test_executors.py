@@ -5,11 +5,11 @@ import os
 import pickle
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+import threading
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
-import emcee
 import numpy as np
 import pytest
 
@@ -18,12 +18,12 @@ from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import pool_executor
-from fe_likelihoods.simulation.executors import DaskExecutor, LocalPool, PoolExecutor, as_executor
+from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch, sent_simulation, simulate_batch
 from tests.faults import treacherous
-from tests.faults.treacherous import Absent, Large, Treacherous, Unpicklable, posterior_of
+from tests.faults.treacherous import Absent, Gated, Large, Treacherous, Unpicklable, gone, line, posterior_of
 
-SLOW = ("one process", "executor", "multiprocessing")  # kinds of pools
+SLOW = ("executor", "multiprocessing")  # kinds of pools
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -53,31 +53,23 @@ def thetas(rng):
     return thetas
 
 
-def pools():
-    yield "None", lambda: None
-    yield "one process", lambda: LocalPool(1)
-    yield "three processes", lambda: LocalPool(3)
-    yield "threads", lambda: ThreadPoolExecutor(3)
-    yield "ThreadPool", lambda: ThreadPool(2)
-    yield "executor", lambda: ProcessPoolExecutor(2, mp_context=SPAWN)
-    yield "multiprocessing", lambda: SPAWN.Pool(2)
-    yield "another object", Recorder
+POOLS = {
+    "None": lambda: None,
+    "three processes": lambda: LocalPool(3),
+    "threads": lambda: ThreadPoolExecutor(3),
+    "ThreadPool": lambda: ThreadPool(2),
+    "executor": lambda: ProcessPoolExecutor(2, mp_context=SPAWN),
+    "multiprocessing": lambda: SPAWN.Pool(2),
+    "another object": Recorder,
+}
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        pytest.param(
-            make, id=name, marks=pytest.mark.slow if name in ("one process", "executor", "multiprocessing") else ()
-        )
-        for name, make in pools()
-    ],
-)
-def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in POOLS])
+def test_same_bits_on_every_executor(name, oscillator, thetas, rng):
     measured = rng.normal(size=(2, 300))
     expected = misfit_batch(oscillator, thetas, measured)
     assert [bool(reason) for reason in expected.reasons] == [row == 5 for row in range(23)]
-    pool = make()
+    pool = POOLS[name]()
     executor = as_executor(pool, oscillator)
     for n in (23, 3, 1):
         result = misfit_batch(oscillator, thetas[:n], measured, executor)
@@ -100,19 +92,6 @@ def test_same_bits_on_every_executor(make, oscillator, thetas, rng):
             break
 
 
-def test_kind_of_executor():
-    class Client(Recorder):
-        def gather(self, futures): ...
-
-    with LocalPool(2) as pool:
-        assert as_executor(pool) is pool
-        assert as_executor(as_executor(pool)) is pool
-    assert as_executor(None) is None
-    assert as_executor(3).workers == as_executor(np.int64(3)).workers == 3
-    assert type(as_executor(Client())) is DaskExecutor
-    assert type(as_executor(Recorder())) is PoolExecutor
-
-
 @pytest.mark.parametrize(
     "pool",
     [0, -1, True, 2.5, "four", object(), float("nan"), [2]],
@@ -121,13 +100,6 @@ def test_kind_of_executor():
 def test_invalid_pools_are_refused(pool):
     with pytest.raises(ValueError, match="pool must be None, a positive number of processes, or an object with map"):
         posterior_of(Treacherous(), pool=pool)
-
-
-def test_model_is_sent_once_to_each_process(shared_pool):
-    with shared_pool(2) as pool:
-        for _ in range(3):
-            batch = simulate_batch(Large(), np.tile([0.2, 0.3], (20, 1)), pool)
-            assert set(batch.response[:, 0, 0]) == {1.0}
 
 
 def test_a_worker_of_another_pool_loads_the_model_once():
@@ -139,28 +111,15 @@ def test_a_worker_of_another_pool_loads_the_model_once():
         assert len(treacherous.LOADED) == loaded
 
 
-def test_a_worker_keeps_a_bounded_number_of_functions():
-    executor = as_executor(Recorder())
-    for ballast in range(20):
-        model = Treacherous()
-        model.ballast = ballast
-        simulate_batch(model, np.array([[0.1, 0.2]]), executor)
-    assert len(pool_executor.loaded_functions) == 8
-
-
 @pytest.mark.parametrize(
     "make", [lambda: 2, lambda: ProcessPoolExecutor(1), lambda: LocalPool(1)], ids=["2", "executor", "pool"]
 )
 def test_model_that_cannot_be_pickled_is_refused_with_the_attribute(make):
-    with pytest.raises(ValueError, match=r"the solver\.lock of Unpicklable, of type lock, cannot be sent") as error:
+    with pytest.raises(
+        ValueError, match=r"the solver\.output of Unpicklable, of type TextIOWrapper, cannot be sent"
+    ) as error:
         posterior_of(Unpicklable(), pool=make())
-    assert "must not contain open files, locks" in str(error.value) and " at 0x" not in str(error.value)
-
-
-def test_model_that_cannot_be_pickled_runs_in_threads():
-    with ThreadPoolExecutor(2) as pool:
-        posterior = posterior_of(Unpicklable(), pool=pool)
-        assert np.isfinite(posterior(posterior.sample_prior(5, 1))).all()
+    assert "must not contain open files" in str(error.value) and " at 0x" not in str(error.value)
 
 
 def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
@@ -172,21 +131,6 @@ def test_model_that_cannot_be_loaded_is_an_error_not_a_failure():
         with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
             posterior(posterior.sample_prior(5, 1))
     assert posterior.report()["simulations"] == 0
-
-
-def test_local_pool_maps_any_function_and_raises_its_exceptions(shared_pool):
-    with shared_pool(2) as pool:
-        assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
-        assert pool.map(abs, []) == []
-        with pytest.raises(TypeError, match="bad operand"):
-            pool.map(abs, [1, "two", 3])
-        assert pool.map(str, [1, 2]) == ["1", "2"]
-        assert pool.map(lambda x: 2 * x, [1]) == [2]
-        numbers = (number for number in (1, 2))
-        with pytest.raises(
-            ValueError, match=r"cannot be sent to another process \(TypeError: cannot pickle 'generator'"
-        ):
-            pool.map(lambda x: next(numbers), [1])
 
 
 def test_threads_in_workers_are_limited(monkeypatch):
@@ -208,73 +152,153 @@ def test_likelihood_with_a_pool_of_its_own_pickles_without_it():
     posterior.likelihood.simulator.pool.close()
 
 
-def test_as_the_pool_of_a_sampler(seed, shared_pool):
-    """The chain equals that of a run without a pool."""
-    posterior = posterior_of(Treacherous())
-    start = posterior.sample_prior(10, seed)
-    chains = []
-    with shared_pool(2) as pool:
-        for workers in (None, pool):
-            sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, pool=workers)
-            sampler.random_state = np.random.RandomState(seed).get_state()
-            sampler.run_mcmc(start, 5)
-            chains.append(sampler.get_chain())
-    np.testing.assert_array_equal(*chains)
-
-
 SCRIPT = """
+import sys
 import numpy as np
+COUNT = int(sys.argv[1])
+print('run', end=' ')
+unused = (number for number in range(3))
 from fe_likelihoods.models.function import FunctionModel
 from tests.faults.treacherous import CHANNELS, line, posterior_of
 
 def mine(theta):
     return 2.0 * line(theta)
 
-def main():
-    x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
-    for limit in (None, 60.0):
-        model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
-        print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
-
+x = np.array([[0.1 * k, 0.2, 0.5] for k in range(1, 9)])
+for limit in (None, 60.0):
+    model = FunctionModel(mine, ("offset", "slope"), CHANNELS, 0.1, 20, time_limit=limit)
+    print(posterior_of(model, pool=2)(x).tolist() == posterior_of(model)(x).tolist())
 """
 
 
-@pytest.mark.parametrize(
-    "end",
-    [
-        pytest.param('if __name__ == "__main__":\n    main()\n', id="guarded", marks=pytest.mark.slow),
-        pytest.param("main()\n", id="not guarded"),
-    ],
-)
-def test_models_defined_in_a_script(end, tmp_path):
-    """Workers do not run the script, so it needs no guard."""
+def test_models_defined_in_a_script(tmp_path):
+    """Workers do not run the script, so it needs no guard; values that the functions do not use are not sent."""
     script = tmp_path / "script.py"
-    script.write_text("import sys\nCOUNT = int(sys.argv[1])\nprint('run', end=' ')\n" + SCRIPT + end)
+    script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     run = subprocess.run([sys.executable, script, "8"], env=environment, capture_output=True, text=True, timeout=120)
     assert " ".join(run.stdout.split()) == "run True True", run.stderr
 
 
-@pytest.mark.slow
-def test_models_of_a_prompt():
-    code = "import numpy as np\n" + SCRIPT + "main()\n"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
-    assert " ".join(run.stdout.split()) == "True True", run.stderr
-
-
-@pytest.mark.parametrize("system", ["column", pytest.param("bridge", marks=pytest.mark.slow)])
-def test_compiled_models_go_through_a_pool_to_the_same_bits(system, shared_pool):
+def test_compiled_models_go_through_a_pool_to_the_same_bits(shared_pool):
     """Without a pool a batch runs on threads of this process; with a pool, sets run one by one in the workers."""
-    if system == "column":
-        posterior = problems.bridge_column(duration=2.0)
-        thetas = posterior.sample_prior(6, 1)[:, :5]
-    else:
-        record = problems.isolated_bridge_data().record.trim(0.0, 2.0)
-        posterior = problems.isolated_bridge(record=record, step=1e-3)
-        thetas = posterior.sample_prior(6, 1)[:, :10]
+    posterior = problems.bridge_column(duration=2.0)
+    thetas = posterior.sample_prior(6, 1)[:, :5]
     likelihood = posterior.likelihood
     with shared_pool(2) as pool:
         pooled = FELikelihood(likelihood.model, likelihood.measurements, likelihood.noise, pool=pool)
         np.testing.assert_array_equal(pooled.misfit(thetas), likelihood.misfit(thetas))
         assert pooled.simulations == 6
+
+
+# items that are submitted: each ends by itself -----------------------------------------------------------------------
+
+LONG, SHORT = np.array([0.95, 0.1]), [np.array([offset, 0.1]) for offset in (0.1, 0.2, 0.3, 0.4)]
+SECONDS = 60.0  # after which a test gives up
+
+
+@pytest.fixture
+def function(tmp_path):
+    return sent_simulation(Gated(tmp_path))
+
+
+def wait_until(condition):
+    stop = threading.Event()
+    for _ in range(int(SECONDS / 0.01)):
+        if condition():
+            return
+        stop.wait(0.01)
+    raise AssertionError("it does not happen")
+
+
+@pytest.mark.parametrize("kind", ["local", "threads"])
+def test_whichever_ends_first_comes_first(kind, function, tmp_path, shared_pool):
+    with shared_pool(2) if kind == "local" else ThreadPoolExecutor(2) as pool:
+        futures = as_executor(pool).submit_all(function, [LONG, *SHORT])
+        arrivals = as_completed(futures, timeout=SECONDS)
+        assert {next(arrivals) for _ in SHORT} == set(futures[1:])
+        assert not futures[0].done()
+        (tmp_path / "go").touch()
+        assert next(arrivals) is futures[0]
+        for future, theta in zip(futures, [LONG, *SHORT], strict=True):
+            np.testing.assert_array_equal(future.result()[0], line(theta))
+
+
+def test_a_function_that_cannot_be_loaded_is_the_error_of_its_items_only(shared_pool):
+    with shared_pool(2) as pool:
+        absent = pool.submit_all(sent_simulation(Absent()), SHORT)
+        fine = pool.submit_all(sent_simulation(Treacherous()), SHORT)
+        for future in absent:
+            with pytest.raises(ValueError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
+                future.result()
+        assert [future.result()[1] for future in fine] == [""] * 4
+        unpicklable = pool.submit_all(abs, [threading.Lock(), -1])
+        with pytest.raises(TypeError, match="cannot pickle"):
+            unpicklable[0].result()
+        assert unpicklable[1].result() == 1
+
+
+def test_the_function_is_sent_once_to_each_process(shared_pool):
+    function = sent_simulation(Large())
+    with shared_pool(2) as pool:
+        futures = [pool.submit(function, theta) for theta in SHORT * 5]
+        assert {future.result()[0][0, 0] for future in futures} == {1.0}
+
+
+def test_map_goes_before_items_that_wait(function, tmp_path, shared_pool):
+    """A verification does not wait for a batch of long runs."""
+    with shared_pool(1) as pool:
+        first = pool.submit_all(function, [SHORT[0], LONG])
+        first[0].result()
+        waiting = pool.submit_all(function, [LONG + 0.01])
+        (tmp_path / "go").touch()
+        assert pool.map(abs, [-1, -2]) == [1, 2]
+        assert all(future.result()[1] == "" for future in [*first, *waiting])
+
+
+def test_items_are_given_up(function, tmp_path):
+    with LocalPool(1) as pool:
+        (pid,) = pool.map(os.getsid, [0])
+        running, waiting = pool.submit_all(function, [LONG, SHORT[0]])
+        wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists())
+        pool.give_up([running, waiting], running=False)
+        assert waiting.cancelled() and running.running()
+        pool.give_up([running])
+        assert gone([pid])
+        with pytest.raises(CancelledError):
+            running.result()
+        assert pool.submit(function, SHORT[1]).result()[1] == ""
+        left = pool.submit(function, LONG)
+    with pytest.raises(CancelledError):  # the pool was closed
+        left.result(SECONDS)
+    assert not (tmp_path / f"started {SHORT[0][0]!r}").exists()
+
+
+def test_cancelled_items_are_not_run(function, tmp_path, shared_pool):
+    with shared_pool(1) as pool:
+        futures = pool.submit_all(function, [LONG, *SHORT])
+        wait_until(lambda: (tmp_path / f"started {LONG[0]!r}").exists())
+        assert [future.cancel() for future in futures] == [False, True, True, True, True]
+        (tmp_path / "go").touch()
+        assert futures[0].result()[1] == ""
+    with ThreadPoolExecutor(1) as threads:
+        started, go = threading.Event(), threading.Event()
+        executor = as_executor(threads)
+        first, second = executor.submit_all(lambda item: (started.set(), str(go.wait(SECONDS))), [1, 2])
+        assert started.wait(SECONDS)
+        assert [first.cancel(), second.cancel()] == [False, True]
+        executor.give_up([first], running=False)
+        go.set()
+        assert first.result()[1] == "True"
+        assert isinstance(first, Future)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="NO fork ON THIS SYSTEM")
+def test_a_forked_process_starts_workers_of_its_own():
+    with LocalPool(1) as pool:
+        parent = pool.map(os.getsid, [0])
+        child = os.fork()
+        if not child:
+            os._exit(int(pool.map(os.getsid, [0]) == parent))
+        assert os.waitpid(child, 0)[1] == 0
+        assert pool.map(os.getsid, [0]) == parent

@@ -1,7 +1,6 @@
-"""Each simulation in a worker has a working folder of its own; simulations that write elsewhere do not overlap."""
+"""Each simulation in a worker has a working folder of its own; simulations that write elsewhere at once are refused."""
 
 import contextlib
-import itertools
 import logging
 import multiprocessing
 import os
@@ -12,7 +11,6 @@ import sys
 import tempfile
 import threading
 import time
-import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,12 +20,11 @@ import pytest
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.opensees import OpenSeesModel
 from fe_likelihoods.signals.channels import Channel
-from fe_likelihoods.simulation import folder, shared_files
+from fe_likelihoods.simulation import folder
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.faults import UnusableModel
-from fe_likelihoods.simulation.folder import Sender, run_in_folder
+from fe_likelihoods.simulation.folder import Observed
 from fe_likelihoods.simulation.model import simulate_batch
-from fe_likelihoods.simulation.opened import Observed
 
 CHANNELS = [Channel("top", "displacement", "mm")]
 THETAS = np.random.default_rng(1).uniform(0.5, 1.5, (12, 2))
@@ -66,7 +63,6 @@ def pool():
 def start(tmp_path, monkeypatch):
     """The working folder of this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(shared_files, "_warned", set())
     return tmp_path
 
 
@@ -332,25 +328,37 @@ def in_a_database(path, theta):
         return [list(file.execute("select * from x").fetchone())]
 
 
-@pytest.mark.parametrize("write", [write_and_read, rewritten, in_its_folder, remade, made_once, in_a_database])
-def test_simulations_that_write_an_absolute_path_do_not_overlap(write, start, pool, tmp_path_factory):
+def by_a_program(path, theta):
+    """Noticed when Python code reads it, the second time."""
+    subprocess.run(["/bin/sh", "-c", f'sleep .01; echo "$0" "$1" > {path}', *map(repr, theta.tolist())], check=True)
+    return [[float(word) for word in Path(path).read_text().split()]]
+
+
+WRITES = [write_and_read, rewritten, in_its_folder, remade, made_once, in_a_database, by_a_program]
+
+
+@pytest.mark.parametrize("write", WRITES)
+def test_simulations_of_several_workers_that_write_an_absolute_path_are_refused(write, start, pool, tmp_path_factory):
     path = tmp_path_factory.mktemp("place") / "in.txt"
-    with pytest.warns(UserWarning, match="relative file name, which is private") as warned:
-        assert_right(lambda theta: write(str(path), theta), pool)
-        assert_right(lambda theta: write(str(path), theta), pool)
-    [text] = [str(each.message) for each in warned if each.category is UserWarning]
-    assert str(path.parent) in text
-    assert Path.cwd() == start
+    with pytest.raises(UnusableModel, match="use one worker, pool=1") as refused:
+        simulate_batch(model(lambda theta: write(str(path), theta)), THETAS, pool)
+    assert str(path.parent) in str(refused.value)
+    with LocalPool(1) as one:
+        assert_right(lambda theta: write(str(path), theta), one, THETAS[:4])
 
 
-@pytest.mark.parametrize("function", [lambda theta: write_and_read("in.txt", theta), of_program])
-def test_threads_share_the_working_folder_and_do_not_overlap(function, start):
-    with ThreadPoolExecutor(4) as threads, pytest.warns(UserWarning, match="one after the other"):
-        assert_right(function, threads)
+@pytest.mark.parametrize("options", [{}, {"isolated": True}])
+def test_threads_that_write_files_of_fixed_names_are_refused(options, start, tmp_path_factory):
+    path = "in.txt" if not options else str(tmp_path_factory.mktemp("place") / "in.txt")
+    for function in (lambda theta: write_and_read(path, theta), *([] if options else [of_program])):
+        with ThreadPoolExecutor(2) as threads, pytest.raises(UnusableModel, match="Use a pool of processes"):
+            simulate_batch(model(function, **options), THETAS, as_executor(threads))
 
 
-def test_files_that_no_other_simulation_writes_are_no_reason_to_wait(start, pool, tmp_path_factory):
+def test_files_that_no_other_simulation_writes_are_no_reason_to_refuse(start, pool, tmp_path_factory):
     def harmless(theta):
+        with contextlib.closing(sqlite3.connect(table)) as file:
+            assert file.execute("select * from x").fetchone() == (1,)
         with tempfile.TemporaryDirectory() as place, tempfile.NamedTemporaryFile("w") as file, open(os.devnull, "w"):
             file.write("text")
             subprocess.run(["true"], cwd=place, check=True)
@@ -362,56 +370,20 @@ def test_files_that_no_other_simulation_writes_are_no_reason_to_wait(start, pool
                 text.write("x")
             return write_and_read(f"{place}/in.txt", theta)
 
-    log = str(tmp_path_factory.mktemp("place") / "log.txt")
-    with warnings.catch_warnings(), ThreadPoolExecutor(2) as threads:
-        warnings.simplefilter("error", UserWarning)
+    log, table = (str(tmp_path_factory.mktemp("place") / name) for name in ("log.txt", "table.db"))
+    with contextlib.closing(sqlite3.connect(table)) as file:
+        file.execute("create table x as select 1")
+        file.commit()
+    with ThreadPoolExecutor(2) as threads:
         assert_right(harmless, pool)
         assert_right(harmless, threads)
     assert Path(log).read_text() == "x" * 2 * len(THETAS)
 
 
-def test_one_worker_and_pool_none_do_not_warn(start, tmp_path_factory):
+def test_one_process_may_write_anywhere(start, tmp_path_factory):
     path = str(tmp_path_factory.mktemp("place") / "in.txt")
-    with warnings.catch_warnings(), LocalPool(1) as one:
-        warnings.simplefilter("error", UserWarning)
-        for pool, options in ((one, {}), (None, {"isolated": True}), (None, {})):
-            assert_right(lambda theta: write_and_read(path, theta), pool, THETAS[:3], **options)
-
-
-def test_waiting_for_another_simulation_does_not_count_towards_the_time_limit(start, tmp_path_factory):
-    def slow(theta):
-        with open(path, "w") as file:
-            file.write(str(theta[0]))
-        time.sleep(0.7)
-        return [[float(Path(path).read_text()), theta[1]]]
-
-    path = str(tmp_path_factory.mktemp("place") / "in.txt")
-    with ThreadPoolExecutor(4) as threads, pytest.warns(UserWarning, match="one after the other"):
-        assert_right(slow, threads, THETAS[:4], time_limit=2.0)
-
-
-def test_a_simulation_that_holds_the_lock_may_run_an_isolated_model_that_writes_too(start, pool, tmp_path_factory):
-    def outer(theta):
-        Path(path).write_text("outer")
-        return isolated.simulate(theta)
-
-    path = str(tmp_path_factory.mktemp("place") / "in.txt")
-    isolated = model(lambda theta: write_and_read(path, theta), isolated=True)
-    with pytest.warns(UserWarning, match="one after the other"):
-        assert_right(outer, pool, THETAS[:6])
-
-
-def test_an_absolute_path_of_a_program_is_refused_with_several_workers(start, pool, tmp_path_factory):
-    def program(theta):
-        command = ["/bin/sh", "-c", f'sleep 0.01; echo "$0" "$1" > {path}', *map(repr, theta.tolist())]
-        subprocess.run(command, check=True)
-        return [[float(word) for word in Path(path).read_text().split()]]
-
-    path = str(tmp_path_factory.mktemp("place") / "in.txt")
-    with LocalPool(1) as one:
-        assert_right(program, one, THETAS[:4])
-    with pytest.raises(UnusableModel, match="use a relative file name, .* or pool=1"):
-        simulate_batch(model(program), THETAS, pool)
+    for options in ({"isolated": True}, {}):
+        assert_right(lambda theta: write_and_read(path, theta), None, THETAS[:3], **options)
 
 
 def test_an_input_file_that_is_written_before_each_batch_is_no_reason_to_refuse(start, pool, tmp_path_factory):
@@ -422,18 +394,6 @@ def test_an_input_file_that_is_written_before_each_batch_is_no_reason_to_refuse(
     for k in range(6):
         Path(path).write_text(str(k))
         assert simulate_batch(model(read), THETAS[:4], pool).response[:, 0, 0].tolist() == [float(k)] * 4
-
-
-def test_a_disk_that_machines_share_is_refused(start, tmp_path_factory, monkeypatch):
-    """This process in the place of a worker on another machine."""
-    sender = Sender.here()._replace(process="another", machine="another")
-    place, devices = tmp_path_factory.mktemp("place"), itertools.count()
-    assert run_in_folder(lambda theta: write_and_read("in.txt", theta), THETAS[0], sender)[0] == [THETAS[0].tolist()]
-    assert run_in_folder(lambda theta: write_and_read(place / "in.txt", theta), THETAS[0], sender)[1] != ""
-    monkeypatch.setattr(shared_files, "_device", lambda path: next(devices))
-    with pytest.raises(UnusableModel, match="on another machine"):
-        run_in_folder(lambda theta: write_and_read(place / "in.txt", theta), THETAS[0], sender)
-    assert Path.cwd() == start
 
 
 # all pools ----------------------------------------------------------------------------------------------------------
@@ -459,7 +419,6 @@ def opened(kind, workers):
         "local": LocalPool,
         "processes": lambda n: ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn")),
         "multiprocessing": multiprocessing.get_context("spawn").Pool,
-        "threads": ThreadPoolExecutor,
     }[kind]
     with make(workers) as pool:
         yield pool
@@ -496,7 +455,6 @@ def bar(ops, theta, recorder=None):
 CASES = {
     "relative": relative,
     "in a subfolder": lambda theta: write_and_read("results/in.txt", theta),
-    "absolute": lambda theta: write_and_read(f"{os.environ['PLACE_OF_TEST']}/in.txt", theta),
     "program": of_program,
     "recorder": lambda ops, theta: bar(ops, theta, "disp.out"),
     "recorder in a subfolder": lambda ops, theta: bar(ops, theta, "results/disp.out"),
@@ -506,12 +464,11 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "workers"),
-    [("local", 2), ("local", 8), ("processes", 2), ("multiprocessing", 2), ("threads", 8), ("dask1", 2), ("dask4", 2)],
+    [("local", 2), ("local", 8), ("processes", 2), ("multiprocessing", 2), ("dask1", 2)],
 )
 @pytest.mark.parametrize("case", CASES)
-def test_no_simulation_reads_files_of_another(case, kind, workers, start, tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("PLACE_OF_TEST", str(tmp_path_factory.mktemp("place")))
-    n = 300 if case in ("relative", "absolute") else 60
+def test_no_simulation_reads_files_of_another(case, kind, workers, start):
+    n = 300 if case == "relative" else 60
     thetas = np.random.default_rng(2).uniform(0.5, 1.5, (n, 2))
     for name in ("in.txt", "out.txt", "disp.out", "results/in.txt", "results/disp.out"):
         old(start / name, "1.0 1.0\n")
@@ -521,8 +478,7 @@ def test_no_simulation_reads_files_of_another(case, kind, workers, start, tmp_pa
         pytest.importorskip("openseespy")
         user = OpenSeesModel(CASES[case], ["a", "b"], CHANNELS, 0.01, 2)
         expected = simulate_batch(OpenSeesModel(bar, ["a", "b"], CHANNELS, 0.01, 2), thetas).response
-    with opened(kind, workers) as pool, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with opened(kind, workers) as pool:
         batch = simulate_batch(user, thetas, as_executor(pool))
     assert batch.reasons == [""] * n
     np.testing.assert_allclose(batch.response, expected, rtol=1e-12)

@@ -72,7 +72,7 @@ def test_conjugate_gaussian(mode, seed):
         RandomWalkMove(),
         RandomWalkMove(adapt=True, scale=5.0),
         [(MixtureMove(), 0.5), (RandomWalkMove(), 0.5)],
-        MixtureMove(independence_threshold=1.0),
+        MixtureMove(),
     ],
     ids=["walk", "adaptive walk", "weighted", "mixture"],
 )

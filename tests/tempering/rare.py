@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import integrate, stats
 
-__all__ = ["correlated", "four_branches", "four_branches_exact", "linear", "summarise"]
+__all__ = ["four_branches", "four_branches_exact", "linear", "summarise"]
 
 
 def linear(points):
@@ -22,30 +22,6 @@ def four_branches_exact():
     """By quadrature over d = (a - b) / sqrt(2): the event is |d| > 3 or |s| > 3 + 0.2 d^2, with independent normals."""
     inner = integrate.quad(lambda d: stats.norm.pdf(d) * 2.0 * stats.norm.sf(3.0 + 0.2 * d**2), -3.0, 3.0, epsrel=1e-10)
     return 2.0 * stats.norm.sf(3.0) + inner[0]
-
-
-class correlated:
-    """A correlated normal density as the posterior, and a linear quantity."""
-
-    root = np.array([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0], [0.3, 0.2, 0.5]])
-    mean, weights = np.array([1.0, -2.0, 3.0]), np.array([1.0, 1.0, -1.0])
-
-    @classmethod
-    def log_prob(cls, points):
-        return -0.5 * np.sum(np.linalg.solve(cls.root, (points - cls.mean).T) ** 2, axis=0)
-
-    @classmethod
-    def draws(cls, n, seed):
-        return cls.mean + np.random.default_rng([seed, 1]).standard_normal((n, 3)) @ cls.root.T
-
-    @classmethod
-    def quantity(cls, points):
-        return points @ cls.weights
-
-    @classmethod
-    def threshold(cls, probability):
-        spread = np.linalg.norm(cls.root.T @ cls.weights)
-        return cls.mean @ cls.weights + spread * stats.norm.isf(probability)
 
 
 def summarise(runs, exact):

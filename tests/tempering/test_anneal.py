@@ -72,25 +72,6 @@ def test_pairs_of_population_and_report(recycle):
     assert abs(value - density.posterior.log_evidence) < 5 * error + 0.1
 
 
-def test_one_sweep_per_tick():
-    steps, _ = steps_of(Settings(recycle=False))
-    sweeps = 0
-    for _, report in steps:
-        if isinstance(report, Sweep):
-            assert 0.0 <= report.acceptance <= 1.0
-            sweeps += 1
-        elif isinstance(report, Stage):
-            assert report.moves == sweeps
-            sweeps = 0
-
-
-def test_points_of_recycling_carry_weights():
-    steps, _ = steps_of(Settings(recycle=True))
-    population, stage = next(step for step in steps if isinstance(step[1], Stage))
-    assert stage.moves == 0 and 0.0 < stage.beta < 1.0
-    assert len(population.log_weights) == len(population.coords) == len(population.records) >= N
-
-
 def test_sweeps_after_recycling_use_its_last_proposal(monkeypatch):
     """A mixture fitted to the points that it moves would make their tails too light."""
     found = []
@@ -127,14 +108,6 @@ def finished(generator):
             next(generator)
         except StopIteration as stop:
             return stop.value
-
-
-def test_nothing_runs_ahead_of_its_consumer():
-    steps, density = steps_of(Settings(recycle=False))
-    assert density.evaluations == 0
-    _, first = next(steps)
-    assert isinstance(first, Sweep) and density.evaluations <= 2 * N
-    steps.close()
 
 
 def test_a_restart_makes_earlier_stages_void(monkeypatch):

@@ -26,15 +26,6 @@ def test_distinct_points_in_the_slow_parameters_are_counted(rng):
     assert pickle.loads(pickle.dumps(budget)).simulations == 1007
 
 
-def test_similar_points_are_not_confused():
-    """Points on a grid, columns exchanged, signs changed."""
-    axis = np.arange(-20.0, 21.0)
-    coords = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    record = Record()
-    enter(record, coords)
-    assert Budget(record).simulations == len(coords)
-
-
 def test_the_points_that_fit():
     record = Record(slow=[0])
     budget = Budget(record, limit=5)

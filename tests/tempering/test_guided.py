@@ -1,8 +1,6 @@
 """Runs with a guide: rounds of weighted draws instead of annealing, and independence sweeps at beta = 1."""
 
 import pickle
-import warnings
-from contextlib import nullcontext
 
 import emcee
 import numpy as np
@@ -172,48 +170,6 @@ def test_the_progress_bar_counts_searches_rounds_and_sweeps(capfd):
     assert f"guide: round {len(sampler.rounds)}: {evaluations} evaluations" in shown and "2/2" in shown
 
 
-class Bar:
-    """What tqdm was given."""
-
-    def __init__(self):
-        self.label, self.count, self.shown = "", 0, []
-
-    def set_description_str(self, text, refresh):
-        self.label = text
-
-    def set_postfix(self, figures, refresh):
-        self.figures = figures
-        if refresh:
-            self.update(0)
-
-    def update(self, n):
-        self.count += n
-        self.shown.append((self.label, self.count, self.figures))
-
-
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-@pytest.mark.parametrize("good", [True, False])
-def test_the_progress_bar_shows_what_a_guide_does(good, monkeypatch):
-    bar = Bar()
-    monkeypatch.setattr("samplers.tempered.get_progress_bar", lambda *args, **kwargs: nullcontext(bar))
-    posterior = Gaussian(2)
-    guide = SearchingGuide(posterior) if good else laplace(posterior, scale=0.3, shift=4.0)
-    sampler = run(posterior, guide, steps=0)
-    labels = list(dict.fromkeys(label for label, _, _ in bar.shown))
-    learning = ["guide: after round 1"] if good else []
-    assert labels[: 3 + good] == ["guide: search", "guide: round 1", *learning, "guide: round 2"]
-    assert f"guide: round {len(sampler.rounds)}" in labels
-    simulations = [float(figures["simulations"]) for label, _, figures in bar.shown if label.startswith("guide")]
-    assert simulations == sorted(simulations)
-    if good:
-        assert [figures["simulations"] for _, _, figures in bar.shown[:4]] == ["0", "8", "16", "24"]
-        assert simulations[-1] == sampler.simulations
-        assert bar.shown[-1][2]["ESS"] == f"{sampler.rounds[-1].effective_sample_size:.0f}/{N}"
-    else:  # recycling follows
-        assert labels[-1] in [f"stage {number}" for number in range(1, len(sampler.ladder) + 1)]
-        assert {"beta", "ESS", "acceptance", "log Z"} <= set(bar.shown[-1][2])
-
-
 def test_shares_of_rounds_depend_on_earlier_rounds_only():
     shares = round_shares([30, 60, 60], [0.1, 0.5, 0.9])
     assert np.allclose(shares, np.array([3.0, 6.0, 30.0]) / 39.0)
@@ -279,12 +235,6 @@ def test_the_evidence_of_rounds_is_unbiased_and_its_error_covers(spread, rng):
     error = np.std(values) / np.sqrt(len(values))
     assert abs(np.mean(values) - 1.0) < 4.0 * error + 0.002
     assert np.mean(covered) > 0.9
-
-
-def test_no_warning_with_a_good_guide():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        run(Gaussian(), laplace(Gaussian()))
 
 
 def test_the_shape_of_the_tail_counts_only_where_the_tail_does():

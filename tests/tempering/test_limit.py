@@ -3,21 +3,11 @@
 import json
 import re
 import warnings
-from collections import Counter
 
 import emcee
 import numpy as np
 import pytest
 
-from fe_likelihoods import (
-    Channel,
-    FELikelihood,
-    FunctionModel,
-    HalfNormal,
-    Measurements,
-    Posterior,
-    TruncatedNormal,
-)
 from samplers import SamplingWarning, SMCSampler, TMCMCSampler, Verdict
 from tests.contract.targets import Gaussian
 from tests.covering import covering
@@ -113,20 +103,6 @@ def test_a_run_that_goes_on_is_the_long_run(path, where, tmp_path):
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
 
 
-@pytest.mark.parametrize("path", ["guide", "moves", "recycling"])
-def test_a_limited_run_is_the_beginning_of_the_long_run(path):
-    """The same limit, reached at once or in two parts."""
-    whole = make(path, None)
-    until(whole, 6)
-    limit = 0.6 * whole.simulations
-    once, twice = make(path, limit), make(path, 0.3 * whole.simulations)
-    halted(once, 6)
-    halted(twice, 6)
-    twice.max_simulations = limit
-    halted(twice, 6)
-    assert same(twice, once)
-
-
 def test_steps_that_fit_are_kept():
     sampler = make("guide", None)
     until(sampler, 0)
@@ -156,18 +132,6 @@ def test_a_converged_run_is_not_warned_of(caplog, recwarn):
     sampler = make("guide", 0.5 * annealing)  # control
     with pytest.warns(SamplingWarning, match="ended the run. .*sable: .*To go on from here"):
         until(sampler, 5)
-
-
-def test_the_verdict_says_of_what_the_effective_sample_size_is():
-    sampler = make("guide", None)
-    sampler.run_mcmc(None, 1)
-    draws = sum(r.draws for r in sampler.rounds)
-    assert sampler.verdict.effective_sample_size > N
-    assert f"(of {draws} weighted draws, resampled to {N} walkers)" in str(sampler.verdict)
-    sampler = make("moves", None)
-    sampler.run_mcmc(None, 1)
-    assert f"(of {N} walkers)" in str(sampler.verdict)
-    assert "for its search" not in str(sampler.verdict)
 
 
 @pytest.mark.parametrize("limit", [20, 30, None])
@@ -244,72 +208,6 @@ def test_the_count_is_that_of_the_model(guide, where, tmp_path):
     assert np.array_equal(sampler.get_chain(), chain) and sampler.log_evidence == evidence
 
 
-def oscillators(log):
-    """Free vibration of two oscillators; writes the points to a file, since a list would be a part of the model."""
-    t = np.arange(150) * 0.02
-
-    def response(theta):
-        first, second = 2.0 * np.pi * np.sqrt(theta[0]), 4.6 * np.pi * np.sqrt(theta[1])
-        decay = np.exp(-0.05 * theta[2] * first * t), np.exp(-0.03 * second * t)
-        return 0.01 * (decay[0] * np.cos(first * t) + 0.4 * theta[3] * decay[1] * np.cos(second * t))[None]
-
-    def counted(theta):
-        with open(log, "ab") as file:
-            file.write(theta.tobytes())
-        return response(theta)
-
-    channels = (Channel("top", "displacement", "mm"),)
-    model = FunctionModel(counted, ("k1", "k2", "damping", "share"), channels, dt=0.02, n_steps=150, version="1")
-    noise = 0.0005 * np.random.default_rng(1).normal(size=(1, 150))
-    widths = {"k1": 0.3, "k2": 0.3, "damping": 0.5, "share": 0.5}
-    prior = {name: TruncatedNormal(1.0, width) for name, width in widths.items()} | {"sigma_top": HalfNormal(0.002)}
-    measurements = Measurements(channels, 0.02, response([1.1, 0.9, 0.9, 1.1]) + noise)
-    return Posterior(FELikelihood(model, measurements), prior)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["memory", "file"])
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_the_count_is_that_of_a_model_with_responses(where, tmp_path):
-    """Limits cut search and draws; each file is read by a new sampler and posterior.
-
-    A search that a limit has cut begins fewer starts, and keeps to that: the result is another one than without limits.
-    """
-
-    def make(limit, log, backend=None, seed=1):
-        posterior = oscillators(log)
-        kwargs = {"guide": posterior.guide(), "max_simulations": limit, "backend": backend, "seed": seed}
-        return SMCSampler(100, 5, posterior, vectorize=True, **kwargs)
-
-    def runs():
-        """Runs of each point of four parameters."""
-        return Counter(map(bytes, np.fromfile(log, dtype="V32"))) if log.exists() else Counter()
-
-    log, made = tmp_path / "log", []
-    whole = make(None, tmp_path / "whole")
-    whole.run_mcmc(None, 2)
-    sampler = make(100, log)
-    for limit in (100, 250, 430, None):
-        if where == "file":
-            backend = emcee.backends.HDFBackend(str(tmp_path / "run.h5"))
-            sampler = make(limit, log, backend, 1 + len(runs()))
-        sampler.max_simulations = limit
-        sampler.run_mcmc(None, 2)
-        made.append(len(runs()))
-        assert sampler.simulations == sampler.verdict.simulations == made[-1] <= (limit or np.inf)
-        if where == "file":
-            sampler._record.close()
-    assert 100 == made[0] < made[1] <= made[2] <= made[3]
-    assert abs(sampler.log_evidence - whole.log_evidence) < 4.0 * np.hypot(
-        sampler.log_evidence_error, whole.log_evidence_error
-    )
-    assert sum(runs().values()) <= 1.02 * len(runs())  # without a cache on disk, a few points are run again
-    error = np.hypot(sampler.log_evidence_error, whole.log_evidence_error)
-    assert abs(sampler.log_evidence - whole.log_evidence) < 4.0 * error
-    difference = sampler.get_chain(flat=True).mean(axis=0) - whole.get_chain(flat=True).mean(axis=0)
-    assert np.all(np.abs(difference) < 4.0 * np.hypot(sampler.mean_error(), whole.mean_error()))
-
-
 @pytest.mark.parametrize(
     ("path", "first"),
     covering(["searching guide", "recycling", "moves"], ["limited", "killed", "finished"], strength=1),
@@ -345,16 +243,6 @@ def test_a_smaller_limit_keeps_what_was_made(path, first, tmp_path):
     assert np.array_equal(sampler.get_chain(), whole.get_chain()) and sampler.simulations == whole.simulations
 
 
-def test_a_smaller_limit_in_memory():
-    sampler = make("searching guide", 200)
-    halted(sampler, 2)
-    chain, verdict = sampler.get_chain(), sampler.verdict
-    sampler.max_simulations = 30
-    with pytest.warns(SamplingWarning, match="stored run has made 200 simulations, which are kept"):
-        until(sampler, 2)
-    assert np.array_equal(sampler.get_chain(), chain) and sampler.verdict == verdict
-
-
 def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     file = tmp_path / "run.h5"
     sampler = make("searching guide", None, file)
@@ -367,17 +255,6 @@ def test_a_second_annealing_counts_the_search_of_the_first(tmp_path):
     sampler = make("searching guide", None, file)
     sampler.run_mcmc(None, 2)
     assert sampler.simulations == made + 2 * N
-
-
-def test_no_step_is_stored_where_none_was_wanted():
-    sampler = make("guide", 40)
-    halted(sampler, 0)
-    assert sampler.iteration == 0 and sampler.verdict.status == "not usable"
-    sampler.max_simulations = 10_000
-    until(sampler, 3)
-    whole = make("guide", None)
-    until(whole, 3)
-    assert same(sampler, whole)
 
 
 @pytest.mark.parametrize("where", ["memory", "file"])
@@ -393,14 +270,6 @@ def test_reset_after_a_limit(where, tmp_path):
     sampler.max_simulations = None
     until(sampler, 3)
     assert np.array_equal(sampler.get_chain(), whole.get_chain())
-
-
-def test_the_states_of_a_generator_end_where_the_limit_is():
-    sampler = make("guide", None)
-    sampler.run_mcmc(None, 0)
-    sampler = make("guide", sampler.simulations + 3 * N)
-    states = [state.coords.copy() for state in sampler.sample(None, iterations=10)]
-    assert np.array_equal(np.stack(states), sampler.get_chain()) and len(states) == 3
 
 
 def test_nothing_known_is_an_error_that_keeps_what_was_made():
@@ -446,3 +315,14 @@ def test_the_verdict_is_stored_with_the_chain(tmp_path):
 def test_impossible_limits(limit):
     with pytest.raises(ValueError, match="max_simulations must be a positive number"):
         make("moves", limit)
+
+
+def test_no_step_is_stored_where_none_was_wanted():
+    sampler = make("guide", 40)
+    halted(sampler, 0)
+    assert sampler.iteration == 0 and sampler.verdict.status == "not usable"
+    sampler.max_simulations = 10_000
+    until(sampler, 3)
+    whole = make("guide", None)
+    until(whole, 3)
+    assert same(sampler, whole)

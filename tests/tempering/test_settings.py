@@ -133,19 +133,15 @@ def test_a_setting_of_the_other_sampler_is_refused(Sampler):
             Sampler(60, 3, Gaussian(), vectorize=True, **{name: CHANGES[name][0]})
 
 
-@pytest.mark.parametrize("settings", [{"ess_ratio": 0.95}, {"resampling": "multinomial"}, {"ess_rule": "declining"}])
-def test_a_setting_of_moves_chooses_moves(settings):
-    """From 250 walkers on recycling is the default, and these would act only if it failed."""
-    assert SMCSampler(300, 3, Gaussian(), vectorize=True).settings.recycle
-    assert not SMCSampler(300, 3, Gaussian(), vectorize=True, **settings).settings.recycle
-    assert SMCSampler(300, 3, Gaussian(), vectorize=True, recycle=True, **settings).settings.recycle
-
-
 @pytest.mark.parametrize(
     ("Sampler", "settings", "match"),
     [
         (SMCSampler, {"asynchronous": True}, "asynchronous=True cannot act here"),
         (SMCSampler, {"ess_floor": 10.0}, 'ess_rule="declining"'),
+        (SMCSampler, {"ess_floor": 60.0, "ess_rule": "declining"}, "must be below nwalkers=60"),
+        (SMCSampler, {"pool": 4}, "pool must be an object with a method map"),
+        (SMCSampler, {"backend": "run.h5"}, "backend must be a backend of emcee"),
+        (TMCMCSampler, {"seed": 1.5}, "seed must be a whole number"),
         (TMCMCSampler, {"burn_in": 2, "chains": "equal"}, 'chains="leaders"'),
         (TMCMCSampler, {"max_moves": 9, "burn_in": 0}, 'chains="equal"'),
     ],
@@ -159,18 +155,26 @@ def test_a_setting_that_cannot_act_is_refused(Sampler, settings, match):
 @pytest.mark.parametrize(
     "settings",
     [
-        {"check_draws": 2.5},
-        {"check_draws": True},
-        {"burn_in": 1.5},
+        *({"ess_ratio": value} for value in (0.0, 1.0, np.nan)),
+        *({name: value} for name in ("check_draws", "fast_sweeps") for value in (-1, 1.5, True)),
+        {"ess_rule": "sometimes"},
+        {"ess_floor": -1.0},
+        {"resampling": "wheel"},
+        {"min_moves": 0},
         {"min_moves": 2.0},
-        {"max_moves": 5.5},
-        {"fast_sweeps": True},
+        {"min_moves": 5, "max_moves": 4},
+        {"max_correlation": 0.0},
+        {"coefficient_of_variation": 0.0},
+        {"coefficient_of_variation": np.inf},
+        {"chains": "long"},
+        {"burn_in": -1},
+        {"burn_in": 1.5},
         {"recycle": "no"},
         {"recycle": 1},
     ],
     ids=str,
 )
-def test_a_setting_of_another_type_is_refused(settings):
+def test_an_impossible_setting_is_refused(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         Settings(**settings)
 
@@ -217,12 +221,6 @@ def test_chains_from_leaders_refuse_moves_of_several_walkers(moves):
     TMCMCSampler(60, 3, Gaussian(), chains="equal", moves=moves)
 
 
-@pytest.mark.filterwarnings("ignore::samplers.SamplingWarning")
-def test_chains_from_leaders_take_other_moves_of_emcee():
-    _, stages, _ = outcome(TMCMCSampler, chains="leaders", moves=emcee.moves.GaussianMove(1e-4))
-    assert stages[-1].beta == 1.0
-
-
 def test_settings_as_keywords_and_as_a_preset():
     sampler = SMCSampler(300, 3, Gaussian(), **RAMANCHA_2022_LITERAL)
     assert sampler.settings == Settings(
@@ -244,5 +242,7 @@ def test_defaults_of_the_samplers():
     leaders = replace(Settings(), recycle=False, chains="leaders", burn_in=BURN_IN)
     assert TMCMCSampler(300, 3, posterior).settings == leaders
     assert TMCMCSampler(300, 3, posterior, moves=moves).settings == replace(Settings(), recycle=False)
-    assert SMCSampler(300, 3, posterior).settings == replace(Settings(), recycle=True)
+    assert SMCSampler(150, 3, posterior).settings == replace(Settings(), recycle=True)
+    for few, settings in ((149, {}), (300, {"ess_ratio": 0.95}), (300, {"resampling": "multinomial"})):
+        assert not SMCSampler(few, 3, posterior, **settings).settings.recycle
     assert SMCSampler(300, 3, posterior, moves=moves).settings == replace(Settings(), recycle=False)

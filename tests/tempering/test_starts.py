@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from samplers.evaluation.starts import compare_with_draws, draws_to_compare, spread_by_metropolis
+from samplers.evaluation.starts import compare_with_draws, draws_to_compare
 from tests.tempering.priors import PRIORS, Correlated, LogNormal, Prior, Uniform, ball, refused
 
 
@@ -31,21 +31,6 @@ def test_honest_starts_pass(by, seed):
         for n in (12, 40, 300)
     ]
     assert sum(map(bool, found)) <= 1, found
-
-
-@pytest.mark.slow
-def test_false_alarms(seed):
-    """About one in a thousand of 1000 honest starts, by either test: five of them are improbable (0.004)."""
-    random = np.random.RandomState(seed)
-    cases = list(itertools.product(PRIORS, (2, 3, 7), (24, 60, 100, 250)))
-    alarms = {"draws": 0, "density": 0}
-    for k in range(1000):
-        make, ndim, n = cases[k % len(cases)]
-        prior = make(ndim)
-        points, fresh = prior.draw(n, random), prior.draw(draws_to_compare(n), random)
-        alarms["draws"] += bool(compare_with_draws(points, fresh))
-        alarms["density"] += bool(spread_by_metropolis(points, prior.log_density))
-    assert max(alarms.values()) < 5, alarms
 
 
 def test_the_worst_parameter_is_named(rng):
@@ -85,21 +70,3 @@ def test_priors_with_copies_may_have_copies(rng):
 
     assert not refused(Counts(2).draw(200, np.random.RandomState(5)), Counts(2))
     assert refused(np.ones((200, 2)), Counts(2))
-
-
-def test_points_that_are_more_even_than_draws_pass(rng):
-    n = 200
-    strata = np.column_stack([(rng.permutation(n) + 0.5) / n for _ in range(3)])
-    assert not refused(strata, Uniform(3))
-
-
-def test_too_few_points_for_a_test_of_the_density(rng):
-    def log_density(x):
-        raise AssertionError("not to be called")
-
-    assert not spread_by_metropolis(rng.standard_normal((31, 2)), log_density)
-
-
-def test_control_points_that_shrink(rng):
-    """The test of the density finds points that are too far apart as well."""
-    assert "contracts" in refused(3.0 * rng.standard_normal((200, 2)), Prior(2), "density")

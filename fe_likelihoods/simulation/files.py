@@ -1,0 +1,374 @@
+"""What simulations do with files: what they read, for the label of their model, and what several of them may write.
+
+One audit hook (`sys.addaudithook`) sees what Python code of this process opens, writes and starts.
+
+* Observers note the files, modules, shared libraries and programs that simulations use. Not counted are files that a
+  simulation writes itself, and files of Python and installed packages.
+* Before a running simulation writes to a link in a folder of its own, a private file takes its place. A file outside of
+  its folder is noted, unless the simulation has made it exclusively: other simulations may write it too, so it is
+  refused where several run at once (`refuse_shared`). Compiled code and programs write without an event: a file that
+  they have written is noticed when Python code reads it, since it has changed since the simulation began.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+import stat
+import sys
+import sysconfig
+import threading
+import time
+from collections.abc import Callable, Iterator
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .faults import UnusableModel
+
+__all__ = [
+    "Opened",
+    "RunningSimulation",
+    "file_digest",
+    "note",
+    "observing",
+    "of_this_library",
+    "refuse_shared",
+    "running_simulation",
+]
+
+_CLOCK_TICK = 2.0  # [s]; a file changed more recently may change again with the same modification time
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_TEMPORARY = getattr(os, "O_TMPFILE", 0)  # a file without a name
+_SYSTEM = ("/proc/", "/sys/", "/dev/", "/run/")
+_INSTALLED = ("/usr/", "/lib", "/etc/", "/bin/", "/opt/", "/memfd:", "/SYSV")
+_CACHES = {"__pycache__", ".cache", ".config"}  # written once per machine, by installed packages
+_CACHES_OF_NUMBA = (".nbi", ".nbc")
+
+_observers: "list[_Observer]" = []
+_running: "dict[int, RunningSimulation]" = {}  # by thread; 0 for all threads of a process that runs one at a time
+_lock = threading.Lock()
+_own = threading.local()
+_digests: dict[str, tuple[tuple, float, str]] = {}
+_fresh: set[str] = set()  # files that simulations have read and that were written while they ran
+
+
+class Opened(NamedTuple):
+    """What simulations opened: digests of the contents of files, by path."""
+
+    files: dict[str, str]
+    shared: str = ""  # a file that other simulations may write too
+
+    def items(self) -> dict[str, str]:
+        """Digests by file name, so that the folder does not matter."""
+        found: dict[str, list[str]] = {}
+        for path, digest in self.files.items():
+            found.setdefault(f"opened {os.path.basename(path)}", []).append(digest)
+        return {name: " ".join(sorted(digests)) for name, digests in found.items()}
+
+    def __or__(self, other: "Opened") -> "Opened":
+        return Opened(self.files | other.files, self.shared or other.shared)
+
+    def read_again(self) -> "Opened":
+        """The same files with their present digests; files that are not found, as on other machines, keep theirs."""
+        return Opened({path: _digest_or(path, digest) for path, digest in self.files.items()})
+
+
+class _Observer:
+    """Notes what is opened while it is in the list of observers."""
+
+    def __init__(self) -> None:
+        self.read: set[str] = set()
+        self.written: set[str] = set()
+        self.noted: dict[str, str] = {}
+        self.shared = ""
+        self.modules = set(sys.modules)
+
+    def result(self, known: Opened | None = None) -> Opened | None:
+        """Files that were read and not written, including new modules and shared libraries; None if all are known."""
+        if known is not None and self.noted.keys() <= known.files.keys() and len(sys.modules) == len(self.modules):
+            if not any(path not in known.files and _counts(path) for path in self.read - self.written):
+                if known.shared or not self.shared:
+                    return None
+        new = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
+        read = self.read | {file for file in new if isinstance(file, str)} | set(_mapped())
+        files = {path: _digest_or(path, "") for path in read - self.written if _counts(path)}
+        return Opened({path: digest for path, digest in files.items() if digest} | self.noted, self.shared)
+
+    def see(self, path: Any, writes: bool = False) -> None:
+        """Note a path, or the file that it shows if it is a link in the own folder of a simulation."""
+        if isinstance(path, str | bytes | os.PathLike):
+            path, simulation = os.path.abspath(os.fsdecode(path)), running_simulation()
+            if simulation is None or (path := simulation.shown(path)) is not None:
+                (self.written if writes else self.read).add(path)
+
+
+@contextlib.contextmanager
+def observing() -> Iterator[_Observer]:
+    """Observe what this process opens."""
+    _add_hook()
+    observer = _Observer()
+    with _lock:
+        _observers.append(observer)
+    try:
+        yield observer
+    finally:
+        with _lock:
+            _observers.remove(observer)
+
+
+def note(opened: Opened | None) -> None:
+    """Tell the observers of this process what another process has opened for it."""
+    if opened is not None:
+        for observer in list(_observers):
+            observer.noted.update(opened.files)
+            observer.shared = observer.shared or opened.shared
+
+
+class RunningSimulation:
+    """A simulation that runs now, in its own folder `place` ("" if it has none).
+
+    Links there show the folder `base` by way of `hop`. `thread` runs the simulation, 0 if all threads of this process
+    belong to it. `shared` is the first file that other simulations may write too, else ""; `has_programs` if it
+    started processes.
+    """
+
+    def __init__(self, thread: int, place: str = "", hop: str = "", base: str = "") -> None:
+        self.place, self.base, self._hop, self._thread = place, base, hop, thread
+        self.shared, self.has_programs = "", False
+        self._made: list[str] = []  # files and folders
+        self._databases: list[str] = []  # that may only be read
+        self._start = time.time_ns()
+
+    def run(self, function: Callable[[Any], Any], item: Any) -> Any:
+        """Result of the function for an item."""
+        _add_hook()
+        _running[self._thread] = self
+        try:
+            return function(item)
+        finally:
+            del _running[self._thread]
+            for path in self._databases:
+                self._reads(path)
+
+    def shown(self, path: str) -> str | None:
+        """The file that a link in the own folder shows; None for the simulation's own file, else `path`."""
+        if not self._is_own(path):
+            return path
+        with contextlib.suppress(OSError):
+            return os.readlink(path).replace(self._hop, self.base, 1)
+        path = os.path.realpath(path)  # a link among its folders
+        return None if self._is_own(path) else path
+
+    # events of the audit hook ---------------------------------------------------------------------------------------
+
+    def opens(self, path: Any, mode: Any, flags: int) -> None:
+        """A link in the own folder is replaced by a private file before it is opened for writing."""
+        if (path := _full(path)) is None or (_TEMPORARY and flags & _TEMPORARY == _TEMPORARY):
+            return
+        if not flags & _WRITING:
+            self._reads(path)
+        elif self._is_own(path):
+            if os.path.islink(path) and not flags & os.O_EXCL:
+                target = os.path.realpath(path)
+                os.unlink(path)
+                if not flags & os.O_TRUNC and os.path.isfile(target):
+                    shutil.copyfile(target, path)
+        elif os.path.isdir(path):  # of tempfile, which opens a file in it
+            return
+        elif flags & os.O_EXCL:
+            self.makes(path)
+        elif (mode is not None or flags & (os.O_RDWR | os.O_TRUNC)) and not flags & os.O_APPEND:  # else Path.touch
+            self.writes(path)
+
+    def _reads(self, path: str) -> None:
+        """Note a file that was written twice while a simulation ran, but not by Python code of this simulation."""
+        if self._is_own(path) or path.startswith(_SYSTEM) or _is_cache(path) or self._has_made(path):
+            return
+        with contextlib.suppress(OSError):
+            status = os.stat(path)
+            if self._start <= status.st_mtime_ns <= time.time_ns() and stat.S_ISREG(status.st_mode):
+                self.shared = self.shared or (path if path in _fresh else "")
+                _fresh.add(path)
+
+    def makes(self, path: Any) -> None:
+        """A file or folder that is new belongs to this simulation."""
+        if (path := _full(path)) is not None and not os.path.lexists(path):
+            self._made.append(path)
+
+    def connects(self, path: Any) -> None:
+        """A database is looked at when the simulation has ended."""
+        if path not in ("", ":memory:") and (path := _full(path)) is not None:
+            self._databases.append(path)
+
+    def removes(self, path: Any, folder: int | None) -> None:
+        if folder in (None, -1):  # else within a folder, whose removal has an event of its own
+            self.writes(path)
+
+    def starts(self, folder: Any = None) -> None:
+        """A process, or a program that may write in its folder."""
+        self.has_programs = True
+        self.enters(folder)
+
+    def enters(self, folder: Any) -> None:
+        if isinstance(folder, str | bytes | os.PathLike):
+            self.writes(os.path.join(os.path.realpath(os.fsdecode(folder)), "*"))
+
+    def writes(self, path: Any) -> None:
+        """Note a file that does not belong to this simulation alone."""
+        if self.shared or (path := _full(path)) is None:
+            return
+        if self._is_own(path) or _is_cache(path) or self._has_made(path):
+            return
+        with contextlib.suppress(OSError):
+            mode = os.stat(path).st_mode
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a terminal, a pipe, /dev/null
+                return
+        self.shared = os.path.dirname(path) if path.endswith("/*") else path
+
+    def _has_made(self, path: str) -> bool:
+        return any(path == made or path.startswith(made + os.sep) for made in self._made)
+
+    def _is_own(self, path: str) -> bool:
+        return bool(self.place) and path.startswith(self.place + os.sep)
+
+
+def running_simulation() -> RunningSimulation | None:
+    """The simulation that runs in this thread."""
+    return _running.get(threading.get_ident()) or _running.get(0)
+
+
+@contextlib.contextmanager
+def of_this_library() -> Iterator[None]:
+    """Files and programs in the ``with`` block do not belong to the simulation."""
+    before, _own.is_quiet = getattr(_own, "is_quiet", False), True
+    try:
+        yield
+    finally:
+        _own.is_quiet = before
+
+
+def refuse_shared(path: str, n_workers: int | None) -> None:
+    """`UnusableModel` for a file that simulations share, unless it is "", or there is one worker only."""
+    if path and n_workers != 1:
+        raise UnusableModel(
+            f"The simulations write to {path}, or read there what is written while they run, and simulations in other "
+            "workers may do the same at that moment, so that results would be mixed up. Use a pool of processes (dask: "
+            "workers with one thread) and a relative file name, which is private to each simulation, or a folder from "
+            "tempfile (docs/parallel.rst); or use one worker, pool=1"
+        )
+
+
+_EVENTS: dict[str, Callable[[RunningSimulation, tuple], Any]] = {
+    "open": lambda simulation, arguments: simulation.opens(*arguments),
+    "os.chdir": lambda simulation, arguments: simulation.enters(arguments[0]),
+    "os.fork": lambda simulation, _: simulation.starts(),
+    "os.posix_spawn": lambda simulation, _: simulation.starts("."),
+    "os.system": lambda simulation, _: simulation.starts("."),
+    "subprocess.Popen": lambda simulation, arguments: simulation.starts(arguments[2] or "."),
+    "tempfile.mkdtemp": lambda simulation, arguments: simulation.makes(arguments[0]),
+    "sqlite3.connect": lambda simulation, arguments: simulation.connects(arguments[0]),
+    "ctypes.dlopen": lambda simulation, _: None,
+}
+for _event in ("os.mkdir", "os.truncate", "shutil.rmtree"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[0])
+for _event in ("os.link", "os.rename", "os.symlink"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.writes(arguments[1])
+for _event in ("os.remove", "os.rmdir"):
+    _EVENTS[_event] = lambda simulation, arguments: simulation.removes(*arguments)
+
+
+@functools.cache
+def _add_hook() -> None:
+    sys.addaudithook(_hook)  # for the life of the process
+
+
+def _hook(event: str, arguments: tuple) -> None:
+    if not (_observers or _running) or event not in _EVENTS:
+        return
+    with contextlib.suppress(Exception):  # never disturb the code that is observed
+        for observer in list(_observers):
+            _observe(observer, event, arguments)
+    simulation = None if getattr(_own, "is_quiet", False) else running_simulation()
+    if simulation is not None:
+        with of_this_library():
+            _EVENTS[event](simulation, arguments)
+
+
+def _observe(observer: _Observer, event: str, arguments: tuple) -> None:
+    if event == "open":
+        path, mode, flags = arguments
+        observer.see(path, any(each in mode for each in "wax+") if isinstance(mode, str) else bool(flags & _WRITING))
+    elif event in ("ctypes.dlopen", "sqlite3.connect"):
+        observer.see(arguments[0])
+    elif event == "subprocess.Popen":
+        program, command, folder, _ = arguments
+        words = [command] if isinstance(command, str | bytes | os.PathLike) else list(command)
+        for word in filter(None, [shutil.which(os.fsdecode(program or words[0])), *words]):
+            observer.see(os.path.join(folder or "", os.fsdecode(word)))
+
+
+# paths --------------------------------------------------------------------------------------------------------------
+
+
+def file_digest(path: str | os.PathLike) -> str:
+    """Digest of a file's content; read again only after its size or modification time has changed."""
+    name = os.fspath(path)
+    status = os.stat(name)
+    stamp = status.st_size, status.st_mtime_ns, status.st_ino
+    known = _digests.get(name)
+    if known is not None and known[0] == stamp and known[1] - status.st_mtime > _CLOCK_TICK:
+        return known[2]
+    now = time.time()
+    with open(name, "rb") as file:
+        digest = hashlib.file_digest(file, lambda: blake2b(digest_size=16)).hexdigest()
+    _digests[name] = stamp, now, digest
+    return digest
+
+
+def _digest_or(path: str, otherwise: str) -> str:
+    try:
+        return file_digest(path) if os.path.isfile(path) else otherwise
+    except OSError:
+        return otherwise
+
+
+def _mapped() -> list[str]:
+    """Files mapped into this process's memory, such as shared libraries; on Linux only."""
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:
+        return []
+    paths = [line.split(None, 5)[5:] for line in lines]
+    return [path for (path,) in filter(None, paths) if path.startswith("/") and not path.endswith("(deleted)")]
+
+
+def _counts(path: str) -> bool:
+    """Whether a file counts: it does not belong to the system, Python or an installed package."""
+    if path.startswith((*_SYSTEM, *_INSTALLED)) or path.endswith((".pyc", "-shm", "-wal")):
+        return False
+    if "-packages" + os.sep in path or path.startswith(_installed()):
+        return False
+    return os.path.realpath(path) != os.path.realpath(sys.executable)
+
+
+@functools.cache
+def _installed() -> tuple[str, ...]:
+    library = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    prefixes = [os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)]
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    return tuple(os.path.realpath(folder) + os.sep for folder in (library, *prefixes, *map(sysconfig.get_path, names)))
+
+
+def _full(path: Any) -> str | None:
+    """Absolute path, without links among its folders; None for file descriptors."""
+    if not isinstance(path, str | bytes | os.PathLike):
+        return None
+    folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
+    return os.path.join(os.path.realpath(folder), name)
+
+
+def _is_cache(path: str) -> bool:
+    folder, name = os.path.split(path)
+    return not _CACHES.isdisjoint(folder.split(os.sep)) or any(suffix in name for suffix in _CACHES_OF_NUMBA)
