@@ -137,12 +137,8 @@ class Target:
         """What the function returns for each of the points (n, ndim) in turn; with `vectorize`, for all at once."""
         points = self.as_points(coords)
         if self.vectorize:
-            yield self.caught(points)
-            return
-        for answer in map_in(pool)(self.caught if pool is None else SentFunction(self.caught), points):
-            if isinstance(answer, Ended):
-                raise answer.error
-            yield answer
+            return iter([self.caught(points)])
+        return map(self.caught, points) if pool is None else _unless_ended(map_in(pool), self.caught, points)
 
     def evaluated(self, coords: np.ndarray, results: Any) -> EvaluatedBatch:
         """Log-posterior and blobs of points (n, ndim) from `answers`; ValueError if these are no log-densities."""
@@ -220,6 +216,14 @@ class Target:
             shape,
         )
         return None
+
+
+def _unless_ended(map_of_pool: Callable, caught: Callable, points: Any) -> Iterator:
+    """Answers from the processes of a pool; an error that ends the run is raised here."""
+    for answer in map_of_pool(SentFunction(caught), points):
+        if isinstance(answer, Ended):
+            raise answer.error
+        yield answer
 
 
 def _answer(method: Callable, *args: Any, dtype: Any = None) -> np.ndarray | None:
