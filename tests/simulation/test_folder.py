@@ -388,6 +388,7 @@ def test_a_simulation_may_read_in_another_folder_and_not_what_was_written_there_
         return [(theta * float(Path("x.txt").read_text())).tolist()]
 
     def written(theta):
+        time.sleep(0.02)  # times of files have steps of some milliseconds
         Path(place, "x.txt").touch()  # as compiled code does
         return looks(theta)
 
