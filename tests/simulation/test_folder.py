@@ -380,6 +380,25 @@ def test_files_that_no_other_simulation_writes_are_no_reason_to_refuse(start, po
     assert Path(log).read_text() == "x" * 2 * len(THETAS)
 
 
+def test_a_simulation_may_read_in_another_folder_and_not_what_was_written_there_meanwhile(
+    start, pool, tmp_path_factory
+):
+    def looks(theta):
+        os.chdir(place)
+        return [(theta * float(Path("x.txt").read_text())).tolist()]
+
+    def written(theta):
+        time.sleep(0.02)  # times of files have steps of some milliseconds
+        Path(place, "x.txt").touch()  # as compiled code does
+        return looks(theta)
+
+    place = tmp_path_factory.mktemp("place")
+    old(place / "x.txt", "1.0")
+    assert_right(looks, pool)
+    with pytest.raises(UnusableModel, match=r"x\.txt"):
+        simulate_batch(model(written), THETAS[:2], pool)
+
+
 def test_one_process_may_write_anywhere(start, tmp_path_factory):
     path = str(tmp_path_factory.mktemp("place") / "in.txt")
     for options in ({"isolated": True}, {}):
