@@ -45,7 +45,7 @@ class CheckedModel:
 
     def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
         label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, model, pool, label)
+        self.rows = None if cache is None else VerifiedCache(cache, pool, label)
         self._label = label
         self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0

@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +15,6 @@ __all__ = ["FailureLog", "TooManyFailures", "reason_without_numbers"]
 logger = logging.getLogger(__name__)
 
 _MAX_RECORDS = 1000
-_MOST_KEPT = 10_000  # failures whose reason is found by their parameters
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
 _OTHER_FAULTS = "other faults of the infrastructure"
@@ -63,19 +62,6 @@ class FailureLog:
         self._reasons_of_model: set[str] = set()
         self._transient_reasons: set[str] = set()
         self._names = tuple(parameter_names)
-        self._latest: OrderedDict[bytes, str] = OrderedDict()  # reasons by structural parameters
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"_latest": OrderedDict()}
-
-    def reason(self, theta: np.ndarray) -> str:
-        """Reason of the failure at the structural parameters `theta`; empty if none of the last failures was there."""
-        return self._latest.get((theta + 0.0).tobytes(), "")
-
-    def fault(self, theta: np.ndarray) -> str:
-        """Reason of the failure at the structural parameters `theta` if its cause is not the model, else empty."""
-        reason = self.reason(theta)
-        return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
 
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
         """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
@@ -88,9 +74,6 @@ class FailureLog:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
         parameters = dict(zip(self._names, theta.tolist(), strict=True))
         transient = isinstance(reason, TransientReason)
-        self._latest[(theta + 0.0).tobytes()] = reason
-        if len(self._latest) > _MOST_KEPT:
-            self._latest.popitem(last=False)
         reason, seconds = split_seconds(reason)
         if not self.count or (transient and not self.transient):
             logger.warning(

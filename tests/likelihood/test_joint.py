@@ -18,7 +18,6 @@ from fe_likelihoods import (
     Posterior,
     RCColumn,
     Record,
-    SimulationCache,
     SimulationFailed,
     TruncatedNormal,
     fragility,
@@ -109,20 +108,6 @@ def test_nothing_is_simulated_where_a_noise_is_impossible(pieces):
     joint = JointLikelihood(pieces, separate=["sigma_top"])
     assert joint([1.0, 1.0, 1.0, 0.5, -0.5]) == joint([1.0, np.nan, 1.0, 0.5, 0.5]) == -np.inf
     assert joint.simulations == 0
-
-
-def test_caches_of_the_parts_are_used(pieces, tmp_path, rng):
-    cache = SimulationCache(tmp_path / "cache.db")
-
-    def with_cache():
-        parts = {key: FELikelihood(each.model, each.measurements, cache=cache) for key, each in pieces.items()}
-        return JointLikelihood(parts)
-
-    points = points_of(with_cache(), rng)
-    expected, again = with_cache()(points), with_cache()
-    np.testing.assert_array_equal(again(points), expected)
-    report = again.report()
-    assert report["simulations"] == 0 and report["disk_hits"] == report["cache_hits"] == 2 * len(points)
 
 
 def test_fingerprints(pieces, rng):
