@@ -219,10 +219,6 @@ class Simulator:
 
     # requests -----------------------------------------------------------------------------------------------------
 
-    def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels) [SI unit squared]; NaN for failures."""
-        return self.statistics(thetas)[:, : self.measurements.n_channels]
-
     def statistics(self, thetas: np.ndarray) -> np.ndarray:
         """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural), see `run`."""
         return self.run(as_rows(thetas, self.model.parameter_names))
@@ -280,17 +276,11 @@ class Simulator:
         return request.statistics if len(keys) == len(which) else request.statistics[which]
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
-        """Cache statistics (n, n_numbers) of an earlier run in memory, unsimulated; ValueError for another shape.
+        """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
 
         Failures (with a reason) are recorded, and all rows count for `max_failure_share`. Rows that are cached already
         are not changed. Nothing is written to the cache on disk.
         """
-        thetas, statistics = as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
-        if statistics.shape != (len(thetas), self.n_numbers) or len(reasons) != len(thetas):
-            raise ValueError(
-                f"recall: expected statistics of shape ({len(thetas)}, {self.n_numbers}) and {len(thetas)} reasons; "
-                f"got {statistics.shape} and {len(reasons)}. Pass what statistics() returned for the same noise"
-            )
         keys, which = distinct_keys(thetas)
         known = self.memory_cache.look_up(keys, self.n_numbers)[1]
         last = dict(zip(which, range(len(thetas)), strict=True))

@@ -13,15 +13,12 @@ from fe_likelihoods import (
     GaussianNoise,
     HalfNormal,
     JointLikelihood,
-    LinearOscillator,
     Measurements,
     Posterior,
     RCColumn,
     Record,
     SimulationFailed,
     TruncatedNormal,
-    fragility,
-    peak,
     propagate,
 )
 from fe_likelihoods.noise.marginal import MarginalNoise
@@ -164,21 +161,6 @@ def test_predictions_are_of_one_part(pieces, rng):
     for message, (target, settings) in cases.items():
         with pytest.raises(ValueError, match=message):
             propagate(target, samples, progress=False, **settings)
-
-
-def test_fragility_of_a_part(rng):
-    oscillators = {
-        name: LinearOscillator(Record("noise", 0.02, rng.normal(size=80)), period)
-        for name, period in {"short": 0.4, "long": 0.8}.items()
-    }
-    data = {name: Measurements(o.channels, o.dt, o.simulate([1.0, 1.0])) for name, o in oscillators.items()}
-    joint = JointLikelihood({name: FELikelihood(o, data[name]) for name, o in oscillators.items()})
-    samples = np.abs(rng.normal(1.0, 0.1, size=(20, 4)))
-    record = oscillators["short"].record
-    records = [record.scale(factor) for factor in (0.5, 1.0, 1.5, 2.0)]
-    ours = fragility(joint, samples, records, peak("displacement"), 0.01, part="long", progress=False)
-    theirs = fragility(oscillators["long"], samples[:, :2], records, peak("displacement"), 0.01, progress=False)
-    np.testing.assert_array_equal(ours.probability, theirs.probability)
 
 
 def test_bad_input_is_refused_before_anything_is_simulated(pieces, rng):
