@@ -17,7 +17,6 @@ logger = logging.getLogger(__name__)
 _MAX_RECORDS = 1000
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
-_OTHER_FAULTS = "other faults of the infrastructure"
 _MIN_SIMULATIONS = 20  # before the share of failures is checked
 # A point without digits after it belongs to the number in arrays, "[1. 2.]", and before an exponent, "2.e-3".
 _DIGITS = r"\d+(?:\.\d+|\.(?=\s*(?:[-+\d\]),]|\.\d)|e[-+]?\d))?|\.\d+"
@@ -49,7 +48,7 @@ class FailureLog:
     the model, so that a later run simulates the point again. `records` has ``{"parameters": {name: value}, "reason":
     str}`` of the first 1000 failures of each of these two kinds, with ``"seconds"`` where known and ``"transient":
     True``. `reasons` counts failures per reason; after the first 100 reasons by their text without numbers, and after
-    100 of these in two groups, the model's failures and others.
+    100 of these together.
     """
 
     def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:
@@ -59,8 +58,6 @@ class FailureLog:
         self.outcomes = self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
-        self._reasons_of_model: set[str] = set()
-        self._transient_reasons: set[str] = set()
         self._names = tuple(parameter_names)
 
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
@@ -91,9 +88,14 @@ class FailureLog:
                 self.records[-1]["seconds"] = seconds
             if transient:
                 self.records[-1]["transient"] = True
-        known = self._transient_reasons if transient else self._reasons_of_model
-        other = _OTHER_FAULTS if transient else _OTHER_REASONS
-        self.reasons[_counted_under(reason, known) or other] += 1
+        self.reasons[self._counted_under(reason)] += 1
+
+    def _counted_under(self, reason: str) -> str:
+        """The text under which a reason is counted."""
+        for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
+            if text in self.reasons or len(self.reasons) < most:
+                return text
+        return _OTHER_REASONS
 
     def check(self, running: int = 0) -> None:
         """Raise `TooManyFailures` if too large a share of the simulations (20 or more) failed.
@@ -110,12 +112,3 @@ class FailureLog:
                 f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
                 "narrow the prior or raise max_failure_share"
             )
-
-
-def _counted_under(reason: str, known: set[str]) -> str:
-    """The text under which a reason is counted, added to `known`; empty if there are too many texts."""
-    for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
-        if text in known or len(known) < most:
-            known.add(text)
-            return text
-    return ""
