@@ -1,17 +1,12 @@
 """Cache of simulations on disk, shared by runs, samplers, processes and programs.
 
-For each simulation, the sum of squared residuals is stored, one number per channel. It depends neither on the noise nor
-on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
-simulation is a digest of the declared identity (fingerprints of model and measurements), the generation, and the
-structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
-model's code (`fe_likelihoods.cache.verification`); rows of other generations stay in the file and are not used.
-
-Responses, which depend on the model alone, are stored in double precision if they are requested, for example by a
-guide, or for every simulation. Failures of the model are stored under a key of the model, so that they are valid for
-any measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run
-simulates the point again. A simulation that was stopped at a time limit is stored together with this limit. A later run
-with a longer limit repeats it; a run with the same or a shorter limit repeats it once, because a busy machine may have
-been the cause.
+The statistics of a simulation depend neither on the noise parameters nor on the prior, so one simulation serves every
+noise level, every tempering stage and every sampler. Its key is a digest of the declared identity (fingerprints of
+model and measurements), the generation, and the structural parameters to the last bit. Responses and failures of the
+model have keys of the model alone, for any measurements. Faults of the infrastructure
+(`fe_likelihoods.simulation.faults`) are not stored. A simulation that was stopped at a time limit is stored with this
+limit: a later run with a longer limit repeats it, and a run with the same or a shorter one repeats it once, because a
+busy machine may have been the cause.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.

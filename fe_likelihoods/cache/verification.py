@@ -1,18 +1,12 @@
 """Verification of a cache: stored simulations are run again and compared before they are trusted.
 
-Stored simulations belong to the declared identity of a model. Code and files cannot prove that the model with this
-identity still computes the same results. Therefore stored rows are compared with new simulations. The model's label
-(`fe_likelihoods.simulation.label`) decides how many:
+Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
+(`fe_likelihoods.simulation.label`) decides how many rows are compared; numbers and powers: ``docs/parallel.rst``.
 
-* The label is known in the file: two rows before the first row is used in a process (the row stored last, and a random
-  one of the requested rows), and a random one of every 100 rows used. A difference is an error, `StaleCache`: something
-  that the label does not contain has changed. A change in a share p of the parameter space is noticed with a
-  probability of 1 - (1 - p)^n after n rows, in one process or in several.
-* The label is unknown: enough rows, chosen to cover the parameter space, to detect a change in 5 % of the space with a
-  probability of 95 % (59 rows, or all rows). If all agree, the label is added to the rows' generation (adoption). If
-  one differs, a new generation begins: the earlier rows stay in the file and are not used. Both are logged.
-
-Simulations complete the label with the files that they open.
+* The label is known in the file: the row stored last and a random one before the first row is used in a process, and a
+  random one of every 100 rows used. A difference is an error, `StaleCache`.
+* The label is unknown: enough rows, chosen to cover the parameter space. If all agree, the label is added to the rows'
+  generation (adoption). If one differs, a new generation begins: the earlier rows stay in the file and are not used.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
 A likelihood, those derived from it and their copies share their verified and stored rows (`Trust`).
