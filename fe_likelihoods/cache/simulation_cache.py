@@ -54,7 +54,7 @@ _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this pr
 
 
 class CacheInfo(NamedTuple):
-    """State of a cache; the last five numbers as for `SimulationCache`."""
+    """State of the file of a cache."""
 
     path: Path
     simulations: int
@@ -63,11 +63,6 @@ class CacheInfo(NamedTuple):
     response_bytes: int  # of the stored responses [bytes]
     seconds: float  # wall time of the stored simulations [s]
     file_bytes: int  # without its write-ahead log [bytes]
-    hits: int
-    misses: int
-    evictions: int
-    damaged: int
-    verified: int
 
 
 def rows_to_compare(verify: bool | int | str) -> int:
@@ -123,9 +118,8 @@ class SimulationCache:
 
     Attributes
     ----------
-    hits, misses, evictions, damaged, verified : int
-        Rows that this object has found, not found, evicted, found damaged and deleted, and simulated again without a
-        difference, in this process.
+    damaged : int
+        Rows that this object has found damaged and deleted, in this process.
     file : CacheFile
         The SQLite file and its connection.
 
@@ -176,7 +170,7 @@ class SimulationCache:
 
     def _begin(self, file: CacheFile) -> None:
         self.file = file
-        self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
+        self.damaged = 0
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
         self._warned_read_only = self._said_evicted = False
@@ -263,7 +257,6 @@ class SimulationCache:
                 sums = "SELECT id, sum(size) OVER (ORDER BY id DESC) AS newest FROM rows WHERE size > 0"
                 evict = f"DELETE FROM rows WHERE id IN (SELECT id FROM ({sums}) WHERE newest > ?)"
                 responses = connection.execute(evict, limit).rowcount
-        self.evictions += responses
         if responses and not self._said_evicted:
             self._said_evicted = True
             text = "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)"
@@ -366,7 +359,7 @@ class SimulationCache:
         return self.info().simulations - before
 
     def info(self) -> CacheInfo:
-        """State of the cache, and counts of this object."""
+        """State of the cache."""
         query = (
             "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size), "
             "total(seconds) FROM rows"
@@ -374,8 +367,7 @@ class SimulationCache:
         with self.file.lock:
             *counted, seconds = (self.file.select(query) or [(0,) * 5])[0]
             size = self.path.stat().st_size if self.path.exists() else 0
-            counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
-            return CacheInfo(self.path, *map(int, counted), seconds, size, *counts)
+            return CacheInfo(self.path, *map(int, counted), seconds, size)
 
     def forget(self, *fingerprints: str) -> int:
         """Delete all rows with these fingerprints, in all generations, for all users of the file; returns their number.

@@ -165,11 +165,7 @@ class VerifiedCache:
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
         """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
-        found = self._look_up(fingerprint, thetas, run, run.n_numbers, None)
-        unknown = found.rows.count(None)
-        self.cache.hits += len(thetas) - unknown
-        self.cache.misses += unknown
-        return found
+        return self._look_up(fingerprint, thetas, run, run.n_numbers, None)
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | str | None]:
         """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
@@ -322,7 +318,6 @@ class VerifiedCache:
                     return _Comparison(compared, stopped, row, new)
                 else:
                     compared += 1
-        self.cache.verified += compared
         return _Comparison(compared, stopped)
 
     def _simulate(self, thetas: np.ndarray, run: VerifyingRun) -> list[Simulated]:

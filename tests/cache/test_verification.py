@@ -117,12 +117,7 @@ def test_the_same_model_is_verified_once(filled, thetas):
     np.testing.assert_array_equal(likelihood.misfit(thetas[:1]), expected[:1])
     assert likelihood.simulator.verifications == 2  # the requested row, and the one that was stored last
     np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert (
-        likelihood.simulator.verifications
-        == likelihood.simulator.cache.verified
-        == likelihood.simulator.cache.info().verified
-        == 2
-    )
+    assert likelihood.simulator.verifications == 2
     assert (likelihood.simulations, likelihood.model.runs, likelihood.simulator.disk_hits) == (0, 2, 50)
     assert likelihood.simulator.seconds > 0.0
 
@@ -366,11 +361,7 @@ def test_a_simulation_that_is_stopped_is_not_a_difference(filled, thetas, caplog
     """Another row is verified in its place; the first of them is the one that was stored last."""
     likelihood = likelihood_of(Scaled(fault=thetas[-1:, 0]), filled)
     likelihood.misfit(thetas)
-    assert (
-        likelihood.simulator.verifications,
-        likelihood.simulator.unverified,
-        likelihood.simulator.cache.verified,
-    ) == (2, 1, 2)
+    assert (likelihood.simulator.verifications, likelihood.simulator.unverified) == (2, 1)
     assert "1 of 3 stored simulations could not be verified" in caplog.text
     assert likelihood.simulator.failures.count == 0
 
@@ -392,7 +383,6 @@ def test_rows_are_used_if_no_simulation_ends(filled, thetas, caplog):
         likelihood.misfit(thetas)
     assert likelihood.simulator.verifications == 0
     assert likelihood.simulator.unverified == verification.MAX_ATTEMPTS  # and no more for a while
-    assert likelihood.simulator.cache.verified == 0
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert sum("used without verification" in text for text in warnings) == 1
 
