@@ -259,7 +259,7 @@ class Simulator:
             self._check_before(request.run)
             some, start = left[: self._chunk(len(left), full)], time.perf_counter()
             with observed(self._checked.label, self.pool, self._checked.complete):
-                if self._returns_responses(full):
+                if self.pool is None or self._returns_responses(full):
                     values, reasons = simulate_batch(self.model, request.thetas[some], self.pool)
                 else:
                     values, reasons = misfit_batch(
@@ -382,12 +382,13 @@ class Simulator:
 
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
+        most = most_responses(self.model) if self.pool is None or self._returns_responses(full) else n
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return n
+            return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         one_by_one = self.pool is None and not has_batch_method(self.model)
         smallest = 1 if one_by_one else _ROUNDS_PER_CHUNK * workers  # so that all workers are busy
-        return min(max(smallest, self.chunk_size), most_responses(self.model) if self._returns_responses(full) else n)
+        return min(max(smallest, self.chunk_size), most)
 
     @interrupts_end_the_run()
     def _run_in_pool(self, request: _Request, rows: Sequence[int]) -> None:
@@ -519,12 +520,12 @@ class Simulator:
     ) -> None:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
-        The values are responses if these were requested or are stored on disk, else statistics.
+        The values are responses or statistics; responses are kept if they were requested or are stored on disk.
         """
         thetas, keys, full = request.thetas[rows], [request.keys[row] for row in rows], request.responses is not None
         responses, statistics, why = None, values, reasons
-        if self._returns_responses(full):
-            batch, responses = SimulationBatch(values, reasons), values
+        if values.ndim == 3:
+            batch, responses = SimulationBatch(values, reasons), values if self._returns_responses(full) else None
             statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
         self._seconds += seconds
         self.simulations += len(thetas)
