@@ -32,7 +32,7 @@ DEFAULT_TOLERANCE = 1e-9
 ROUNDING = 1e-13  # relative error of a sum of squares, since processors add the terms in different orders
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class VerifyingRun:
     """What the simulations of one request need; the model has one `fingerprint` for all of them."""
 
@@ -42,6 +42,7 @@ class VerifyingRun:
     statistic: Statistic | None  # that is stored; None: sums of squares
     n_numbers: int  # length of the statistic
     tolerance: float | None = None  # as for `SimulationCache`
+    has_no_label: bool = False  # the file was read and has no label of the model
 
     @cached_property
     def fingerprint(self) -> str:

@@ -4,29 +4,25 @@ A generation contains the simulations of one state of a model's code. It may hav
 results when they were compared (`fe_likelihoods.cache.verification`).
 """
 
-import contextlib
 import json
 import os
 import secrets
 import threading
-import uuid
-import weakref
 import zlib
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..simulation.files import Opened
-from ..simulation.label import ModelLabel, cpu_name, value_digest
-from ..simulation.local_pool import LocalPool
-from ..simulation.model import Model
+from ..simulation.label import ModelLabel, cpu_name
+from .comparison import VerifyingRun
 from .file import CacheFile
 from .rows import source_number
 
-__all__ = ["StoredLabel", "Trust", "labels_of", "shared_trust"]
+__all__ = ["StoredLabel", "Trust", "labels_of"]
 
 OWN = 2**40  # `compared` of the label with which a generation began, whose rows need no comparison
 MAX_TRUSTS = 32
@@ -59,35 +55,27 @@ def labels_of(file: CacheFile, source: int) -> list[StoredLabel]:
 class Trust:
     """Label and generation of a model in a file, and which rows are trusted in this process.
 
-    Likelihoods with the same file, model and pool share it (`shared_trust`), as do derived likelihoods and copies. In
-    other processes, where `token` identifies it, it starts without trusted rows. `cpu` is the number of the processor,
-    0 if simulations run on other machines. `stored` has the labels in the file, by the source numbers of models;
-    `generations` are in use for the rows of a fingerprint; `served` and `verified` count rows that were used and
-    compared, by fingerprint and whether any row is a success; rows with the number of the `session` were stored here
-    and need no verification; `stale` has the fingerprint of a row that differed, its generation, and the error.
+    Derived likelihoods and copies share it. In other processes, where `token` identifies it, it starts without trusted
+    rows. `cpu` is the number of the processor, 0 if simulations run on other machines. `stored` has the labels in the
+    file, by the source numbers of models; `generations` are in use for the rows of a fingerprint; `served` and
+    `verified` count rows that were used and compared, by fingerprint and whether any row is a success; rows with the
+    number of the `session` were stored here and need no verification; `stale` has the key of a row that differed, and
+    the error.
     """
 
-    def __init__(self, label: ModelLabel, is_local: bool, token: str, key: tuple = (), objects: tuple = ()) -> None:
-        self.label, self.is_local, self.token, self.key = label, is_local, token, key
+    def __init__(self, label: ModelLabel, is_local: bool, token: str) -> None:
+        self.label, self.is_local, self.token = label, is_local, token
         self.cpu = zlib.crc32(cpu_name().encode()) if is_local else 0
-        self._objects = [_reference(each) for each in objects]
         self.stored: dict[int, StoredLabel] = {}
         self.generations: dict[str, int] = {}
         self.pause_ends = -np.inf  # of the time in which nothing is verified, since no new simulation ended [s]
-        self.stale: tuple[str, int, Any] | None = None
+        self.stale: tuple[bytes, Any] | None = None
         self._lock, self._owner = threading.RLock(), os.getpid()
         self.start_again()
 
     def __reduce__(self) -> tuple:
         _remember(self)
         return _of_token, (self.label, self.is_local, self.token)
-
-    def is_for(self, key: tuple, objects: tuple, file: CacheFile) -> bool:
-        """Whether this is the state of a model and a pool, and the file still has its labels."""
-        same = self.key == key and len(self._objects) == len(objects)
-        if not same or any(refer() is not each for refer, each in zip(self._objects, objects, strict=True)):
-            return False
-        return all(each.id in {found.id for found in labels_of(file, each.source)} for each in self.stored.values())
 
     @property
     def lock(self) -> threading.RLock:
@@ -102,10 +90,13 @@ class Trust:
         self.verified: Counter[tuple[str, bool]] = Counter()
         self.session = secrets.randbits(62)
 
-    def find(self, file: CacheFile, fingerprint: str) -> StoredLabel | None:
-        """The label in the file, with the present contents of the files that simulations opened; None if unknown."""
-        source = source_number(fingerprint)
-        if source not in self.stored:
+    def find(self, file: CacheFile, run: VerifyingRun) -> StoredLabel | None:
+        """The label in the file, with the present contents of the files that simulations opened; None if unknown.
+
+        The file is read once for each request.
+        """
+        source = source_number(run.fingerprint)
+        if source not in self.stored and not run.has_no_label:
             labels = labels_of(file, source)
             for each in labels:
                 self.label.add(Opened(each.files).read_again(), here=False)
@@ -117,6 +108,7 @@ class Trust:
             elif self.stored:  # another length of the record, for example
                 other = next(iter(self.stored.values()))
                 self.put(file, {source}, other.generation, other.compared)
+            run.has_no_label = source not in self.stored
         return self.stored.get(source)
 
     def put(self, file: CacheFile, sources: Iterable[int], generation: int, compared: int) -> None:
@@ -173,28 +165,3 @@ def _remember(trust: Trust) -> Trust:
     while len(_trusts) > MAX_TRUSTS:
         _trusts.popitem(last=False)
     return trust
-
-
-def shared_trust(cache: Any, model: Model, pool: Any, label: ModelLabel, repeats_bits: bool) -> Trust:
-    """The `Trust` of this process for a file, a model in its present state, and a pool.
-
-    Compiled models of this library with equal values share it (`repeats_bits`: the same parameters give the same bits
-    on the same processor). A model that runs user code may have a state that neither its fingerprint nor its label
-    contains, so only the same model object with the same pool shares it.
-    """
-    is_local = pool is None or isinstance(pool, LocalPool)
-    values, objects = "", tuple(each for each in (model, pool) if each is not None)
-    if is_local and repeats_bits and not label.observes:
-        with contextlib.suppress(ValueError):  # a value that cannot be compared
-            values, objects = value_digest(model), ()
-    key = str(cache.path), cache.tolerance, cache.verify, is_local, model.fingerprint, label.code, values
-    found = [trust for trust in list(_trusts.values()) if trust.is_for(key, objects, cache.file)]
-    return _remember(found[-1] if found else Trust(label, is_local, uuid.uuid4().hex, key, objects))
-
-
-def _reference(value: Any) -> Callable[[], Any]:
-    """A weak reference, or a strong reference if the class does not allow weak ones."""
-    try:
-        return weakref.ref(value)
-    except TypeError:
-        return lambda: value

@@ -43,13 +43,14 @@ def _as_limit(name: str, what: str, value: Any) -> int:
 class MemoryCache:
     """Least-recently-used cache of statistics of at most `rows` simulations, by the bytes of the structural parameters.
 
-    Failures are cached as NaN. Threads may share the cache. It is empty after unpickling, because its contents would
-    dominate the size of the pickle. ValueError if `rows` is not a whole number or is negative.
+    Failures are cached as NaN, with their reasons. Threads may share the cache. It is empty after unpickling, because
+    its contents would dominate the size of the pickle. ValueError if `rows` is not a whole number or is negative.
     """
 
     def __init__(self, rows: int) -> None:
         self.rows = _as_limit("memory_rows", "number of simulations to cache in memory", rows)
         self._misfits: OrderedDict[bytes, bytes] = OrderedDict()  # from the least to the most recently used
+        self._reasons: dict[bytes, str] = {}
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple:
@@ -82,13 +83,19 @@ class MemoryCache:
         """Drop all rows."""
         with self._lock:
             self._misfits.clear()
+            self._reasons.clear()
 
-    def store(self, keys: Sequence[bytes], misfits: np.ndarray) -> None:
-        """Cache the statistics (n, width) of n distinct keys."""
+    def store(self, keys: Sequence[bytes], misfits: np.ndarray, reasons: Sequence[str]) -> None:
+        """Cache the statistics (n, width) of n distinct keys, and the reasons of failures; empty for others."""
         with self._lock:
             self._misfits.update(zip(keys, map(np.ndarray.tobytes, misfits), strict=True))
+            self._reasons.update((key, reason) for key, reason in zip(keys, reasons, strict=True) if reason)
             while len(self._misfits) > self.rows:
-                self._misfits.popitem(last=False)
+                self._reasons.pop(self._misfits.popitem(last=False)[0], None)
+
+    def reason(self, key: bytes) -> str:
+        """Reason of a cached failure; empty for others."""
+        return self._reasons.get(key, "")
 
 
 class ResponseMemory:

@@ -1,17 +1,12 @@
 """Cache of simulations on disk, shared by runs, samplers, processes and programs.
 
-For each simulation, the sum of squared residuals is stored, one number per channel. It depends neither on the noise nor
-on the prior, so one simulation serves every noise level, every tempering stage and every sampler. The key of a
-simulation is a digest of the declared identity (fingerprints of model and measurements), the generation, and the
-structural parameters to the last bit, so hits are exact. A generation contains the simulations of one state of the
-model's code (`fe_likelihoods.cache.verification`); rows of other generations stay in the file and are not used.
-
-Responses, which depend on the model alone, are stored in double precision if they are requested, for example by a
-guide, or for every simulation. Failures of the model are stored under a key of the model, so that they are valid for
-any measurements. Faults of the infrastructure (`fe_likelihoods.simulation.faults`) are not stored: a later run
-simulates the point again. A simulation that was stopped at a time limit is stored together with this limit. A later run
-with a longer limit repeats it; a run with the same or a shorter limit repeats it once, because a busy machine may have
-been the cause.
+The statistics of a simulation depend neither on the noise parameters nor on the prior, so one simulation serves every
+noise level, every tempering stage and every sampler. Its key is a digest of the declared identity (fingerprints of
+model and measurements), the generation, and the structural parameters to the last bit. Responses and failures of the
+model have keys of the model alone, for any measurements. Faults of the infrastructure
+(`fe_likelihoods.simulation.faults`) are not stored. A simulation that was stopped at a time limit is stored with this
+limit: a later run with a longer limit repeats it, and a run with the same or a shorter one repeats it once, because a
+busy machine may have been the cause.
 
 A cache never makes a run fail. A row that does not match its checksum is simulated again, a damaged file is moved
 aside, and while the file cannot be written, rows wait in memory.
@@ -53,12 +48,13 @@ logger = logging.getLogger(__name__)
 MAX_WAITING_ROWS = 100_000  # rows kept in memory while the file cannot be written
 MAX_CANDIDATES = 5000  # rows from which the rows to compare are chosen
 CONFIDENCE = 0.95
+TIMEOUT = 30.0  # how long to wait for another writer [s]
 
 _repeated: set[tuple[str, str]] = set()  # remarks by file and model, in this process
 
 
 class CacheInfo(NamedTuple):
-    """State of a cache; the last five numbers as for `SimulationCache`."""
+    """State of the file of a cache."""
 
     path: Path
     simulations: int
@@ -67,11 +63,6 @@ class CacheInfo(NamedTuple):
     response_bytes: int  # of the stored responses [bytes]
     seconds: float  # wall time of the stored simulations [s]
     file_bytes: int  # without its write-ahead log [bytes]
-    hits: int
-    misses: int
-    evictions: int
-    damaged: int
-    verified: int
 
 
 def rows_to_compare(verify: bool | int | str) -> int:
@@ -109,19 +100,12 @@ class SimulationCache:
     ----------
     path : path
         The file; created if it does not exist. A read-only file is used for reading, with a warning.
-    max_rows : int
-        Largest number of stored rows; a simulation without its response has one of about 160 bytes. Every write evicts
-        the oldest beyond this number.
-    retry_failures : bool
-        Run failed simulations again, after a change that no fingerprint contains (an external program, a licence).
     responses : bool
         Store the response of every simulation. By default, only requested responses are stored
         (`FELikelihood.simulate`, guides).
     max_response_bytes : int
         Largest size of all stored responses [bytes], at 8 bytes per channel and sample. The oldest are evicted; the
         first time, a message at level INFO.
-    timeout : float
-        How long to wait for another writer [s].
     verify : bool, int or str
         How many stored rows are simulated again before other rows are used (`fe_likelihoods.cache.verification`). If
         the model's label is known: two rows per process, and one of every 100. If it is unknown, because code, a file
@@ -134,9 +118,8 @@ class SimulationCache:
 
     Attributes
     ----------
-    hits, misses, evictions, damaged, verified : int
-        Rows that this object has found, not found, evicted, found damaged and deleted, and simulated again without a
-        difference, in this process.
+    damaged : int
+        Rows that this object has found damaged and deleted, in this process.
     file : CacheFile
         The SQLite file and its connection.
 
@@ -165,39 +148,35 @@ class SimulationCache:
         self,
         path: str | os.PathLike,
         *,
-        max_rows: int = 1_000_000,
-        retry_failures: bool = False,
         responses: bool = False,
         max_response_bytes: int = 2**30,
-        timeout: float = 30.0,
         verify: bool | int | str = True,
         tolerance: float | None = None,
     ) -> None:
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"SimulationCache: expected the path of a file; got {path!r}")
-        for name, value in (("max_rows", max_rows), ("max_response_bytes", max_response_bytes)):
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"SimulationCache: {name} must be a whole number of 1 or more; got {value!r}")
+        most = max_response_bytes
+        if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
+            raise ValueError(f"SimulationCache: max_response_bytes must be a whole number of 1 or more; got {most!r}")
         if tolerance is not None and not 0.0 <= tolerance < np.inf:
             raise ValueError(f"SimulationCache: tolerance must be a number of 0 or more, or None; got {tolerance!r}")
         rows_to_compare(verify)  # refuses an impossible value
-        self.max_rows, self.max_response_bytes = int(max_rows), int(max_response_bytes)
-        self.retry_failures, self.responses = bool(retry_failures), bool(responses)
+        self.max_response_bytes, self.responses = int(max_response_bytes), bool(responses)
         self.verify, self.tolerance = verify, tolerance
-        self._begin(CacheFile(path, timeout))
+        self._begin(CacheFile(path, TIMEOUT))
         self.file.check()
         if not self.file.writable:
             self._warn_read_only()
 
     def _begin(self, file: CacheFile) -> None:
         self.file = file
-        self.hits = self.misses = self.evictions = self.damaged = self.verified = 0
+        self.damaged = 0
         self._waiting: list[Row] = []
         self._remark = ""  # that was stored last
         self._warned_read_only = self._said_evicted = False
 
     def __getstate__(self) -> tuple:
-        settings = ("max_rows", "max_response_bytes", "retry_failures", "responses", "verify", "tolerance")
+        settings = ("max_response_bytes", "responses", "verify", "tolerance")
         return self.path, self.file.timeout, {name: getattr(self, name) for name in settings}
 
     def __setstate__(self, state: tuple) -> None:
@@ -233,7 +212,7 @@ class SimulationCache:
             for row in map(Row._make, self._rows(keys)):
                 if not is_undamaged(row) or not (row.reason or len(row.value) == 8 * width):
                     bad.append(row.key)
-                elif not row.reason or not (self.retry_failures or self._may_end(row, limit)):
+                elif not row.reason or not self._may_end(row, limit):
                     good[row.key] = row
             self._drop(bad)
         return CachedRows([good.get(key) for key in keys], width)
@@ -273,24 +252,15 @@ class SimulationCache:
         responses, limit = 0, (self.max_response_bytes,)
         with transaction(connection):
             connection.executemany(STORE, rows)
-            evict = "DELETE FROM rows WHERE id <= (SELECT max(id) FROM rows) - ?"
-            self.evictions += connection.execute(evict, (self.max_rows,)).rowcount
             too_many = "SELECT total(size) > ? FROM rows WHERE size > 0"
             if any(row.size for row in rows) and connection.execute(too_many, limit).fetchone()[0]:
                 sums = "SELECT id, sum(size) OVER (ORDER BY id DESC) AS newest FROM rows WHERE size > 0"
                 evict = f"DELETE FROM rows WHERE id IN (SELECT id FROM ({sums}) WHERE newest > ?)"
                 responses = connection.execute(evict, limit).rowcount
-        self.evictions += responses
         if responses and not self._said_evicted:
             self._said_evicted = True
             text = "%s: the oldest responses are evicted, because all have more than %d bytes (max_response_bytes)"
             logger.info(text, self.path, self.max_response_bytes)
-
-    def are_stored(self, fingerprint: str, thetas: np.ndarray, generation: int | None = None) -> np.ndarray:
-        """Whether rows are stored (n,). They are not verified, not checked for damage, and not counted as hits."""
-        keys = self._keys(fingerprint, thetas, generation)
-        found = {key for (key,) in self._rows(keys, "key")}
-        return np.array([key in found for key in keys], dtype=bool)
 
     # generations --------------------------------------------------------------------------------------------------
 
@@ -304,10 +274,9 @@ class SimulationCache:
 
         Random ones if there are many. Other values of these rows are read by `rows_of`.
         """
-        where = "WHERE source = ? AND generation = ? AND time_limit = 0 AND (length(value) = ? OR length(reason) > ?)"
+        where = "WHERE source = ? AND generation = ? AND time_limit = 0 AND (length(value) = ? OR length(reason) > 0)"
         query = f"SELECT key, theta FROM rows WHERE id IN (SELECT id FROM rows {where} ORDER BY random() LIMIT ?)"
-        shortest = 2**31 if self.retry_failures else 0
-        values = source_number(fingerprint), generation, 8 * width, shortest, MAX_CANDIDATES
+        values = source_number(fingerprint), generation, 8 * width, MAX_CANDIDATES
         return self.file.select(query, values)
 
     def latest_success(self, fingerprint: str, generation: int, width: int) -> Row | None:
@@ -337,15 +306,15 @@ class SimulationCache:
         rows = self.rows_of(simulation_keys(model.fingerprint, np.zeros((1, 0)), 0))
         return reason_of(rows[0]) if rows else ""
 
-    def repeat_remark(self, model: Model) -> None:
+    def repeat_remark(self, model: Model, fingerprint: str) -> None:
         """Log a model's stored remark, once per process, unless the model has just made a remark itself.
 
         A built-in model warns once if a simulation was beyond the range of its laws. Without the stored remark, a later
         process that uses cached simulations would give no warning.
         """
-        if not hasattr(model, "range_remark") or (str(self.path), model.fingerprint) in _repeated:
+        if not hasattr(model, "range_remark") or (str(self.path), fingerprint) in _repeated:
             return
-        _repeated.add((str(self.path), model.fingerprint))
+        _repeated.add((str(self.path), fingerprint))
         text = self.look_up_remark(model)
         if text and not model.range_remark:
             logger.warning("simulations of this model in %s: %s", self.path, text)
@@ -390,7 +359,7 @@ class SimulationCache:
         return self.info().simulations - before
 
     def info(self) -> CacheInfo:
-        """State of the cache, and counts of this object."""
+        """State of the cache."""
         query = (
             "SELECT total(size IS NULL), total(size IS NULL AND length(reason) > 0), total(size > 0), total(size), "
             "total(seconds) FROM rows"
@@ -398,17 +367,7 @@ class SimulationCache:
         with self.file.lock:
             *counted, seconds = (self.file.select(query) or [(0,) * 5])[0]
             size = self.path.stat().st_size if self.path.exists() else 0
-            counts = self.hits, self.misses, self.evictions, self.damaged, self.verified
-            return CacheInfo(self.path, *map(int, counted), seconds, size, *counts)
-
-    def clear(self) -> None:
-        """Delete all rows, for all users of the file; caches in memory are not affected. OSError if that fails."""
-        with self.file.lock:
-            self.file.insist(lambda connection: connection.execute("DELETE FROM rows"))
-            self._waiting.clear()
-            self._remark = ""
-            # returns the space to the disk; may fail while others read
-            self.file.attempt("vacuumed", lambda connection: connection.execute("VACUUM"), None)
+            return CacheInfo(self.path, *map(int, counted), seconds, size)
 
     def forget(self, *fingerprints: str) -> int:
         """Delete all rows with these fingerprints, in all generations, for all users of the file; returns their number.

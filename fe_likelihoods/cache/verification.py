@@ -1,24 +1,19 @@
 """Verification of a cache: stored simulations are run again and compared before they are trusted.
 
-Stored simulations belong to the declared identity of a model. Code and files cannot prove that the model with this
-identity still computes the same results. Therefore stored rows are compared with new simulations. The model's label
-(`fe_likelihoods.simulation.label`) decides how many:
+Code and files cannot prove that the model with a declared identity still computes the same results. The model's label
+(`fe_likelihoods.simulation.label`) decides how many rows are compared; numbers and powers: ``docs/parallel.rst``.
 
-* The label is known in the file: two rows before the first row is used in a process (the row stored last, and a random
-  one of the requested rows), and a random one of every 100 rows used. A difference is an error, `StaleCache`: something
-  that the label does not contain has changed. A change in a share p of the parameter space is noticed with a
-  probability of 1 - (1 - p)^n after n rows, in one process or in several.
-* The label is unknown: enough rows, chosen to cover the parameter space, to detect a change in 5 % of the space with a
-  probability of 95 % (59 rows, or all rows). If all agree, the label is added to the rows' generation (adoption). If
-  one differs, a new generation begins: the earlier rows stay in the file and are not used. Both are logged.
-
-Simulations complete the label with the files that they open.
+* The label is known in the file: the row stored last and a random one before the first row is used in a process, and a
+  random one of every 100 rows used. A difference is an error, `StaleCache`.
+* The label is unknown: enough rows, chosen to cover the parameter space. If all agree, the label is added to the rows'
+  generation (adoption). If one differs, a new generation begins: the earlier rows stay in the file and are not used.
 
 Failures are compared only if there is no successful simulation, since a changed model often fails at the same points.
-Likelihoods of one model and file share their verified and stored rows (`fe_likelihoods.cache.labels.shared_trust`).
+A likelihood, those derived from it and their copies share their verified and stored rows (`Trust`).
 """
 
 import logging
+import secrets
 import time
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -28,17 +23,17 @@ import numpy as np
 
 from ..simulation.files import Opened
 from ..simulation.label import ModelLabel
-from ..simulation.model import Model, SimulationBatch, misfit_of_responses
+from ..simulation.local_pool import LocalPool
+from ..simulation.model import SimulationBatch, misfit_of_responses
 from .comparison import (
     DEFAULT_TOLERANCE,
     Simulated,
     VerifyingRun,
     difference_of,
     is_transient,
-    response_tolerance,
     simulate_again,
 )
-from .labels import Trust, labels_of, shared_trust
+from .labels import Trust, labels_of
 from .rows import CachedRows, Place, Row, pack_rows, reason_of, source_number
 from .simulation_cache import SimulationCache, rows_to_compare
 
@@ -99,8 +94,8 @@ class VerifiedCache:
     object there.
     """
 
-    def __init__(self, cache: SimulationCache, model: Model, pool: Any, label: ModelLabel) -> None:
-        self._set_up(cache, shared_trust(cache, model, pool, label, response_tolerance(model) == 0.0))
+    def __init__(self, cache: SimulationCache, pool: Any, label: ModelLabel) -> None:
+        self._set_up(cache, Trust(label, pool is None or isinstance(pool, LocalPool), secrets.token_hex(16)))
 
     def _set_up(self, cache: SimulationCache, trust: Trust) -> None:
         self.cache, self._trust = cache, trust
@@ -143,12 +138,12 @@ class VerifiedCache:
         """Store simulations under the model's label: statistics and responses, if given, and failures of the model."""
         trust = self._trust
         with trust.lock:
-            stored = trust.find(self.cache.file, run.fingerprint)
+            stored = trust.find(self.cache.file, run)
             if stored is None:
                 if not trust.generations and time.monotonic() < trust.pause_ends:  # it is not known which rows agree
                     return
                 trust.begin(self.cache.file, run.fingerprint, set())
-                stored = trust.find(self.cache.file, run.fingerprint)
+                stored = trust.find(self.cache.file, run)
             place = Place(stored.generation, trust.cpu, trust.session)
         rows = []
         if misfit is not None:
@@ -166,25 +161,11 @@ class VerifiedCache:
         for generation in {each.generation for each in self._trust.stored.values()}:
             self.cache.discard(thetas, *fingerprints, generation=generation)
 
-    def are_stored(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> np.ndarray:
-        """Whether statistics or responses are stored (n,), in any generation that may be used; nothing is verified."""
-        with self._trust.lock:
-            stored = self._trust.find(self.cache.file, run.fingerprint)
-        found = np.zeros(len(thetas), dtype=bool)
-        for name in (fingerprint, run.fingerprint):
-            for generation in self.cache.generations_of(name) if stored is None else [stored.generation]:
-                found |= self.cache.are_stored(name, thetas, generation)
-        return found
-
     # look-ups ---------------------------------------------------------------------------------------------------------
 
     def look_up(self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun) -> CachedRows:
         """Statistics that are stored, some verified; `StaleCache` if one differs although the label is known."""
-        found = self._look_up(fingerprint, thetas, run, run.n_numbers, None)
-        unknown = found.rows.count(None)
-        self.cache.hits += len(thetas) - unknown
-        self.cache.misses += unknown
-        return found
+        return self._look_up(fingerprint, thetas, run, run.n_numbers, None)
 
     def look_up_responses(self, thetas: np.ndarray, run: VerifyingRun) -> list[np.ndarray | str | None]:
         """Responses (n_channels, n_steps) [SI], or reasons of failures for any measurements; None if not stored.
@@ -202,37 +183,28 @@ class VerifiedCache:
     def _look_up(
         self, fingerprint: str, thetas: np.ndarray, run: VerifyingRun, width: int, limit: float | None
     ) -> CachedRows:
-        if run.model is not self._model:
-            if self._model is not None:  # another model object was set
-                with self._trust.lock:
-                    self._trust.start_again()
-                    self._trust.stale = None
-            self._model = run.model
+        trust = self._trust
+        if self._model is not None and run.model is not self._model:  # another model object was set
+            with trust.lock:
+                trust.start_again()
+                trust.stale = None
+        self._model = run.model
         while True:
-            generation = self._generation(fingerprint, run, width)
-            if generation is None:
-                return CachedRows([None] * len(thetas), width)
+            with trust.lock:
+                if fingerprint not in trust.generations:
+                    found = self._find(fingerprint, run, width)
+                    if found is None:
+                        return CachedRows([None] * len(thetas), width)
+                    trust.generations[fingerprint] = found
+                generation = trust.generations[fingerprint]
             rows = self.cache.look_up(fingerprint, thetas, width, generation, limit)
             if not self.cache.verify or self._verify(fingerprint, rows.rows, generation, run, width):
                 return rows
 
-    # the generation ---------------------------------------------------------------------------------------------------
-
-    def _generation(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
-        """Generation whose rows are used; None if no rows of this identity can be used yet."""
-        trust = self._trust
-        if fingerprint not in trust.generations:
-            with trust.lock:
-                found = self._find(fingerprint, run, width)
-                if found is None:
-                    return None
-                trust.generations[fingerprint] = found
-        return trust.generations[fingerprint]
-
     def _find(self, fingerprint: str, run: VerifyingRun, width: int) -> int | None:
         """The generation of a known label, or one that new simulations agree with, or a new one; None: cannot tell."""
-        trust, cache = self._trust, self.cache
-        stored, n = trust.find(cache.file, run.fingerprint), rows_to_compare(cache.verify)
+        trust, cache, kind = self._trust, self.cache, type(run.model).__name__
+        stored, n = trust.find(cache.file, run), rows_to_compare(cache.verify)
         before, source = 0 if stored is None else stored.compared, source_number(run.fingerprint)
         if before >= n > 0:
             return stored.generation
@@ -251,12 +223,11 @@ class VerifiedCache:
                 "%s: the code, a file, a package or the machine of this %s is not that of its stored simulations; up "
                 "to %d of them are simulated again, to see whether they can be used"
             )
-            most = min(n, len(rows[present[0]]))
-            logger.warning(text, cache.path, type(run.model).__name__, most)
+            logger.warning(text, cache.path, kind, min(n, len(rows[present[0]])))
         start = time.monotonic()
         for generation in present:
             chosen = choose_rows(rows[generation], n - before, self._random)
-            result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, fingerprint, run)
+            result = self._compare(cache.rows_of(chosen), len(chosen), FIRST_COMPARED, run)
             if result.row is not None:
                 continue
             if result.compared < len(chosen) / 2:
@@ -266,7 +237,7 @@ class VerifiedCache:
             trust.verified[fingerprint, True] += result.compared
             if stored is None:
                 text = "%s: %d stored simulations of this %s agree with new ones: all are used"
-                logger.warning(text, cache.path, result.compared, type(run.model).__name__)
+                logger.warning(text, cache.path, result.compared, kind)
             return generation
         self._begin(fingerprint, run)
         return trust.stored[source].generation
@@ -287,8 +258,8 @@ class VerifiedCache:
             if not others:
                 return True
             if trust.stale is not None:
-                differing, of_error, error = trust.stale
-                if self.cache.are_stored(differing, error.theta[None], of_error)[0]:
+                differing, error = trust.stale
+                if self.cache.rows_of([differing]):
                     raise StaleCache(str(error), error.theta)
                 trust.stale = None
             if time.monotonic() < trust.pause_ends:
@@ -306,10 +277,16 @@ class VerifiedCache:
             due = served // ROWS_PER_VERIFICATION - trust.verified[kind]
             if due > 0:
                 start = time.monotonic()
-                result = self._compare(self._in_order(latest, others), due, due, fingerprint, run)
-                self._warn_of_stopped(result)
+                result = self._compare(self._in_order(latest, others), due, due, run)
+                if result.stopped:
+                    n, text = len(result.stopped), "" if result.compared else ". Rows are used without verification"
+                    logger.warning(
+                        "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped "
+                        "(%s)%s",
+                        *(self.cache.path, n, n + result.compared, result.stopped[0], text and f"{text} for a while"),
+                    )
                 if result.row is not None:
-                    return self._use_no_rows(result, fingerprint, generation, run)
+                    return self._use_no_rows(result.row, result.new, fingerprint, generation, run)
                 if not result.compared:
                     self._pause(start)
                     return True
@@ -325,7 +302,7 @@ class VerifiedCache:
         shuffled = [rows[place] for place in self._random.permutation(len(rows))]
         yield from (row for row in sorted(shuffled, key=lambda row: bool(row.reason)) if row != latest)
 
-    def _compare(self, rows: Iterable[Row], n: int, size: int, fingerprint: str, run: VerifyingRun) -> _Comparison:
+    def _compare(self, rows: Iterable[Row], n: int, size: int, run: VerifyingRun) -> _Comparison:
         """Simulate rows again, in batches of `size` and more, until n are compared, one differs, or too many stop."""
         rows, compared, stopped = iter(rows), 0, []
         while compared < n and len(stopped) < max(MAX_ATTEMPTS, compared):
@@ -337,11 +314,10 @@ class VerifiedCache:
             for row, new in zip(chosen, self._simulate(thetas, run), strict=True):
                 if is_transient(new.reason):
                     stopped.append(new.reason)
-                elif self._difference(row, new, fingerprint, run)[0]:
+                elif self._difference(row, new, run)[0]:
                     return _Comparison(compared, stopped, row, new)
                 else:
                     compared += 1
-        self.cache.verified += compared
         return _Comparison(compared, stopped)
 
     def _simulate(self, thetas: np.ndarray, run: VerifyingRun) -> list[Simulated]:
@@ -359,19 +335,8 @@ class VerifiedCache:
         now = time.monotonic()
         self._trust.pause_ends = now + max(PAUSE_SECONDS, PAUSE_RATIO * (now - start))
 
-    def _warn_of_stopped(self, result: _Comparison) -> None:
-        if result.stopped:
-            logger.warning(
-                "%s: %d of %d stored simulations could not be verified, because the new simulation was stopped (%s)%s",
-                self.cache.path,
-                len(result.stopped),
-                len(result.stopped) + result.compared,
-                result.stopped[0],
-                "" if result.compared else ". Rows are used without verification for a while",
-            )
-
-    def _difference(self, row: Row, new: Simulated, fingerprint: str, run: VerifyingRun) -> tuple[str, float]:
-        """How a simulation differs from a stored one, in words and relative to the response norm; empty if it agrees.
+    def _difference(self, row: Row, new: Simulated, run: VerifyingRun) -> tuple[str, float]:
+        """How a simulation differs from a stored one, as `_difference`.
 
         A row of another or unknown processor may differ in the last digits.
         """
@@ -382,11 +347,10 @@ class VerifiedCache:
         other = run.tolerance is None and not row.cpu == self._trust.cpu != 0
         return _difference(misfit, reason, new, run, max(run.accepted, DEFAULT_TOLERANCE if other else 0.0))
 
-    def _use_no_rows(self, result: _Comparison, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
+    def _use_no_rows(self, row: Row, new: Simulated, fingerprint: str, generation: int, run: VerifyingRun) -> bool:
         """Begin a new generation, if the label was adopted and no row was used; False. `StaleCache` otherwise."""
-        row, new, trust = result.row, result.new, self._trust
-        theta = np.frombuffer(row.theta, dtype="<f8")
-        difference, change = self._difference(row, new, fingerprint, run)
+        trust, theta = self._trust, np.frombuffer(row.theta, dtype="<f8")
+        difference, change = self._difference(row, new, run)
         start = time.perf_counter()
         (once_more,) = simulate_again(run, theta[None])
         self.seconds += time.perf_counter() - start
@@ -409,14 +373,14 @@ class VerifiedCache:
         if spread:
             text += f", or accept such differences with SimulationCache(path, tolerance={10.0 * spread:.1e})"
         elif row.reason and not scatter:
-            text += ". If failures depend on anything but the parameters, set retry_failures=True"
+            text += ". Also do so if failures depend on anything but the parameters, such as a licence"
         elif 0.0 < change < LARGEST_ROUNDING and not scatter:
             text += (
                 ". If the model is not exactly repeatable, for example on another machine, accept differences of this "
                 f"size, {change:.1e} of the response, with SimulationCache(path, tolerance={2.0 * change:.1e})"
             )
-        trust.stale = fingerprint, generation, StaleCache(text, theta)
-        raise trust.stale[2]
+        trust.stale = row.key, StaleCache(text, theta)
+        raise trust.stale[1]
 
 
 def _difference(
@@ -424,10 +388,8 @@ def _difference(
 ) -> tuple[str, float]:
     """How a simulation differs from an earlier one, in words and relative to the response norm; empty if it agrees."""
     if reason or new.reason:
-        if reason and new.reason:
-            return "", 0.0
         was, now = (f"failed ({text})" if text else "succeeded" for text in (reason, new.reason))
-        return f"it {was}; simulated again, it {now}", 0.0
+        return ("" if reason and new.reason else f"it {was}; simulated again, it {now}"), 0.0
     found = difference_of(earlier, new, run, tolerance)
     if found is None:
         return "", 0.0

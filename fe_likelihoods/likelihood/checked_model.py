@@ -44,9 +44,8 @@ class CheckedModel:
         self._set_up(model, statistic, cache, pool)
 
     def _set_up(self, model: Model, statistic: Statistic | None, cache: SimulationCache | None, pool: Any) -> None:
-        label = ModelLabel(model, statistic)
-        self.rows = None if cache is None else VerifiedCache(cache, model, pool, label)
-        self._label = label
+        self.label = ModelLabel(model, statistic)
+        self.rows = None if cache is None else VerifiedCache(cache, pool, self.label)
         self._known = self.label.items | self.label.opened.items() | {_FINGERPRINT: model.fingerprint}
         self._repeated = 0
         self._begin()
@@ -59,17 +58,17 @@ class CheckedModel:
         self._was_sent = False  # from another process, by a pool whose workers import the code
 
     def __getstate__(self) -> tuple:
-        return self.rows, self._label, self._known, self._repeated, os.getpid()
+        return self.rows, self.label, self._known, self._repeated, os.getpid()
 
     def __setstate__(self, state: tuple) -> None:
-        self.rows, self._label, self._known, self._repeated, pid = state
+        self.rows, self.label, self._known, self._repeated, pid = state
         self._begin()
         self._was_sent = pid != os.getpid() and not is_arriving()  # by value
+        self._share_label()
 
-    @property
-    def label(self) -> ModelLabel:
-        """Label of the model, shared by likelihoods with the same model and file."""
-        return self._label if self.rows is None else self.rows.label
+    def _share_label(self) -> None:
+        """Use the label of the rows, shared by likelihoods with the same model and file."""
+        self.label = self.label if self.rows is None else self.rows.label
 
     @property
     def compared(self) -> int:
@@ -79,7 +78,7 @@ class CheckedModel:
     def complete(self, opened: Opened | None) -> None:
         """Add the files that simulations opened to the model's label."""
         if self.rows is None:
-            self._label.add(opened)
+            self.label.add(opened)
         else:
             self.rows.complete(opened)
 
@@ -87,6 +86,7 @@ class CheckedModel:
         """Trust rows that another simulator has verified or stored, unless its code differs."""
         if self.rows is not None and other.rows is not None:
             self.rows.share_trust(other.rows)
+            self._share_label()
 
     def before(self, run: VerifyingRun, earlier: Callable[[], list]) -> None:
         """Compare the model before simulations, unless the last comparison was too recent.
@@ -95,7 +95,7 @@ class CheckedModel:
         `ChangedModel`; the simulations at `unchecked` may be from before or after the change.
         """
         if not self._points and not self.has_results:
-            start, changed = time.monotonic(), self._changed(run.model)
+            start, changed = time.monotonic(), self._changed(run.model, run.fingerprint)
             self._renew(changed)
             if not changed.keys() <= self.label.changing:  # nothing was used yet: the model is labelled as it is now
                 self._require_what_was_sent(run.model, changed)
@@ -105,7 +105,7 @@ class CheckedModel:
         self._points = self._points or earlier()
         self._is_due = time.monotonic() >= self._not_before
         if self._is_due:
-            self._require_same(run)
+            self._require_same(run, run.fingerprint)
             pause = max(0.0, 2.0 * self._last_seconds - _NO_TIME) / _SHARE_OF_TIME
             self._not_before = time.monotonic() + pause
 
@@ -125,7 +125,7 @@ class CheckedModel:
         if not here and not self._points:
             self._points = points  # threads share the model, which may have changed itself: these can be repeated
         if due and (here or self._points):
-            self._require_same(run, simulated_here=here)
+            self._require_same(run, run.model.fingerprint, simulated_here=here)
         if points and (not self.unchecked or not self._points):
             self._points = [(self._points or points)[0], points[-1]]
         return due
@@ -141,19 +141,19 @@ class CheckedModel:
                 "make a new likelihood"
             )
 
-    def _changed(self, model: Model) -> dict[str, str | None]:
+    def _changed(self, model: Model, fingerprint: str) -> dict[str, str | None]:
         """Present digests of what has changed, None if it is gone; a file counts from when a simulation opened it."""
         known = self.label.opened.items() | self._known
-        now = self.label.present(model) | {_FINGERPRINT: model.fingerprint}
+        now = self.label.present(model) | {_FINGERPRINT: fingerprint}
         return {name: now.get(name) for name in known.keys() | now.keys() if known.get(name) != now.get(name)}
 
     def _renew(self, changed: Mapping[str, str | None]) -> None:
         # the same objects where nothing has changed, so that pickles stay small
         self._known = {name: digest for name, digest in (self._known | changed).items() if digest is not None}
 
-    def _require_same(self, run: VerifyingRun, simulated_here: bool = False) -> None:
+    def _require_same(self, run: VerifyingRun, fingerprint: str, simulated_here: bool = False) -> None:
         """Raise `ChangedModel` if the model has changed, except for values that it changes itself."""
-        start, changed = time.monotonic(), self._changed(run.model)
+        start, changed = time.monotonic(), self._changed(run.model, fingerprint)
         self._last_seconds = time.monotonic() - start
         if changed:
             usual = changed.keys() <= self.label.changing
@@ -173,7 +173,7 @@ class CheckedModel:
                     "to be a parameter"
                 )
             self.label.has_changed_itself(changed)
-            self._renew(self._changed(run.model))
+            self._renew(self._changed(run.model, run.model.fingerprint))
         self.unchecked.clear()
         self._last_seconds = time.monotonic() - start
 

@@ -8,7 +8,7 @@ posterior, and a part is not simulated where an earlier one is -inf.
 import logging
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
 from contextlib import suppress
 from queue import SimpleQueue
@@ -41,25 +41,24 @@ class _Point:
 
 
 class _Part:
-    """The points that wait for the simulations of one likelihood, whose parameters are `columns` of the points."""
+    """One likelihood, whose parameters are `columns` of the points, and the points that wait for its simulations."""
 
     def __init__(self, likelihood: FELikelihood, columns: list[int]) -> None:
         self.likelihood, self.simulator, self.columns = likelihood, likelihood.simulator, columns
-        self.running: dict[bytes, Simulation] = {}
-        self.points: dict[Simulation, list[_Point]] = {}
-        self.unstarted: list[_Point] = []  # without a pool that takes single items
+        self.waiting: dict[bytes, tuple[Simulation, list[_Point]]] = {}
 
-    def thetas(self, points: Sequence[_Point]) -> np.ndarray:
-        """Structural parameters (n, n_structural)."""
-        return np.array([point.row[self.columns] for point in points])[:, : self.simulator.n_structural]
+    @property
+    def running(self) -> list[Simulation]:
+        """Simulations that are waited for."""
+        return [simulation for simulation, _ in self.waiting.values()]
 
 
 class EvaluationQueue:
     """Queue of points at which a posterior is evaluated, see `Posterior.evaluation_queue`.
 
     Its methods are called from one thread. With a pool of the likelihood, each simulation is sent to it when the point
-    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `collect` runs
-    the next few simulations. With `responses`, the likelihood caches these as well, for its `simulate`.
+    is submitted, and duplicates are simulated once. Without a pool, or with one that has ``map`` only, `submit` waits
+    for the simulations. With `responses`, the likelihood caches these as well, for its `simulate`.
     """
 
     def __init__(self, likelihood: FELikelihood | JointLikelihood, prior: Prior, responses: bool = False) -> None:
@@ -89,7 +88,7 @@ class EvaluationQueue:
         return None if None in sizes else sum(sizes)
 
     def submit(self, coords: Any) -> list[int]:
-        """Submit points (n, ndim) without waiting; returns n tickets, each of which `collect` returns once.
+        """Submit points (n, ndim); returns n tickets, each of which `collect` returns once.
 
         Points outside the support of the prior, with impossible noise parameters, or whose simulations are cached, are
         finished at once. ValueError for another shape, RuntimeError if the queue is closed.
@@ -100,21 +99,19 @@ class EvaluationQueue:
         if rows.ndim != 2:
             raise ValueError(f"submit: expected points of shape (n, {len(names)}); got shape {rows.shape}")
         # row by row, so that the values are the same as for single points to the last bit
-        log_prior = [float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows]
+        log_prior = np.array([float(np.atleast_1d(self._prior.logpdf(row[None]))[0]) for row in rows])
         first, self._tickets = self._tickets, self._tickets + len(rows)
         self._pending += len(rows)
-        points = [_Point(first + place, *each) for place, each in enumerate(zip(rows, log_prior, strict=True))]
-        possible = np.array(log_prior) > -np.inf
+        possible = log_prior > -np.inf
         for part in self._parts:
             possible[possible] = part.likelihood.possible(rows[possible][:, part.columns])
-        for point in points:
-            if not possible[point.ticket - first]:
-                self._finished.append((point.ticket, -np.inf))
+        self._finished += [(first + int(place), -np.inf) for place in np.flatnonzero(~possible)]
+        points = [_Point(first + int(place), rows[place], log_prior[place]) for place in np.flatnonzero(possible)]
         try:
-            self._advance(0, [point for point in points if possible[point.ticket - first]])
+            self._advance(0, points)
         except Exception as error:  # raised by `collect`
             self._error = self._error or error
-        return [point.ticket for point in points]
+        return list(range(first, self._tickets))
 
     def collect(self) -> list[tuple[int, float]]:
         """Wait until a point is finished; tickets and log-probabilities in the order in which the points finished.
@@ -131,10 +128,9 @@ class EvaluationQueue:
             if self._error is not None:
                 raise self._error
             for part in self._parts:
-                if part.points:
+                if part.waiting:
                     part.simulator.check_failures()
-            if not self._evaluate_some():
-                self._receive(wait=True)
+            self._receive(wait=True)
         self._collected, self._finished = self._finished, []
         self._pending -= len(self._collected)
         return self._collected
@@ -147,86 +143,72 @@ class EvaluationQueue:
         self._require_open()
         for part in self._parts:
             # not all of them may have announced their end
-            self._taken += [each for each in part.points if each.future.done()]
+            self._taken += [each for each in part.running if each.future.done()]
         self._receive(wait=False)
         return self._collected + self._finished
 
     def close(self) -> None:
         """Cancel points that the pool has not started; running ones are cached when they end. May be called twice."""
-        if self._closed:
-            return
-        self._closed = True
-        for part in self._parts:
-            left = part.simulator.leave(part.points, running=False)
+        for part in () if self._closed else self._parts:
+            left = part.simulator.leave(part.running, running=False)
             if left:
                 threading.Thread(target=_cache_rest, args=(part.simulator, left), daemon=True).start()
+        self._closed = True
 
     def _require_open(self) -> None:
         if self._closed:
             raise RuntimeError("the queue is closed: make another one with posterior.evaluation_queue()")
 
-    def _advance(self, stage: int, points: list[_Point]) -> None:
-        """Evaluate points in one of the parts: at once if their simulations are cached."""
-        part = self._parts[stage]
-        if not part.simulator.streams:
-            part.unstarted += points
-        elif points:
-            thetas = part.thetas(points) + 0.0
-            keys = [theta.tobytes() for theta in thetas]
-            new = [place for place, key in enumerate(keys) if key not in part.running]
-            found = dict(zip(new, part.simulator.request(thetas[new], self._responses, self._arrived), strict=True))
-            for place, point in enumerate(points):
-                simulation = found[place] if place in found else part.running[keys[place]]
-                if simulation.future is None:
-                    self._pass_on(stage, point, simulation.result.statistics)
-                else:
-                    part.running[keys[place]] = simulation
-                    part.points.setdefault(simulation, []).append(point)
-
-    def _evaluate_some(self) -> bool:
-        """Evaluate some points of a part that has no pool for single items; returns whether there were any."""
-        stage = next((stage for stage, part in enumerate(self._parts) if part.unstarted), None)
-        if stage is None:
-            return False
-        part = self._parts[stage]
-        some = part.unstarted[: self.workers]
-        thetas = part.thetas(some)
-        if self._responses:
-            part.simulator.simulate(thetas)
-        statistics = part.simulator.statistics(thetas)
-        del part.unstarted[: len(some)]
-        for point, row in zip(some, statistics, strict=True):
-            self._pass_on(stage, point, row)
-        return True
+    def _advance(self, stage: int, points: Sequence[_Point]) -> None:
+        """Evaluate points in one of the parts: at once if their simulations are cached, or cannot be submitted."""
+        if not points:
+            return
+        part, simulator = self._parts[stage], self._parts[stage].simulator
+        thetas = np.array([point.row[part.columns] for point in points])[:, : simulator.n_structural] + 0.0
+        if not simulator.streams:
+            if self._responses:
+                simulator.simulate(thetas)
+            self._pass_on(stage, points, simulator.statistics(thetas))
+            return
+        keys = [theta.tobytes() for theta in thetas]
+        new = [place for place, key in enumerate(keys) if key not in part.waiting]
+        found = dict(zip(new, simulator.request(thetas[new], self._responses, self._arrived), strict=True))
+        for place, (key, point) in enumerate(zip(keys, points, strict=True)):
+            if isinstance(found.get(place), np.ndarray):
+                self._pass_on(stage, [point], [found[place]])
+            else:
+                part.waiting.setdefault(key, (found.get(place), []))[1].append(point)
 
     @interrupts_end_the_run()
     def _receive(self, wait: bool) -> None:
         """Take simulations that have ended; with `wait`, at least one."""
         self._taken += take_all(self._arrived, wait=wait and not self._taken)
         for stage, part in enumerate(self._parts):
-            ended = [each for each in dict.fromkeys(self._taken) if each in part.points]
+            running = set(part.running)
+            ended = [each for each in dict.fromkeys(self._taken) if each in running]
             with suppress(Exception):  # which is the error of each simulation
                 part.simulator.receive(ended)
             for simulation in ended:
-                points = part.points.pop(simulation)
-                del part.running[simulation.key]
+                _, points = part.waiting.pop(simulation.key)
                 try:
                     if simulation.error is not None:
                         raise simulation.error
-                    for point in points:
-                        self._pass_on(stage, point, simulation.result.statistics)
+                    self._pass_on(stage, points, [simulation.statistics] * len(points))
                 except Exception as error:
                     self._error = self._error or error
         self._taken.clear()
 
-    def _pass_on(self, stage: int, point: _Point, statistics: np.ndarray) -> None:
-        """Pass a point on to the next part, from the statistics (n_numbers,) of its simulation."""
-        part = self._parts[stage]
-        point.log_likelihood += float(part.likelihood.of_statistics(point.row[None, part.columns], statistics[None])[0])
-        if point.log_likelihood == -np.inf or stage + 1 == len(self._parts):
-            self._finished.append((point.ticket, point.log_prior + point.log_likelihood))
-        else:
-            self._advance(stage + 1, [point])
+    def _pass_on(self, stage: int, points: Sequence[_Point], statistics: Iterable[np.ndarray]) -> None:
+        """Pass points on to the next part, from the statistics (n_numbers,) of their simulations."""
+        part, left = self._parts[stage], []
+        for point, row in zip(points, statistics, strict=True):
+            value = part.likelihood.of_statistics(point.row[None, part.columns], row[None])
+            point.log_likelihood += float(value[0])
+            if point.log_likelihood == -np.inf or stage + 1 == len(self._parts):
+                self._finished.append((point.ticket, float(point.log_prior + point.log_likelihood)))
+            else:
+                left.append(point)
+        self._advance(stage + 1, left)
 
 
 def _cache_rest(simulator: Simulator, left: list[Simulation]) -> None:

@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,10 +15,8 @@ __all__ = ["FailureLog", "TooManyFailures", "reason_without_numbers"]
 logger = logging.getLogger(__name__)
 
 _MAX_RECORDS = 1000
-_MOST_KEPT = 10_000  # failures whose reason is found by their parameters
 _MAX_REASONS = 100
 _OTHER_REASONS = "other reasons"
-_OTHER_FAULTS = "other faults of the infrastructure"
 _MIN_SIMULATIONS = 20  # before the share of failures is checked
 # A point without digits after it belongs to the number in arrays, "[1. 2.]", and before an exponent, "2.e-3".
 _DIGITS = r"\d+(?:\.\d+|\.(?=\s*(?:[-+\d\]),]|\.\d)|e[-+]?\d))?|\.\d+"
@@ -50,7 +48,7 @@ class FailureLog:
     the model, so that a later run simulates the point again. `records` has ``{"parameters": {name: value}, "reason":
     str}`` of the first 1000 failures of each of these two kinds, with ``"seconds"`` where known and ``"transient":
     True``. `reasons` counts failures per reason; after the first 100 reasons by their text without numbers, and after
-    100 of these in two groups, the model's failures and others.
+    100 of these together.
     """
 
     def __init__(self, parameter_names: Sequence[str], max_share: float) -> None:
@@ -60,22 +58,7 @@ class FailureLog:
         self.outcomes = self.count = self.transient = 0
         self.records: list[dict] = []
         self.reasons: Counter[str] = Counter()
-        self._reasons_of_model: set[str] = set()
-        self._transient_reasons: set[str] = set()
         self._names = tuple(parameter_names)
-        self._latest: OrderedDict[bytes, str] = OrderedDict()  # reasons by structural parameters
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | {"_latest": OrderedDict()}
-
-    def reason(self, theta: np.ndarray) -> str:
-        """Reason of the failure at the structural parameters `theta`; empty if none of the last failures was there."""
-        return self._latest.get((theta + 0.0).tobytes(), "")
-
-    def fault(self, theta: np.ndarray) -> str:
-        """Reason of the failure at the structural parameters `theta` if its cause is not the model, else empty."""
-        reason = self.reason(theta)
-        return split_seconds(reason)[0] if isinstance(reason, TransientReason) else ""
 
     def count_outcomes(self, thetas: np.ndarray, reasons: Sequence[str]) -> None:
         """Count simulations at structural parameters (n, n_structural), and record those that have a reason."""
@@ -88,9 +71,6 @@ class FailureLog:
         """Record one failure at the structural parameters `theta` (n_structural,); the first one is logged."""
         parameters = dict(zip(self._names, theta.tolist(), strict=True))
         transient = isinstance(reason, TransientReason)
-        self._latest[(theta + 0.0).tobytes()] = reason
-        if len(self._latest) > _MOST_KEPT:
-            self._latest.popitem(last=False)
         reason, seconds = split_seconds(reason)
         if not self.count or (transient and not self.transient):
             logger.warning(
@@ -108,9 +88,14 @@ class FailureLog:
                 self.records[-1]["seconds"] = seconds
             if transient:
                 self.records[-1]["transient"] = True
-        known = self._transient_reasons if transient else self._reasons_of_model
-        other = _OTHER_FAULTS if transient else _OTHER_REASONS
-        self.reasons[_counted_under(reason, known) or other] += 1
+        self.reasons[self._counted_under(reason)] += 1
+
+    def _counted_under(self, reason: str) -> str:
+        """The text under which a reason is counted."""
+        for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
+            if text in self.reasons or len(self.reasons) < most:
+                return text
+        return _OTHER_REASONS
 
     def check(self, running: int = 0) -> None:
         """Raise `TooManyFailures` if too large a share of the simulations (20 or more) failed.
@@ -127,12 +112,3 @@ class FailureLog:
                 f"largest share allowed is {self.max_share:g}. See failures and report(); then correct the model, "
                 "narrow the prior or raise max_failure_share"
             )
-
-
-def _counted_under(reason: str, known: set[str]) -> str:
-    """The text under which a reason is counted, added to `known`; empty if there are too many texts."""
-    for text, most in ((reason, _MAX_REASONS), (reason_without_numbers(reason), 2 * _MAX_REASONS)):
-        if text in known or len(known) < most:
-            known.add(text)
-            return text
-    return ""

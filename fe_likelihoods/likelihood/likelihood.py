@@ -275,8 +275,8 @@ class FELikelihood(SumOfParts):
         return self.measurements.values - response
 
     def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels) at structural parameters, see `Simulator.misfit`."""
-        return self.simulator.misfit(thetas)
+        """Sums of squared residuals (n, n_channels) [SI unit squared] at structural parameters; NaN for failures."""
+        return self.simulator.statistics(thetas)[:, : self.measurements.n_channels]
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
         """Responses (n, n_channels, n_steps) at structural parameters, which are cached, see `Simulator.simulate`."""
@@ -371,7 +371,7 @@ class FELikelihood(SumOfParts):
         points = np.atleast_2d(as_points(x, self.parameter_names))
         drawn = self.noise.noise.parameter_names
         uniform = uniform_numbers((len(points), len(drawn)), rng)
-        sigmas = self.noise.draw(self.simulator.misfit(points), self.n_samples, uniform)
+        sigmas = self.noise.draw(self.misfit(points), self.n_samples, uniform)
         names = (*self.parameter_names, *drawn)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))
 

@@ -17,7 +17,6 @@ import numpy as np
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
-from .block_likelihood import BlockLogLikelihood
 from .evaluation_queue import EvaluationQueue
 from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
@@ -460,7 +459,9 @@ class Posterior:
     def predictive_draws(self, samples: Any, block: float | None = None, seed: int = 0) -> PredictiveDraws:
         """Predictions of the measurements by samples of the posterior, and the log-likelihood in blocks of time.
 
-        The responses are cached, like those for a guide; cached ones are not simulated again.
+        The terms of all blocks (`PredictiveDraws.blocks`), for leave-one-out cross-validation, add up to
+        `log_likelihood`; for a `marginal` posterior they do so for one draw of its noise parameters. The responses are
+        cached, like those for a guide; cached ones are not simulated again.
 
         Parameters
         ----------
@@ -485,25 +486,6 @@ class Posterior:
         """
         self._check_models("a prediction")
         return predictive_draws(self.likelihood, as_points(samples, self.prior.names), block, seed)
-
-    def block_log_likelihood(self, samples: Any, seconds: float | None = None) -> BlockLogLikelihood:
-        """Log-likelihood of samples in blocks of time, for leave-one-out cross-validation.
-
-        The terms of all blocks add up to `log_likelihood`. For a `marginal` posterior they do so for one draw of its
-        noise parameters.
-
-        Parameters
-        ----------
-        samples : (n, ndim) float, or mapping
-            Samples of the posterior.
-        seconds : float, optional
-            Length of a block [s]; see `predictive_draws`, whose errors are raised here too.
-
-        Returns
-        -------
-        BlockLogLikelihood
-        """
-        return self.predictive_draws(samples, seconds).blocks
 
     def evaluation_queue(self, responses: bool = False) -> EvaluationQueue:
         """A queue of points whose log-probabilities are returned in the order in which their simulations end.
@@ -586,8 +568,3 @@ class Posterior:
         1
         """
         return self.likelihood.report()
-
-
-def _family(distribution: str) -> str:
-    """Name of a distribution without its parameters, which are in the unit of the samples."""
-    return distribution.removeprefix("FrozenDistribution(").partition("(")[0]

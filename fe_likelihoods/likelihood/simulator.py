@@ -1,9 +1,10 @@
 """Simulations of a model and their statistics against measurements: each is run once, counted, cached and verified.
 
-A request first takes what is known (`fe_likelihoods.likelihood.known_simulations`). The other simulations are sent to
-a pool to which single items can be submitted, and each is cached when it arrives, so that nothing waits for a batch.
-Without such a pool they are run in parts, and each part is cached when it has ended: in this process (compiled models
-on threads), or by the ``map`` of a pool.
+A request first takes what is known: statistics in memory and on disk, then responses in memory and on disk, from which
+the statistics are computed with the same bits as from a new simulation. The other simulations are sent to a pool to
+which single items can be submitted, and each is cached when it arrives, so that nothing waits for a batch. Without such
+a pool they are run in parts, and each part is cached when it has ended: in this process (compiled models on threads),
+or by the ``map`` of a pool.
 """
 
 import hashlib
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError, Future
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from samplers.interrupts import interrupts_end_the_run
 from ..cache.comparison import VerifyingRun, observed
 from ..cache.memory import MemoryCache, ResponseMemory, distinct_keys, thetas_of
 from ..cache.simulation_cache import SimulationCache
+from ..cache.verification import StaleCache
 from ..noise.statistics import Statistic, statistic_width
 from ..priors.points import as_rows
 from ..signals.channels import Measurements
@@ -43,36 +45,60 @@ from ..simulation.model import (
 from .checked_model import CheckedModel
 from .failure_log import FailureLog
 from .inputs import check_statistic, name_of_statistic
-from .known_simulations import KnownSimulations, Requested
 
-__all__ = ["Simulated", "Simulation", "Simulator", "take_all"]
+__all__ = ["Simulation", "Simulator", "take_all"]
 
 _SECONDS_PER_CHUNK = 5.0  # simulation time between two writes to the cache on disk
 _ROUNDS_PER_CHUNK = 8  # simulations per worker and chunk: at the end of a chunk, workers idle half a round on average
 
 
-class Simulated(NamedTuple):
-    """Result of one simulation: its statistics, the reason of a failure, and its response if it was requested."""
+class _Request:
+    """Distinct simulations that were requested, whose results are filled in.
 
-    statistics: np.ndarray
-    reason: str
-    response: np.ndarray | None
+    For n `keys` (see `distinct_keys`): `thetas` (n, n_structural), `statistics` (n, n_numbers), NaN where not known,
+    `reasons` of failures, `responses` (n, n_channels, n_steps) if requested, and whether the statistics are `known`,
+    nothing is to be simulated (`done`), and a result was read from the disk (`on_disk`).
+    """
+
+    def __init__(self, keys: list[bytes], full: bool, run: VerifyingRun) -> None:
+        self.keys, self.run = keys, run
+        self.thetas = thetas_of(keys, len(run.model.parameter_names))
+        self.finite = np.isfinite(self.thetas).all(axis=1)
+        self.reasons = ["" if fine else "the parameters are not finite" for fine in self.finite]
+        shape = len(keys), len(run.model.channels), run.model.n_steps
+        self.responses = np.full(shape, np.nan) if full else None
+        self.statistics = self.known = self.done = np.empty(0)
+        self.on_disk = np.zeros(len(keys), bool)
+
+    def fill(self, row: int, statistics: np.ndarray, reason: str, response: np.ndarray | None = None) -> None:
+        """Enter the result of one simulation."""
+        self.statistics[row], self.reasons[row], self.known[row], self.done[row] = statistics, reason, True, True
+        if self.responses is not None:
+            self.responses[row] = np.nan if reason or response is None else response
 
 
 class Simulation:
-    """A simulation that was requested of a `Simulator`, by the key of its parameters (see `distinct_keys`).
+    """A simulation that runs in the pool of a `Simulator`: row `row` of a request, whose result is filled in there.
 
-    A known one has a `result` at once. One that was sent to a pool has a `future`; it is `received` when it has ended
-    or was cancelled, and then has a `result`, or an `error` for which the model is not to blame. `full` ones return
-    their response.
+    It is `received` when it has ended or was cancelled, and then has an `error` if its result is not known.
     """
 
-    __slots__ = ("error", "full", "future", "key", "received", "result")
+    __slots__ = ("error", "future", "received", "request", "row")
 
-    def __init__(self, key: bytes, full: bool, future: Future | None = None, result: Simulated | None = None) -> None:
-        self.key, self.full, self.future, self.result = key, full, future, result
+    def __init__(self, request: _Request, row: int, future: Future) -> None:
+        self.request, self.row, self.future = request, row, future
         self.error: BaseException | None = None
         self.received = False
+
+    @property
+    def key(self) -> bytes:
+        """Key of the parameters."""
+        return self.request.keys[self.row]
+
+    @property
+    def statistics(self) -> np.ndarray:
+        """Statistics (n_numbers,), when it has been received without an error."""
+        return self.request.statistics[self.row]
 
 
 def take_all(arrived: SimpleQueue, wait: bool) -> list[Simulation]:
@@ -98,13 +124,12 @@ class _Running:
 class Simulator:
     """A model's simulations, compared with measurements in the order of the model's channels; each is run once.
 
-    `statistics` and, where responses are needed, `simulate` wait for their simulations. `request`, `receive` and
-    `leave` are for those who go on meanwhile, and need a pool that `streams`. Options are those of `FELikelihood`; the
-    statistic is the sums of squares by default. `measured` are values (n_channels, n_steps), or a `Comparison` where
-    samples are missing. `simulations`, `cache_hits` and `disk_hits` count simulations run by this object in this
-    process, cached rows, and rows from the disk; `failures` include known ones from the disk. `chunk_size` simulations
-    are run between two writes to the disk, adapted to their duration; `when_simulated` is called with the number that
-    have ended, in this process only.
+    `run` waits for its simulations. `request`, `receive` and `leave` are for those who go on meanwhile, and need a pool
+    that `streams`. Options are those of `FELikelihood`; the statistic is the sums of squares by default. `measured` are
+    values (n_channels, n_steps), or a `Comparison` where samples are missing. `simulations`, `cache_hits` and
+    `disk_hits` count simulations run by this object in this process, cached rows, and rows from the disk; `failures`
+    include known ones from the disk. `chunk_size` simulations are run between two writes to the disk, adapted to their
+    duration; `when_simulated` is called with the number that have ended, in this process only.
     """
 
     def __init__(
@@ -130,7 +155,6 @@ class Simulator:
         self.memory_cache, self.response_memory = MemoryCache(memory_rows), ResponseMemory(memory_bytes)
         self._checked = CheckedModel(model, statistic, self.cache, self.pool)
         self._key = self.simulation_key
-        self._known = KnownSimulations(self._key, self.memory_cache, self.response_memory, self._checked, self.failures)
         self.chunk_size = 1
         self.simulations = self.cache_hits = self.disk_hits = 0
         self._seconds = 0.0
@@ -160,12 +184,8 @@ class Simulator:
 
     def report(self) -> dict:
         """Summary of the simulations that were requested in this process, see `Posterior.report`."""
-        return {
-            "simulations": self.simulations,
-            "verifications": self.verifications,
-            "unverified": self.unverified,
-            "cache_hits": self.cache_hits,
-            "disk_hits": self.disk_hits,
+        names = ("simulations", "verifications", "unverified", "cache_hits", "disk_hits")
+        return {name: getattr(self, name) for name in names} | {
             "failures": list(self.failures.records),
             "failure_count": self.failures.count,
             "transient_failures": self.failures.transient,
@@ -194,110 +214,160 @@ class Simulator:
 
     def share(self, other: "Simulator") -> None:
         """Use the responses in memory of another simulator, and trust the rows that it has verified."""
-        self.response_memory = self._known.responses = other.response_memory
+        self.response_memory = other.response_memory
         self._checked.share_trust(other._checked)
 
     # requests -----------------------------------------------------------------------------------------------------
 
-    def misfit(self, thetas: np.ndarray) -> np.ndarray:
-        """Sums of squared residuals (n, n_channels) [SI unit squared]; NaN for failures."""
-        return self.statistics(thetas)[:, : self.measurements.n_channels]
-
-    def statistics(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None) -> np.ndarray:
-        """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural); NaN if failed.
-
-        Duplicates are simulated once, cached rows are reused, and non-finite rows are skipped. Where `possible`, called
-        unless all rows are in memory, is False (n,), nothing is simulated and rows may be NaN. Raises
-        `TooManyFailures`, `ChangedModel` or `StaleCache`; simulations that have ended are cached, except after the
-        model has changed.
-        """
-        keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
-        statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
-        if all(known):
-            self.cache_hits += len(which)
-        elif possible is not None and not (wanted := possible()).all():
-            statistics = np.full((len(which), self.n_numbers), np.nan)
-            if wanted.any():
-                statistics[wanted] = self.statistics(thetas[wanted])
-            return statistics
-        else:
-            requested, run = self._look_up(keys, which, False)
-            left = np.flatnonzero(~requested.done)
-            statistics = requested.statistics
-            if len(left):
-                statistics[left] = [new.statistics for new in self._new([keys[row] for row in left], False, run)]
-        return statistics if len(keys) == len(which) else statistics[which]
+    def statistics(self, thetas: np.ndarray) -> np.ndarray:
+        """Statistics (n, n_numbers) that the noise needs, at structural parameters (n, n_structural), see `run`."""
+        return self.run(as_rows(thetas, self.model.parameter_names))
 
     def simulate(self, thetas: np.ndarray) -> SimulationBatch:
-        """Responses (n, n_channels, n_steps) [SI] at structural parameters (n, n_structural); NaN and reason if failed.
+        """Responses (n, n_channels, n_steps) [SI] at structural parameters (n, n_structural), see `run`.
 
-        They and their statistics are cached. Duplicates are simulated once, and cached responses are reused. A point
-        whose statistics are cached without its response is simulated again, unless it failed. Raises the errors of
-        `statistics`.
+        A point whose statistics are cached without its response is simulated again, unless it failed.
         """
-        keys, which = distinct_keys(as_rows(thetas, self.model.parameter_names))
-        requested, run = self._look_up(keys, which, True)
-        left = np.flatnonzero(~requested.done)
-        for row, new in zip(left, self._new([keys[row] for row in left], True, run), strict=True):
-            requested.responses[row], requested.reasons[row] = new.response, new.reason
-        if len(keys) == len(which):
-            return SimulationBatch(requested.responses, requested.reasons)
-        return SimulationBatch(requested.responses[which], [requested.reasons[row] for row in which])
+        request, which = self.run(as_rows(thetas, self.model.parameter_names), full=True)
+        return SimulationBatch(request.responses[which], [request.reasons[row] for row in which])
 
-    def request(self, thetas: np.ndarray, full: bool, arrived: SimpleQueue) -> list[Simulation]:
-        """Simulations at n structural parameters, sent to the pool unless they are known; duplicates are one object.
+    def run(self, thetas: np.ndarray, possible: Callable[[], np.ndarray] | None = None, full: bool = False) -> Any:
+        """Statistics (n, n_numbers) at structural parameters (n, n_structural), NaN if failed.
 
-        Those that have a `future` will come through the queue `arrived` when they have ended: pass them to `receive`,
-        or to `leave` if they are not needed any more. Raises the errors of `statistics`.
+        With `full`, the request with responses, and the row in it of each point. Duplicates are simulated once, results
+        are cached, cached ones are reused, and non-finite rows are skipped. Where `possible`, called unless all rows
+        are in memory, is False (n,), nothing is simulated and rows may be NaN. Raises `TooManyFailures`, `ChangedModel`
+        or `StaleCache`; simulations that have ended are cached, except after the model has changed.
         """
         keys, which = distinct_keys(thetas)
-        requested, run = self._look_up(keys, which, full)
-        found: dict[int, Simulation] = {}
-        for row in np.flatnonzero(requested.done).tolist():
-            response = requested.responses[row] if full else None
-            result = Simulated(requested.statistics[row], requested.reasons[row], response)
-            found[row] = Simulation(keys[row], full, result=result)
-        left = np.flatnonzero(~requested.done).tolist()
-        found |= dict(zip(left, self._send([keys[row] for row in left], full, arrived, run), strict=True))
-        return [found[row] for row in which]
-
-    def are_stored(self, thetas: np.ndarray) -> np.ndarray:
-        """Whether a response in memory or any result on disk exists (n,); it is neither read nor verified."""
-        keys = [row.tobytes() for row in thetas + 0.0]
-        run = self._run
-        outcomes = self.response_memory.look_up(run.fingerprint, keys)
-        stored = np.array([outcome is not None for outcome in outcomes], dtype=bool)
-        if self._checked.rows is not None:
-            stored |= self._checked.rows.are_stored(self._key, thetas, run)
-        return stored
+        if not full:
+            statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
+            if all(known):
+                self.cache_hits += len(which)
+                return statistics if len(keys) == len(which) else statistics[which]
+        if possible is not None and not (wanted := possible()).all():
+            statistics = np.full((len(which), self.n_numbers), np.nan)
+            if wanted.any():
+                statistics[wanted] = self.run(thetas[wanted])
+            return statistics
+        request = self._look_up(keys, which, full)
+        left = (~request.done).nonzero()[0]
+        if len(left) and self.streams:
+            self._run_in_pool(request, left)
+            left = left[:0]
+        while len(left):
+            self._check_before(request.run)
+            some, start = left[: self._chunk(len(left), full)], time.perf_counter()
+            with observed(self._checked.label, self.pool, self._checked.complete):
+                if self.pool is None or self._returns_responses(full):
+                    values, reasons = simulate_batch(self.model, request.thetas[some], self.pool)
+                else:
+                    values, reasons = misfit_batch(
+                        self.model, request.thetas[some], self.measured, self.pool, self.statistic
+                    )
+            self._record(request, some, values, reasons, time.perf_counter() - start)
+            # the size grows by steps: the first simulations may be failures that took no time
+            self.chunk_size = min(
+                4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / (time.perf_counter() - start))
+            )
+            left = left[len(some) :]
+        if full:
+            return request, which
+        return request.statistics if len(keys) == len(which) else request.statistics[which]
 
     def recall(self, thetas: np.ndarray, statistics: np.ndarray, reasons: Sequence[str]) -> None:
-        """Cache statistics (n, n_numbers) of an earlier run in memory, unsimulated; ValueError for another shape.
+        """Cache statistics (n, n_numbers) of an earlier run in memory, at structural parameters (n, n_structural).
 
         Failures (with a reason) are recorded, and all rows count for `max_failure_share`. Rows that are cached already
         are not changed. Nothing is written to the cache on disk.
         """
-        thetas, statistics = as_rows(thetas, self.model.parameter_names), np.asarray(statistics, dtype=float)
-        if statistics.shape != (len(thetas), self.n_numbers) or len(reasons) != len(thetas):
-            raise ValueError(
-                f"recall: expected statistics of shape ({len(thetas)}, {self.n_numbers}) and {len(thetas)} reasons; "
-                f"got {statistics.shape} and {len(reasons)}. Pass what statistics() returned for the same noise"
-            )
         keys, which = distinct_keys(thetas)
         known = self.memory_cache.look_up(keys, self.n_numbers)[1]
-        for place, row in dict(zip(which, range(len(thetas)), strict=True)).items():
-            if not known[place] and np.isfinite(thetas[row]).all():
-                self.memory_cache.store([keys[place]], statistics[[row]])
-                self.failures.count_outcomes(thetas[[row]], [reasons[row]])
+        last = dict(zip(which, range(len(thetas)), strict=True))
+        rows = [row for place, row in last.items() if not known[place] and np.isfinite(thetas[row]).all()]
+        new = [reasons[row] for row in rows]
+        self.memory_cache.store([keys[which[row]] for row in rows], statistics[rows], new)
+        self.failures.count_outcomes(thetas[rows], new)
 
-    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> tuple[Requested, VerifyingRun]:
+    # known simulations --------------------------------------------------------------------------------------------
+
+    def _look_up(self, keys: list[bytes], which: list[int], full: bool) -> _Request:
         """What is known of distinct keys, which is counted; `which` has the key of every requested row."""
-        run = self._run
-        requested = self._known.look_up(keys, full, run)
+        request = _Request(keys, full, self._run)
+        request.statistics, known = self.memory_cache.look_up(keys, self.n_numbers)
+        request.known = np.array(known, dtype=bool) | ~request.finite
+        request.done = request.known.copy()
+        try:
+            self._fill(request, full)
+        except StaleCache:
+            self._clear()
+            raise
         counts = np.bincount(which, minlength=len(keys))
-        self.cache_hits += int(counts[requested.done & requested.finite].sum())
-        self.disk_hits += int(counts[requested.on_disk].sum())
-        return requested, run
+        self.cache_hits += int(counts[request.done & request.finite].sum())
+        self.disk_hits += int(counts[request.on_disk].sum())
+        return request
+
+    def _fill(self, request: _Request, full: bool) -> None:
+        """Fill in what caches contain, also in their responses; rows of the disk may be simulated to verify them."""
+        stored, new = self._checked.rows, (~request.done).nonzero()[0]
+        if stored is not None and len(new):
+            rows = stored.look_up(self._key, request.thetas[new], request.run)
+            known, reasons = np.flatnonzero(rows.known), rows.reasons
+            if len(known):
+                self._enter(request, new[known].tolist(), rows.values[known], [reasons[place] for place in known])
+                request.on_disk[new[known]] = True
+        if full:  # a failure needs no response
+            request.done = ~np.isfinite(request.statistics).all(axis=1) & request.known
+            for row in np.flatnonzero(request.done):
+                reason = request.reasons[row] or self.memory_cache.reason(request.keys[row])
+                request.reasons[row] = reason or "the simulation failed before"
+        if stored is not None or len(self.response_memory):
+            left, size = (~request.done).nonzero()[0].tolist(), most_responses(self.model)
+            for start in range(0, len(left), size):
+                self._fill_from_responses(request, left[start : start + size])
+
+    def _fill_from_responses(self, request: _Request, rows: list[int]) -> None:
+        """Fill in rows whose responses are cached, and their statistics where these are not known."""
+        stored, run, full = self._checked.rows, request.run, request.responses is not None
+        in_memory = self.response_memory.look_up(run.fingerprint, [request.keys[row] for row in rows])
+        outcomes = {row: outcome for row, outcome in zip(rows, in_memory, strict=True) if outcome is not None}
+        left = [row for row in rows if row not in outcomes]
+        if stored is not None and left:
+            read = zip(left, stored.look_up_responses(request.thetas[left], run), strict=True)
+            from_disk = {row: outcome for row, outcome in read if outcome is not None}
+            request.on_disk[list(from_disk)] = True
+            outcomes |= from_disk
+            if full and from_disk:
+                keys = [request.keys[row] for row in from_disk]
+                self.response_memory.store(run.fingerprint, keys, list(from_disk.values()))
+        if full:
+            for row, outcome in outcomes.items():
+                request.responses[row] = np.nan if isinstance(outcome, str) else outcome
+        request.done[list(outcomes)] = True
+        if new := [row for row in outcomes if not request.known[row]]:
+            nothing = np.full((len(self.model.channels), self.model.n_steps), np.nan)
+            failed = [outcomes[row] if isinstance(outcomes[row], str) else "" for row in new]
+            responses = [nothing if reason else outcomes[row] for row, reason in zip(new, failed, strict=True)]
+            batch = SimulationBatch(np.array(responses), failed)
+            statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+            self._enter(request, new, statistics, reasons)
+            if stored is not None:
+                stored.store(self._key, request.thetas[new], statistics, reasons, None, 0.0, run)
+
+    def _enter(self, request: _Request, rows: list[int], statistics: np.ndarray, reasons: list[str]) -> None:
+        """Fill in known statistics (n, n_numbers), cache them in memory, and count failures."""
+        for row, values, reason in zip(rows, statistics, reasons, strict=True):
+            request.fill(row, values, reason, None if request.responses is None else request.responses[row].copy())
+        self._checked.has_results = True
+        if self.cache is not None:
+            self.cache.repeat_remark(self.model, request.run.fingerprint)
+        self.failures.count_outcomes(request.thetas[rows], reasons)
+        self.memory_cache.store([request.keys[row] for row in rows], statistics, reasons)
+
+    def _clear(self) -> None:
+        """Empty the caches in memory, because their results may belong to another model."""
+        self.memory_cache.clear()
+        self.response_memory.clear()
 
     # simulations --------------------------------------------------------------------------------------------------
 
@@ -308,43 +378,23 @@ class Simulator:
 
     def check_failures(self) -> None:
         """Raise `TooManyFailures` if too many simulations have failed, even if all that run succeed."""
-        self.failures.check(len(self._running.simulations))
-
-    def _new(self, keys: list[bytes], full: bool, run: VerifyingRun) -> list[Simulated]:
-        """Results of new simulations of distinct keys: one by one as they arrive from the pool, or in parts."""
-        if self.streams and keys:
-            return self._new_in_pool(keys, full, run)
-        results: list[Simulated] = []
-        while len(results) < len(keys):
-            self._check_before(run)
-            left = keys[len(results) :]
-            some = left[: self._chunk(len(left), full)]
-            thetas, start = thetas_of(some, self.n_structural), time.perf_counter()
-            with observed(self._checked.label, self.pool, self._checked.complete):
-                if self._returns_responses(full):
-                    values, reasons = simulate_batch(self.model, thetas, self.pool)
-                else:
-                    values, reasons = misfit_batch(self.model, thetas, self.measured, self.pool, self.statistic)
-            results += self._record(some, thetas, full, values, reasons, time.perf_counter() - start, run)
-            # the size grows by steps: the first simulations may be failures that took no time
-            seconds = time.perf_counter() - start
-            self.chunk_size = min(4 * len(some), 1 + int(_SECONDS_PER_CHUNK * len(some) / seconds))
-        return results
+        self.failures.check(0 if self._in_pool is None else len(self._running.simulations))
 
     def _chunk(self, n: int, full: bool) -> int:
         """Number of simulations, of n, between two writes to the cache on disk, or two reports of progress."""
+        most = most_responses(self.model) if self.pool is None or self._returns_responses(full) else n
         if self.cache is None and (self.when_simulated is None or self.pool is not None):
-            return n
+            return min(n, most)
         workers = (os.cpu_count() or 1) if self.pool is None else self.pool.n_workers or n
         one_by_one = self.pool is None and not has_batch_method(self.model)
         smallest = 1 if one_by_one else _ROUNDS_PER_CHUNK * workers  # so that all workers are busy
-        return min(max(smallest, self.chunk_size), most_responses(self.model) if self._returns_responses(full) else n)
+        return min(max(smallest, self.chunk_size), most)
 
     @interrupts_end_the_run()
-    def _new_in_pool(self, keys: list[bytes], full: bool, run: VerifyingRun) -> list[Simulated]:
+    def _run_in_pool(self, request: _Request, rows: Sequence[int]) -> None:
+        """Run rows of a request in the pool, and record each as it arrives."""
         arrived: SimpleQueue = SimpleQueue()
-        simulations = self._send(keys, full, arrived, run)
-        left = dict.fromkeys(simulations)
+        left = dict.fromkeys(self._send(request, rows, arrived))
         try:
             while left:
                 ended = take_all(arrived, wait=True)
@@ -358,34 +408,45 @@ class Simulator:
         except BaseException:
             self.leave(left, running=True)
             raise
-        return [simulation.result for simulation in simulations]
 
-    def _send(self, keys: list[bytes], full: bool, arrived: SimpleQueue, run: VerifyingRun) -> list[Simulation]:
-        """Submit simulations of n distinct keys to the pool."""
-        if not keys:
+    def request(self, thetas: np.ndarray, full: bool, arrived: SimpleQueue) -> list[Simulation | np.ndarray]:
+        """Statistics (n_numbers,) at each of n structural parameters if known, else the simulation that runs for it.
+
+        Simulations will come through the queue `arrived` when they have ended: pass them to `receive`, or to `leave` if
+        they are not needed any more. Duplicates are one object. Raises the errors of `run`.
+        """
+        keys, which = distinct_keys(thetas)
+        request = self._look_up(keys, which, full)
+        left = (~request.done).nonzero()[0].tolist()
+        sent = dict(zip(left, self._send(request, left, arrived), strict=True))
+        return [sent.get(row, request.statistics[row]) for row in which]
+
+    def _send(self, request: _Request, rows: Sequence[int], arrived: SimpleQueue) -> list[Simulation]:
+        """Submit rows of a request to the pool."""
+        if not len(rows):
             return []
-        self._check_before(run)
+        self._check_before(request.run)
         running = self._running
         with running.lock:
             if not running.simulations:
                 running.functions.clear()
                 running.since = running.counted_until = time.perf_counter()
-            thetas = list(thetas_of(keys, self.n_structural))
-            futures = self.pool.submit_all(self._sent_function(full), thetas)
-            sent = [Simulation(key, full, future) for key, future in zip(keys, futures, strict=True)]
+            function = self._sent_function(request.responses is not None)
+            futures = self.pool.submit_all(function, list(request.thetas[rows]))
+            sent = [Simulation(request, int(row), future) for row, future in zip(rows, futures, strict=True)]
             running.simulations.update(sent)
         for simulation in sent:
             simulation.future.add_done_callback(partial(_arrive, arrived, simulation))
         return sent
 
     def receive(self, ended: Iterable[Simulation]) -> None:
-        """Count and cache simulations of one request that have ended in the pool; sets `result` or `error` of each.
+        """Count and cache simulations that have ended in the pool; sets the `error` of each without a result.
 
         `ChangedModel` if the model has changed; these simulations, and all since the last comparison, are not stored.
         """
         running = self._running
         with running.lock:
-            some, outcomes = [], []
+            of_requests: dict[_Request, list[tuple[Simulation, tuple]]] = {}
             for simulation in ended:
                 if simulation.received:
                     continue
@@ -394,14 +455,31 @@ class Simulator:
                 try:
                     outcome, opened = unpack(simulation.future.result(), self.pool)
                     self._checked.complete(opened)
-                    outcomes.append(outcome)
-                    some.append(simulation)
+                    of_requests.setdefault(simulation.request, []).append((simulation, outcome))
                 except CancelledError:
                     simulation.error = RuntimeError("the pool was closed before a simulation had finished")
                 except BaseException as error:
                     simulation.error = error
-            if some:
-                self._record_outcomes(some, outcomes)
+            try:
+                for request, pairs in of_requests.items():
+                    self._record_arrived(request, *zip(*pairs, strict=True))
+            except BaseException as error:
+                for pairs in of_requests.values():
+                    for simulation, _ in pairs:
+                        simulation.error = error
+                raise
+
+    def _record_arrived(self, request: _Request, ended: tuple[Simulation, ...], outcomes: tuple[tuple, ...]) -> None:
+        """Record simulations of one request that the pool has run."""
+        now = time.perf_counter()
+        seconds, self._running.counted_until = now - self._running.counted_until, now
+        responses = self._returns_responses(request.responses is not None)
+        shape = (len(self.model.channels), self.model.n_steps) if responses else (self.n_numbers,)
+        values = np.full((len(ended), *shape), np.nan)
+        for row, (result, _) in zip(values, outcomes, strict=True):
+            if result is not None:
+                row[...] = result
+        self._record(request, [each.row for each in ended], values, [reason for _, reason in outcomes], seconds)
 
     def leave(self, simulations: Iterable[Simulation], running: bool) -> list[Simulation]:
         """Stop waiting: ended simulations are cached, others are cancelled; with `running`, also those that have begun.
@@ -437,62 +515,35 @@ class Simulator:
     def _returns_responses(self, full: bool) -> bool:
         return full or (self.cache is not None and self.cache.responses)
 
-    def _record_outcomes(self, ended: list[Simulation], outcomes: list[tuple]) -> None:
-        """Record simulations that the pool has run."""
-        running, now, full = self._running, time.perf_counter(), ended[0].full
-        seconds, running.counted_until = now - running.counted_until, now
-        shape = (len(self.model.channels), self.model.n_steps) if self._returns_responses(full) else (self.n_numbers,)
-        values = np.full((len(ended), *shape), np.nan)
-        for row, (result, _) in zip(values, outcomes, strict=True):
-            if result is not None:
-                row[...] = result
-        keys, reasons = [each.key for each in ended], [reason for _, reason in outcomes]
-        try:
-            results = self._record(keys, thetas_of(keys, self.n_structural), full, values, reasons, seconds, self._run)
-        except BaseException as error:
-            for each in ended:
-                each.error = error
-            raise
-        for each, result in zip(ended, results, strict=True):
-            each.result = result
-
     def _record(
-        self,
-        keys: list[bytes],
-        thetas: np.ndarray,
-        full: bool,
-        values: np.ndarray,
-        reasons: list[str],
-        seconds: float,
-        run: VerifyingRun,
-    ) -> list[Simulated]:
+        self, request: _Request, rows: Sequence[int], values: np.ndarray, reasons: list[str], seconds: float
+    ) -> None:
         """Count new simulations, record failures, compare the model if that is due, and cache the results.
 
-        The values are responses if these were requested or are stored on disk, else statistics.
+        The values are responses or statistics; responses are kept if they were requested or are stored on disk.
         """
-        batch, misfit = None, values
-        if self._returns_responses(full):
-            batch = SimulationBatch(values, reasons)
-            misfit, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
+        thetas, keys, full = request.thetas[rows], [request.keys[row] for row in rows], request.responses is not None
+        responses, statistics, why = None, values, reasons
+        if values.ndim == 3:
+            batch, responses = SimulationBatch(values, reasons), values if self._returns_responses(full) else None
+            statistics, reasons = misfit_of_responses(self.model, batch, self.measured, self.statistic)
         self._seconds += seconds
         self.simulations += len(thetas)
         self.failures.count_outcomes(thetas, reasons)
         if self.when_simulated is not None:
             self.when_simulated(len(thetas))
-        self._check_after(thetas, misfit, reasons, seconds, run)
+        run = request.run if request.run.model is self.model else self._run  # the model may have been replaced
+        self._check_after(run, thetas, statistics, reasons, seconds)
         self._checked.has_results = True
-        self.memory_cache.store(keys, misfit)
+        self.memory_cache.store(keys, statistics, reasons)
         if full:
-            outcomes = [reason or response for reason, response in zip(batch.reasons, batch.response, strict=True)]
+            outcomes = [reason or response for reason, response in zip(why, responses, strict=True)]
             self.response_memory.store(run.fingerprint, keys, outcomes)
         if self.cache is not None:
-            response = None if batch is None else batch.response
-            self._checked.rows.store(self._key, thetas, misfit, reasons, response, seconds, run)
+            self._checked.rows.store(self._key, thetas, statistics, reasons, responses, seconds, run)
             self.cache.store_remark(self.model)
-        if not full:
-            return [Simulated(row, reason, None) for row, reason in zip(misfit, reasons, strict=True)]
-        batch.response[[bool(reason) for reason in reasons]] = np.nan
-        return [Simulated(*each) for each in zip(misfit, reasons, batch.response, strict=True)]
+        for place, row in enumerate(rows):
+            request.fill(row, statistics[place], reasons[place], responses[place] if full else None)
 
     # the model ----------------------------------------------------------------------------------------------------
 
@@ -505,27 +556,34 @@ class Simulator:
         """Check failures and the model before simulations, not after them, so that finished simulations are stored."""
         self.check_failures()
         try:
-            self._checked.before(run, lambda: self._known.earlier_points(run))
+            self._checked.before(run, self._earlier_point)
         except ChangedModel:
             self._drop_unchecked(run)
             raise
 
+    def _earlier_point(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Parameters and statistics of a successful simulation in memory, if there is one, to be run again."""
+        thetas = self.memory_cache.successes(self.n_structural)[:1]
+        return list(
+            zip(thetas, self.memory_cache.look_up([each.tobytes() for each in thetas], self.n_numbers)[0], strict=True)
+        )
+
     def _check_after(
-        self, thetas: np.ndarray, misfit: np.ndarray, reasons: list[str], seconds: float, run: VerifyingRun
+        self, run: VerifyingRun, thetas: np.ndarray, statistics: np.ndarray, reasons: list[str], seconds: float
     ) -> None:
         """Compare the model after simulations, if that is due."""
         if self.streams:
             seconds = time.perf_counter() - self._running.since
-        last = not self._running.simulations
+        last = self._in_pool is None or not self._running.simulations
         try:
-            self._checked.after(run, thetas, misfit, reasons, seconds, last)
+            self._checked.after(run, thetas, statistics, reasons, seconds, last)
         except ChangedModel:
             self._drop_unchecked(run)
             raise
 
     def _drop_unchecked(self, run: VerifyingRun) -> None:
         """Drop the simulations since the last comparison, which may be from before or after a change of the model."""
-        self._known.clear()
+        self._clear()
         if self.cache is not None and self._checked.unchecked:
             unchecked = np.concatenate(self._checked.unchecked)
             self._checked.rows.discard(unchecked, self._key, run.fingerprint)

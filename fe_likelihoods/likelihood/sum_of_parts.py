@@ -7,6 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..priors.points import as_points
+from ..simulation.faults import TransientReason
+from ..simulation.model import split_seconds
 from .data_identity import combined_digest
 
 __all__ = ["COUNTS", "SumOfParts"]
@@ -71,7 +73,7 @@ class SumOfParts:
                 wanted = rows if len(left) == len(rows) else rows[left]
                 own = wanted.take(columns, axis=1)
                 simulator = part.simulator
-                statistics = simulator.statistics(own[:, : simulator.n_structural], partial(self.possible, wanted))
+                statistics = simulator.run(own[:, : simulator.n_structural], partial(self.possible, wanted))
                 total[left] += part.of_statistics(own, statistics)
         return total if points.ndim == 2 else float(total[0])
 
@@ -93,11 +95,12 @@ class SumOfParts:
             Empty where the simulations succeeded, or a failure is an answer of the model.
         """
         point = as_points(x, self.parameter_names)
-        found = (
-            part.simulator.failures.fault(point[columns][: part.simulator.n_structural])
-            for part, columns in self.parts()
-        )
-        return next(filter(None, found), "")
+        for part, columns in self.parts():
+            simulator = part.simulator
+            reason = simulator.memory_cache.reason((point[columns][: simulator.n_structural] + 0.0).tobytes())
+            if isinstance(reason, TransientReason):
+                return split_seconds(reason)[0]
+        return ""
 
     @property
     def data_fingerprint(self) -> str:

@@ -38,28 +38,12 @@ class AutoregressiveNoise:
 
     Notes
     -----
-    With e_1 ~ N(0, sigma^2) and e_t = rho e_{t-1} + sqrt(1 - rho^2) sigma z_t, the errors of n samples are normal with
-    covariance sigma^2 rho^|i-j|. Their exact likelihood is ([1]_, section 5.2, with the innovation variance)::
-
-        log L = -n/2 log(2 pi) - n log(sigma) - (n-1)/2 log(1 - rho^2) - Q / (2 sigma^2 (1 - rho^2))
-        Q     = (1 - rho)^2 J + rho D + rho (1 - rho) E
-
-    with the sums J = sum r_t^2, D = sum (r_t - r_{t-1})^2 and E = r_1^2 + r_n^2
-    (`fe_likelihoods.noise.residuals.lag_one_sums`). For rho = 0 this is white noise. Q is written with differences
-    instead of the products r_t r_{t-1}, whose sum would cancel against J for rho near one. For the mean of a channel,
-    the n samples are worth n (1 - rho) / (1 + rho) independent samples.
-
-    Where samples are missing, a sample has the correlation rho^g with the previous sample, g steps earlier. The factor
-    of the pair is the normal density of r_t with mean rho^g r_{t-g} and variance sigma^2 (1 - rho^(2 g)), so gaps are
-    bridged exactly. The sums are then formed for each distance g that occurs.
+    The exact likelihood of the n samples, also with gaps, is on the page ``docs/theory/noise.rst``. For the mean of a
+    channel, they are worth n (1 - rho) / (1 + rho) independent samples.
 
     Finely sampled errors of a smooth model are smoother than any AR(1) process. Then rho tends to one, and the
     likelihood depends on the differences of successive residuals only. Decimate the measurements
     (`Measurements.decimate`) to a step at which rho is well below one.
-
-    References
-    ----------
-    .. [1] J. D. Hamilton (1994), "Time Series Analysis", Princeton University Press.
 
     Examples
     --------
@@ -103,7 +87,7 @@ class AutoregressiveNoise:
         Parameters
         ----------
         statistics : (n, 3 n_channels) float
-            J of all channels, then D, then E (see Notes of the class) [SI unit of the channel, squared]; NaN where the
+            J of all channels, then D, then E (`lag_one_sums`) [SI unit of the channel, squared]; NaN where the
             simulation failed. With missing samples, see `lag_one_sums`.
         n_samples : int or SampleCounts
             Samples per channel; `SampleCounts` where samples are missing.

@@ -20,6 +20,7 @@ and sources are on the page ``docs/theory/noise.rst``.
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -107,45 +108,23 @@ class GaussianNoise:
     (1, 5)      "response"     ``share_<channel>_band1``   the same, for predictions of other motions
     =========== ============== =========================== =======================================================
 
-    **Levels in SI units.** With n samples in channel c (missing samples do not count) and the sum of squared residuals
-    J_c, the log-likelihood is ([1]_, eqs. (2) and (3))::
+    Equations and sources are on the page ``docs/theory/noise.rst``.
 
-        log L = sum_c [ -n/2 log(2 pi) - n log(sigma_c) - J_c / (2 sigma_c^2) ]
+    With effective samples, the term of a channel is multiplied by n_eff / n, which has the effect of thinning without
+    discarding any. The result is not a density of the measurements, so evidences can be compared only between models
+    with the same n_eff.
 
-    With effective samples, the term of channel c is multiplied by n_eff / n. This has the effect of thinning to n_eff
-    samples without discarding any. The result is not a density of the measurements, so evidences can be compared only
-    between models with the same n_eff.
+    Shares of the measured channel must be below 1, since the model would explain nothing. Evidences compare them with
+    other noises only approximately, because the level is computed from the measurements.
 
-    **Shares of the measured channel.** The likelihood is white noise with other parameters: ``share_top = 0.2`` is a
-    standard deviation of 20 % of the measured root mean square. Shares of 1 or more are impossible, since the model
-    would explain nothing. In a prediction, the level is the root mean square of response and error together:
-    sigma^2 = (sensor^2 + share^2 R^2) / (1 - share^2) with the root mean square R of the simulated response. The level
-    is computed from the measurements, so evidences compare these shares with other noises only approximately.
+    A share of the response that was calibrated on a part of a motion, with a gap, or with a long quiet end refers to
+    another mean square than that of the whole motion: calibrate and predict whole motions, or use ``local=1``. Do not
+    choose `local` by the evidence alone: where the model is wrong, a `local` near 1 may prefer a response that is too
+    large, because it permits larger errors. Compare the RRMSE of the fit with ``level="si"``. The
+    statistics are not quadratic in the residuals, so samplers cannot use a guide.
 
-    **Shares of the response.** The window consists of three equal parts of the time, and moves by one part. In its
-    middle part::
-
-        l^2 = (1 - local) R^2 + local e^2
-
-    where e^2 is the mean square of the response in the window, and R^2 its mean square in the whole motion (computed
-    separately for each event and each pause). A share that was calibrated on a part of a motion, with a gap, or with a
-    long quiet end refers to a different R^2 from the whole motion: calibrate and predict whole motions, or use
-    ``local=1``.
-    Do not choose `local` by the evidence alone: where the model is wrong, the likelihood with a `local` near 1 may
-    prefer a response that is too large, because it permits larger errors. Compare the RRMSE of the fit with
-    ``level="si"``. The statistics are not quadratic in the residuals, so samplers cannot use a guide.
-
-    **Frequency bands.** The coefficients of the orthonormal cosine transform (DCT-II) are independent. In band b their
-    variance is sensor^2 + (share_b u_b)^2, where u_b is the root mean square of the response coefficients in the band,
-    or in SI units sensor^2 + sigma_b^2 n / n_b, where sigma_b is the root mean square error in the band, which has n_b
-    of the n coefficients. This is a multivariate normal density of the samples. Missing samples divide a channel into
-    independent stretches; stretches shorter than a period of the lowest edge are refused.
-
-    References
-    ----------
-    .. [1] M. K. Ramancha, R. Astroza, J. P. Conte, J. I. Restrepo, M. D. Todd, "Bayesian nonlinear finite element model
-       updating of a full-scale bridge-column using sequential Monte Carlo", in "Model Validation and Uncertainty
-       Quantification, Volume 3", Springer.
+    Missing samples divide a channel into independent stretches for frequency bands; stretches shorter than a period of
+    the lowest edge are refused.
 
     Examples
     --------
@@ -252,31 +231,31 @@ class GaussianNoise:
 
     # ------------------------------------------------------------------ kind and names
 
-    @property
+    @cached_property
     def _kind(self) -> str:
         return self.groups if isinstance(self.groups, str) else "bands"
 
-    @property
+    @cached_property
     def _whole(self) -> bool:
         """Whether the sums of squares over all samples are sufficient."""
         return self._kind in ("channel", "all") and self.level != "response"
 
-    @property
+    @cached_property
     def _in_parts(self) -> bool:
         """Whether levels follow the response over time."""
         return self.level == "response" and self._kind != "bands"
 
-    @property
+    @cached_property
     def _scaled(self) -> bool:
         """Whether parameters are multiples of channel scales."""
         return self.level == "measured" or (self.level == "si" and self._kind == "all")
 
-    @property
+    @cached_property
     def white(self) -> bool:
         """Whether errors are white, with levels in SI units for the whole measurements."""
         return self._whole and self.level == "si"
 
-    @property
+    @cached_property
     def n_bands(self) -> int:
         """Number of frequency bands; one without bands."""
         return 1 if isinstance(self.groups, str) else len(self.groups) + 1
@@ -297,7 +276,7 @@ class GaussianNoise:
         default = {"groups": "channel", "level": "si"}
         return {name: getattr(self, name) for name in names if getattr(self, name) != default.get(name)}
 
-    @property
+    @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """``sigma_...`` [SI unit of the channel] or ``share_...`` [-], see the table of the class.
 
@@ -539,15 +518,15 @@ class GaussianNoise:
             If the noise does not know the measurements, or knows others.
         """
         statistics, n_channels = np.asarray(statistics, dtype=float), len(self.channels)
-        samples, power = np.broadcast_to(samples_per_channel(n_samples), n_channels), None
+        samples, power = samples_per_channel(n_samples), None
         if self._whole:
-            counts, squares = samples[None], statistics[:, None]
+            counts, squares = samples, statistics[:, None]
         else:
             counts = np.array(self._bound(self.layout).counts)
-            if not np.array_equal(counts.sum(axis=0), samples):
+            if (counts.sum(axis=0) != samples).any():
                 raise ValueError(
                     f"the noise is for {counts.sum(axis=0).tolist()} samples per channel, the measurements have "
-                    f"{samples.tolist()}: take the noise of a likelihood of these measurements"
+                    f"{samples}: take the noise of a likelihood of these measurements"
                 )
             squares, *powers = split_sums(statistics, n_channels, len(counts))
             power = powers[0] if powers else None
@@ -602,11 +581,11 @@ class GaussianNoise:
         n_channels = 1 if self._kind == "all" else len(self.channels)
         return parameters.reshape(len(parameters), n_channels, self.n_bands).transpose(0, 2, 1)
 
-    @property
+    @cached_property
     def _floor(self) -> np.ndarray:
         return np.zeros(len(self.channels)) if self.sensor is None else np.array(self.sensor)
 
-    @property
+    @cached_property
     def _scales(self) -> np.ndarray:
         return np.array(self._bound(self.scales))
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..signals.channels import Channel
+from ..text_tables import text_table
 from ..units import find_unit
 from .sample_counts import distinct_gaps
 
@@ -67,14 +68,12 @@ class ResidualChecks(NamedTuple):
         if self.channels:
             names = [channel.name for channel in self.channels]
             units = [(channel.unit, find_unit(channel.unit, channel.dimension).factor) for channel in self.channels]
-        width = max(map(len, ["channel", *names]))
-        heads = ("unit", "mean", "sd", "lag one", "samples", "independent", "p white", "p normal")
-        lines = [f"{'channel':<{width}} " + " ".join(f"{head:>11}" for head in heads)]
+        rows = [("channel", "unit", "mean", "sd", "lag one", "samples", "independent", "p white", "p normal")]
         for i, (name, (unit, factor)) in enumerate(zip(names, units, strict=True)):
-            sizes = f"{self.mean[i] / factor:>11.3g} {self.standard_deviation[i] / factor:>11.3g}"
-            counts = f"{self.lag_one[i]:>11.2f} {self.n_samples[i]:>11.0f} {self.n_effective[i]:>11.0f}"
-            lines.append(f"{name:<{width}} {unit:>11} {sizes} {counts} {self.white[i]:>11.2g} {self.normal[i]:>11.2g}")
-        return "\n".join(lines)
+            sizes = f"{self.mean[i] / factor:.3g}", f"{self.standard_deviation[i] / factor:.3g}"
+            counts = f"{self.lag_one[i]:.2f}", f"{self.n_samples[i]:.0f}", f"{self.n_effective[i]:.0f}"
+            rows.append((name, unit, *sizes, *counts, f"{self.white[i]:.2g}", f"{self.normal[i]:.2g}"))
+        return text_table(rows)
 
     __repr__ = __str__
 
@@ -170,33 +169,16 @@ def effective_samples(residuals: np.ndarray) -> np.ndarray:
 
     Notes
     -----
-    With the autocorrelation rho_k of the errors::
+    n_eff = n / (1 + 2 sum_k rho_k^2) with the autocorrelation rho_k of the errors, summed to the first lag of at least
+    five correlation times (Sokal's window); for AR(1) errors n (1 - rho^2) / (1 + rho^2). This is the number for the
+    variance of a mean square, that is for sigma, and for a parameter whose sensitivity varies as fast as the errors.
+    Intervals are too wide for a parameter whose sensitivity varies faster, and too narrow for one whose sensitivity
+    varies more slowly, such as an offset; `fe_likelihoods.AutoregressiveNoise` makes this distinction. The integrated
+    autocorrelation time of a mean is not suitable: it is less than one for oscillating residuals. Sources are on the
+    page ``docs/theory/noise.rst``.
 
-        n_eff = n / (1 + 2 sum_k rho_k^2)
-
-    This is the number for the variance of a mean square, that is for sigma [1]_. It is also valid for a parameter whose
-    sensitivity has the same spectrum as the errors; for other parameters, one factor rho_k must be replaced by the
-    autocorrelation of the sensitivity (compare [2]_). Intervals are therefore too wide for a parameter whose
-    sensitivity varies faster than the errors, and too narrow for a parameter whose sensitivity varies more slowly, such
-    as an offset. `fe_likelihoods.AutoregressiveNoise` makes this distinction, a single number cannot. For AR(1) errors
-    the number is n (1 - rho^2) / (1 + rho^2).
-
-    The integrated autocorrelation time of a mean, which samplers report, is not suitable: it is less than one for
-    oscillating residuals, which are typical of structures.
-
-    Where samples are missing, n is the number of samples without them, and each lag is weighted by the share s_k of
-    complete pairs: n_eff = n / (1 + 2 sum_k s_k rho_k^2), with s_k = 1 where no sample is missing.
-
-    The sum ends at the first lag of at least five correlation times 1 + 2 sum_k rho_k^2 (Sokal's window), because later
-    terms are dominated by estimation errors.
-
-    References
-    ----------
-    .. [1] G. V. Bayley, J. M. Hammersley (1946), "The 'effective' number of independent observations in an
-       autocorrelated time series", Supplement to the Journal of the Royal Statistical Society 8, 184-197,
-       doi:10.2307/2983560.
-    .. [2] C. S. Bretherton et al. (1999), "The effective number of spatial degrees of freedom of a time-varying field",
-       Journal of Climate 12, 1990-2009.
+    Where samples are missing, n is the number of samples without them, and each lag is weighted by the share of
+    complete pairs.
 
     Examples
     --------
@@ -295,9 +277,9 @@ def residual_checks(residuals: np.ndarray, channels: Sequence[Channel] = ()) -> 
     Examples
     --------
     >>> print(residual_checks(likelihood.residuals([1.1, 0.9]), model.channels))
-    channel             unit        mean          sd     lag one     samples independent     p white    p normal
-    acceleration           g    -0.00376      0.0471       -0.07         200         178        0.36        0.31
-    displacement          cm      -0.181        1.79       -0.21         200         180      0.0027        0.33
+    channel       unit      mean      sd  lag one  samples  independent  p white  p normal
+    acceleration     g  -0.00376  0.0471    -0.07      200          178     0.36      0.31
+    displacement    cm    -0.181    1.79    -0.21      200          180   0.0027      0.33
     """
     from scipy import stats  # takes 0.5 s to import, and every noise imports this module
 

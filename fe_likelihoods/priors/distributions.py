@@ -113,102 +113,42 @@ class Distribution(ABC):
         return 0.5 * (low + high)
 
     def logpdf(self, x: np.ndarray | float) -> np.ndarray | float:
-        """Logarithm of the density.
-
-        Parameters
-        ----------
-        x : array_like
-            Any shape.
-
-        Returns
-        -------
-        ndarray of the same shape, or float
-            -inf outside the bounds and at NaN; never NaN.
-        """
+        """Logarithm of the density at x of any shape: -inf outside the bounds and at NaN; never NaN."""
         x = np.asarray(x, dtype=float)
         low, high = self.bounds
         with np.errstate(all="ignore"):
             return np.where((x >= low) & (x <= high), self._log_density(x), -np.inf)[()]
 
     def ppf(self, u: np.ndarray | float) -> np.ndarray | float:
-        """Quantile function.
-
-        Parameters
-        ----------
-        u : array_like
-            Probabilities in [0, 1], any shape.
-
-        Returns
-        -------
-        ndarray of the same shape, or float
-            Values within the bounds.
-
-        Raises
-        ------
-        ValueError
-            If a probability is outside [0, 1] or NaN.
-        """
+        """Quantiles, within the bounds, at probabilities u of any shape; ValueError for one outside [0, 1]."""
         u = _unit_interval(u)
         low, high = self.bounds
         with np.errstate(all="ignore"):
             return np.clip(self._quantile(u), low, high)[()]
 
     def isf(self, q: np.ndarray | float) -> np.ndarray | float:
-        """Inverse survival function: the value that is exceeded with probability q.
+        """Inverse survival function: values that are exceeded with probabilities q of any shape; errors as for `ppf`.
 
         It equals ``ppf(1 - q)``, but a small q is not lost in the rounding of 1 - q. `nautilus.Prior` expects it of a
         distribution.
-
-        Parameters
-        ----------
-        q : array_like
-            Probabilities in [0, 1], any shape.
-
-        Returns
-        -------
-        ndarray of the same shape, or float
-            Values within the bounds.
-
-        Raises
-        ------
-        ValueError
-            If a probability is outside [0, 1] or NaN.
         """
         q = _unit_interval(q)
         with np.errstate(all="ignore"):
             return np.clip(self._upper_quantile(q), *self.bounds)[()]
 
     def from_normal(self, z: np.ndarray | float) -> np.ndarray | float:
-        """Map from a standard normal variable to the parameter.
+        """Map from standard normal variables z of any shape to the parameter, increasing.
 
-        The map increases. If z is standard normal, the result has this distribution.
-
-        Parameters
-        ----------
-        z : array_like
-            Any shape; infinite values map to the bounds.
-
-        Returns
-        -------
-        ndarray of the same shape, or float
-            Values within the bounds; NaN where z is NaN.
+        If z is standard normal, the result has this distribution. It is within the bounds, to which infinite z are
+        mapped; NaN where z is NaN.
         """
         return self._mapped(self._from_normal, z, -np.inf, np.inf, self.bounds)
 
     def to_normal(self, x: np.ndarray | float) -> np.ndarray | float:
-        """Map from the parameter to a standard normal variable, the inverse of `from_normal`.
+        """Map from the parameter x, of any shape, to a standard normal variable, the inverse of `from_normal`.
 
-        The log density at x is the standard normal log density at z minus log(dx / dz).
-
-        Parameters
-        ----------
-        x : array_like
-            Any shape.
-
-        Returns
-        -------
-        ndarray of the same shape, or float
-            -inf at and below the lower bound, inf at and above the upper bound; NaN where x is NaN.
+        The log density at x is the standard normal log density at z minus log(dx / dz). -inf at and below the lower
+        bound, inf at and above the upper one; NaN where x is NaN.
         """
         return self._mapped(self._to_normal, x, *self.bounds, (-np.inf, np.inf))
 
@@ -229,19 +169,7 @@ class Distribution(ABC):
         return result[()]
 
     def rvs(self, size: int | tuple[int, ...] = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws.
-
-        Parameters
-        ----------
-        size : int or tuple of int
-            Shape of the result.
-        random_state : int, numpy.random.Generator, numpy.random.RandomState or None
-            A seed, a generator, or None for NumPy's global stream.
-
-        Returns
-        -------
-        ndarray of shape `size`
-        """
+        """Independent draws of shape `size`, from a seed, a generator, or NumPy's global stream (None)."""
         return np.asarray(self.ppf(uniform_numbers(size, random_state)))
 
 

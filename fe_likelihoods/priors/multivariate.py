@@ -1,8 +1,6 @@
-"""Distributions of several correlated parameters, for `Prior`: the normal one, and scipy's distributions.
+"""Distributions of several correlated parameters, for `Prior`: the normal one, and those of one parameter of scipy.
 
-A distribution has a normalised density and draws. Nested samplers and guides also need a map between the parameters and
-independent standard normal variables. `MultivariateNormal` and `MixtureDistribution` have one; a distribution without
-one serves all samplers that use density and draws only.
+A distribution has a normalised density, and a map between the parameters and independent standard normal variables.
 """
 
 import math
@@ -17,7 +15,6 @@ from .distributions import Distribution, RandomState
 
 __all__ = [
     "FrozenDistribution",
-    "FrozenMultivariate",
     "MultivariateDistribution",
     "MultivariateNormal",
     "as_distribution",
@@ -32,8 +29,8 @@ _LARGEST_ASYMMETRY = 1e-8  # of a covariance, in standard deviations of the two 
 class MultivariateDistribution(ABC):
     """Distribution of several parameters together.
 
-    A subclass has `dim`, `logpdf` and either `from_normal` and `to_normal` or `rvs`. If it is not defined for all real
-    numbers it also has `bounds`. Its ``repr`` must show all values, because it is part of fingerprints.
+    A subclass has `dim`, `logpdf`, `from_normal` and `to_normal`, and `bounds` if it is not defined for all real
+    numbers. Its ``repr`` must show all values, because it is part of fingerprints.
 
     Attributes
     ----------
@@ -58,16 +55,13 @@ class MultivariateDistribution(ABC):
     def logpdf(self, x: np.ndarray) -> np.ndarray:
         """Logarithm of the normalised density (...) at parameters x (..., dim); -inf where it is zero."""
 
+    @abstractmethod
     def from_normal(self, z: np.ndarray) -> np.ndarray:
-        """Map from independent standard normal variables (..., dim) to the parameters; ValueError if there is none."""
-        raise ValueError(
-            f"{type(self).__name__} has no map from the unit cube, which nested samplers and guides need; use "
-            "MultivariateNormal or MixtureDistribution, or a sampler that draws from the prior"
-        )
+        """Map from independent standard normal variables (..., dim) to the parameters."""
 
+    @abstractmethod
     def to_normal(self, x: np.ndarray) -> np.ndarray:
         """Map from the parameters (..., dim) to standard normal variables, the inverse of `from_normal`."""
-        return self.from_normal(x)  # raises
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
         """Independent draws, shape (size, dim); arguments as for `Prior.rvs`."""
@@ -187,46 +181,6 @@ class FrozenDistribution(Distribution):
         return self.frozen.isf(q)
 
 
-class FrozenMultivariate(MultivariateDistribution):
-    """A frozen multivariate distribution of `scipy.stats` with ``logpdf`` and ``rvs``, such as ``multivariate_t``.
-
-    Its density is defined for all real numbers. Raises ValueError if its draws have another dimension than `dim`.
-    """
-
-    def __init__(self, frozen: Any, dim: int) -> None:
-        shape = np.shape(frozen.rvs(size=2, random_state=0))
-        if shape != (2, dim) and (shape, dim) != ((2,), 1):
-            raise ValueError(
-                f"Prior: expected a distribution of {dim} parameters; {type(frozen).__name__} draws arrays of shape "
-                f"{shape[1:]}"
-            )
-        self.frozen, self._dim = frozen, dim
-        points = np.reshape(frozen.rvs(size=8, random_state=0), (8, dim))
-        # scipy's frozen objects do not show their values, but draws and densities do
-        self._values = np.concatenate([points.ravel(), np.ravel(frozen.logpdf(points))])
-
-    def __repr__(self) -> str:
-        return f"FrozenMultivariate({type(self.frozen).__name__}, {self._values!r})"
-
-    @property
-    def dim(self) -> int:
-        """Number of parameters."""
-        return self._dim
-
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Logarithm of the density (...) at x (..., dim); -inf where a value is not finite."""
-        x = np.asarray(x, dtype=float)
-        value = np.full(x.shape[:-1], -np.inf)
-        finite = np.isfinite(x).all(axis=-1)
-        if finite.any():
-            value[finite] = self.frozen.logpdf(x[finite])
-        return np.where(np.isnan(value), -np.inf, value)
-
-    def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws, shape (size, dim)."""
-        return np.reshape(self.frozen.rvs(size=size, random_state=random_state), (size, self._dim))
-
-
 def as_distribution(name: str, distribution: Any) -> Distribution:
     """The distribution of one parameter; a frozen one of scipy is wrapped, anything else is a ValueError."""
     if isinstance(distribution, Distribution):
@@ -249,16 +203,13 @@ def as_distribution(name: str, distribution: Any) -> Distribution:
 
 def as_multivariate(names: tuple[str, ...], distribution: Any) -> MultivariateDistribution:
     """The distribution of several parameters; ValueError if it is none, or has other parameters."""
+    if type(distribution).__name__ == "multivariate_normal_frozen":  # of scipy
+        distribution = MultivariateNormal(distribution.mean, distribution.cov)
     if not isinstance(distribution, MultivariateDistribution):
-        if not all(hasattr(distribution, member) for member in ("logpdf", "rvs")) or hasattr(distribution, "ppf"):
-            raise ValueError(
-                f"Prior: the parameters {', '.join(names)} need a distribution of {len(names)} parameters, such as "
-                f"MultivariateNormal(mean, covariance); got {distribution!r}"
-            )
-        if hasattr(distribution, "cov") and type(distribution).__name__ == "multivariate_normal_frozen":
-            distribution = MultivariateNormal(distribution.mean, distribution.cov)
-        else:
-            distribution = FrozenMultivariate(distribution, len(names))
+        raise ValueError(
+            f"Prior: the parameters {', '.join(names)} need a distribution of {len(names)} parameters, such as "
+            f"MultivariateNormal(mean, covariance); got {distribution!r}"
+        )
     if distribution.dim != len(names):
         raise ValueError(
             f"Prior: {len(names)} names, {', '.join(names)}, for a distribution of {distribution.dim} parameters; give "

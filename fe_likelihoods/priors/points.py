@@ -17,7 +17,7 @@ def as_points(x: Any, names: Sequence[str]) -> np.ndarray:
     emcee passes mappings with ``parameter_names=``, nautilus with its own prior. Raises ValueError if the number of
     values or the names are wrong.
     """
-    if isinstance(x, Mapping):
+    if type(x) is not np.ndarray and isinstance(x, Mapping):
         if set(x) != set(names):
             raise ValueError(f"expected a value for each of {', '.join(names)}; got the names {', '.join(map(str, x))}")
         x = np.stack([np.asarray(x[name], dtype=float) for name in names], axis=-1)

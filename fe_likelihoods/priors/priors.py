@@ -91,24 +91,15 @@ class Prior:
         return f"Prior({self.distributions!r})"
 
     def table(self) -> tuple[tuple[str, ...], list[tuple]]:
-        """What a reader asks of the prior, for tables: a header, and one row per parameter.
-
-        Returns
-        -------
-        header : tuple of str
-        rows : list of tuple
-            Name, distribution, mean, standard deviation, lower and upper bound; moments of joint distributions by
-            10 000 draws with a fixed seed.
-        """
+        """A header, and a row per parameter: name, distribution, mean, standard deviation, lower and upper bound."""
         rows: list[tuple] = [()] * self.dim
         for column, distribution in self._single:
             rows[column] = (repr(distribution), *distribution.moments, *distribution.bounds)
         for columns, distribution in self._joint:
-            draws, bounds = distribution.rvs(10_000, 0), np.asarray(distribution.bounds)
             kind = f"{type(distribution).__name__} of {len(columns)}"
-            for place, column in enumerate(columns):
-                one = draws[:, place]
-                rows[column] = (kind, float(one.mean()), float(one.std()), *map(float, bounds[place]))
+            moments = zip(*_moments(distribution), *np.asarray(distribution.bounds).T, strict=True)
+            for column, numbers in zip(columns, moments, strict=True):
+                rows[column] = (kind, *map(float, numbers))
         header = ("parameter", "distribution", "mean", "sd", "lower", "upper")
         return header, [(name, *row) for name, row in zip(self.names, rows, strict=True)]
 
@@ -122,17 +113,7 @@ class Prior:
         return values
 
     def logpdf(self, x: np.ndarray) -> np.ndarray | float:
-        """Sum of the log densities.
-
-        Parameters
-        ----------
-        x : ndarray[dim] or ndarray[n, dim]
-
-        Returns
-        -------
-        float or ndarray[n]
-            -inf outside the bounds and where a value is NaN; never NaN.
-        """
+        """Sum of the log densities (n,) at x (n, dim), a float at (dim,): -inf outside the bounds and at NaN."""
         x = self._checked(x, "x")
         inside = ((x >= self.bounds[:, 0]) & (x <= self.bounds[:, 1])).all(axis=-1)
         with np.errstate(all="ignore"):
@@ -142,22 +123,7 @@ class Prior:
         return log_density if x.ndim == 2 else float(log_density)
 
     def transform(self, u: np.ndarray) -> np.ndarray:
-        """Map from the unit cube to the parameters, for nested samplers.
-
-        Parameters
-        ----------
-        u : ndarray[dim] or ndarray[n, dim]
-            Independent uniform numbers in [0, 1].
-
-        Returns
-        -------
-        ndarray of the same shape
-
-        Raises
-        ------
-        ValueError
-            If a joint distribution has no such map (`MultivariateDistribution.from_normal`).
-        """
+        """Map from the unit cube, u (dim,) or (n, dim) in [0, 1], to the parameters, for nested samplers."""
         u = self._checked(u, "u")
         x = np.empty(u.shape)
         for column, distribution in self._single:
@@ -167,23 +133,11 @@ class Prior:
         return x
 
     def from_normal(self, z: np.ndarray) -> np.ndarray:
-        """Map independent standard normal variables to parameters that have this prior.
+        """Map independent standard normal variables z, (dim,) or (n, dim), to parameters that have this prior.
 
-        Parameters
-        ----------
-        z : ndarray[dim] or ndarray[n, dim]
-            Infinite values map to the bounds.
-
-        Returns
-        -------
-        ndarray of the same shape
-            Within the bounds; NaN where z is NaN.
-
-        Notes
-        -----
-        The map of each parameter is increasing and accurate in both tails, see `Distribution.from_normal`. With z =
-        z(x), the log prior density at x is the sum over the parameters of log phi(z) - log(dx / dz), with the standard
-        normal density phi.
+        They are within the bounds, to which infinite z are mapped, and NaN where z is NaN. The map of each parameter is
+        increasing and accurate in both tails (`Distribution.from_normal`). With z = z(x), the log prior density at x is
+        the sum over the parameters of log phi(z) - log(dx / dz), with the standard normal density phi.
         """
         z = self._checked(z, "z")
         x = np.empty(z.shape)
@@ -192,17 +146,7 @@ class Prior:
         return x
 
     def to_normal(self, x: np.ndarray) -> np.ndarray:
-        """Map from the parameters to independent standard normal variables, the inverse of `from_normal`.
-
-        Parameters
-        ----------
-        x : ndarray[dim] or ndarray[n, dim]
-
-        Returns
-        -------
-        ndarray of the same shape
-            -inf at and below the lower bound, inf at and above the upper bound; NaN where x is NaN.
-        """
+        """Map from parameters x, (dim,) or (n, dim), to standard normal variables, the inverse of `from_normal`."""
         x = self._checked(x, "x")
         z = np.empty(x.shape)
         for column, distribution in [*self._single, *self._joint]:
@@ -210,18 +154,7 @@ class Prior:
         return z
 
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
-        """Independent draws.
-
-        Parameters
-        ----------
-        size : int
-            Number of draws.
-        random_state : int, numpy.random.Generator, numpy.random.RandomState or None
-            A seed, a generator, or None for NumPy's global stream (``np.random.seed``).
-
-        Returns
-        -------
-        ndarray[size, dim]
+        """Independent draws (size, dim), from a seed, a generator, or NumPy's global stream (None, ``np.random.seed``).
 
         Examples
         --------
@@ -239,12 +172,12 @@ class Prior:
         return x
 
     def mean(self) -> np.ndarray:
-        """Mean of every parameter, shape (dim,); of joint distributions by 10 000 draws with a fixed seed."""
+        """Mean of every parameter, shape (dim,)."""
         mean = np.empty(self.dim)
         for column, distribution in self._single:
             mean[column] = distribution.moments[0]
         for columns, distribution in self._joint:
-            mean[columns] = distribution.rvs(10_000, 0).mean(axis=0)
+            mean[columns] = _moments(distribution)[0]
         return mean
 
     def reorder(self, names: Iterable[str]) -> "Prior":
@@ -263,21 +196,9 @@ class Prior:
         return prior
 
     def subset(self, names: Iterable[str]) -> "Prior":
-        """The prior of a subset of the parameters, in the order of `names`.
+        """The prior of some parameters, in the order of `names`: all or none of those with a joint distribution.
 
-        Parameters
-        ----------
-        names : iterable of str
-            Names of parameters; all or none of the parameters with a joint distribution.
-
-        Returns
-        -------
-        Prior
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown, or a joint distribution would be split.
+        ValueError if a name is unknown, or a joint distribution would be split.
         """
         names = tuple(names)
         if unknown := [name for name in names if name not in self.names]:
@@ -294,6 +215,12 @@ class Prior:
             if inside:
                 kept[key] = distribution
         return Prior(kept).reorder(names)
+
+
+def _moments(distribution: MultivariateDistribution) -> tuple[np.ndarray, np.ndarray]:
+    """Means and standard deviations (dim,) of a joint distribution, by 10 000 draws with a fixed seed."""
+    draws = distribution.rvs(10_000, 0)
+    return draws.mean(axis=0), draws.std(axis=0)
 
 
 def _scores(u: np.ndarray) -> np.ndarray:

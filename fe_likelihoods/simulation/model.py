@@ -189,19 +189,19 @@ def first_part(model: Model, seconds: float) -> Model:
     )
 
 
-@interrupts_end_the_run()
 def simulate_batch(model: Model, thetas: np.ndarray, pool: Any = None) -> SimulationBatch:
     """Responses for many parameter sets (n, n_parameters), the same for every pool to the last bit.
 
     A pool runs the simulations one by one, even if the model has a batch method (which would run in this process).
     """
-    shape = (len(model.channels), model.n_steps)
-    if getattr(model, "simulate_together", None) is not None:
-        return model.simulate_together(thetas, pool)
-    if pool is None and has_batch_method(model):
-        with _one_by_one_if_it_fails(model):
-            return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
-    return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
+    with interrupts_end_the_run():  # not as a decorator, which would be one more frame
+        shape = (len(model.channels), model.n_steps)
+        if getattr(model, "simulate_together", None) is not None:
+            return model.simulate_together(thetas, pool)
+        if pool is None and has_batch_method(model):
+            with _one_by_one_if_it_fails(model):
+                return SimulationBatch(*_checked_batch(model, model.simulate_batch(thetas), (len(thetas), *shape)))
+        return SimulationBatch(*_run_each(sent_simulation(model), thetas, shape, pool))
 
 
 @interrupts_end_the_run()

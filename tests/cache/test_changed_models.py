@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import pickle
 import subprocess
 import sys
 import textwrap
@@ -17,7 +16,6 @@ from fe_likelihoods.cache.verification import StaleCache, choose_rows
 from fe_likelihoods.simulation import label
 from fe_likelihoods.simulation.faults import ChangedModel
 from fe_likelihoods.simulation.folder import Observed
-from fe_likelihoods.simulation.label import ModelLabel, items_of, value_digest
 from tests.covering import covering
 
 CHANNELS = (Channel("u", "displacement", "m"),)
@@ -325,37 +323,6 @@ def test_a_model_may_change_its_own_values(workshop, helper, monkeypatch):
 
 
 # labels ---------------------------------------------------------------------------------------------------------------
-
-
-class Counted:
-    calls = 0
-
-
-def test_values_and_code_are_compared_by_value():
-    def made(k, names=("a", "b"), label="x"):
-        def function(t):
-            return k * t * len(names)
-
-        function.label = label
-        return function
-
-    one, same, other = (items_of({"f": made(k)})["f"] for k in (2.0, 2.0, 3.0))
-    assert one == same != other
-    assert (
-        len({value_digest(value) for value in (1, 1.0, True, "1", b"1", None, [1], (1,), {1}, {1: 1}, np.ones(1))})
-        == 11
-    )
-    assert value_digest({"a", "b", "c"}) == value_digest({"c", "b", "a"})
-    looped: list = []
-    looped.append(looped)
-    assert value_digest(looped) == value_digest(looped)
-    with pytest.raises(ValueError, match="no value that can be compared"):
-        value_digest(open(os.devnull))
-    thing = Counted()
-    known = ModelLabel(thing)
-    thing.calls = 3
-    assert known.changed(thing) == {"Counted().calls"}
-    assert pickle.loads(pickle.dumps(known)).code == known.code
 
 
 def test_files_that_a_simulation_writes_do_not_count(tmp_path):

@@ -5,16 +5,12 @@ import multiprocessing
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 from multiprocessing.pool import ThreadPool
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fe_likelihoods.cache import rows as cache_rows
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
@@ -25,7 +21,7 @@ from fe_likelihoods.problems import bridge_column
 from fe_likelihoods.signals.channels import Measurements
 from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation import label
-from fe_likelihoods.simulation.model import SimulationBatch, simulate_batch
+from fe_likelihoods.simulation.model import simulate_batch
 from tests.cache.stored import stored_outcomes
 from tests.lines import Batched, Line
 
@@ -61,8 +57,7 @@ def test_another_run_simulates_nothing(path, thetas):
     assert (second.simulations, second.simulator.cache_hits, second.simulator.disk_hits) == (0, 300, 300)
     np.testing.assert_array_equal(second.misfit(thetas), expected)
     assert (second.simulations, second.simulator.cache_hits, second.simulator.disk_hits) == (0, 600, 300)
-    assert (second.simulator.cache.hits, second.simulator.cache.misses) == (300, 0)
-    assert second.model.runs == second.simulator.verifications == second.simulator.cache.info().verified == 2 + 3
+    assert second.model.runs == second.simulator.verifications == 2 + 3
 
 
 def test_failures_are_cached_with_their_reasons(path, thetas):
@@ -88,13 +83,6 @@ def test_duplicates_and_zeros_of_both_signs(path):
     assert likelihood.simulator.cache.info().simulations == 2
 
 
-def test_without_a_memory_cache_rows_come_from_disk(path, thetas):
-    likelihood = likelihood_of(Line(), path, memory_rows=0)
-    for _ in range(3):
-        likelihood.misfit(thetas)
-    assert (likelihood.simulations, likelihood.simulator.disk_hits) == (300, 600)
-
-
 def test_a_batch_needs_two_queries_and_one_write(path, thetas):
     likelihood = likelihood_of(Batched(np.inf), path)
     for shift in (1.0, 2.0):  # the first begins a generation, the second finds it
@@ -110,31 +98,6 @@ def test_a_batch_needs_two_queries_and_one_write(path, thetas):
     statements.clear()
     likelihood.misfit(thetas)
     assert statements == []  # served by the cache in memory
-
-
-def test_statistics_responses_and_failures_are_written_in_one_transaction(path, thetas):
-    """Or a program that is killed in between would repeat simulations."""
-    likelihood = likelihood_of(Batched(np.inf), path)
-    likelihood.misfit(thetas[:1] + 1.0)
-    statements = []
-    likelihood.simulator.cache.file.connection().set_trace_callback(statements.append)
-    likelihood.simulator.chunk_size = 1000
-    likelihood.simulate(thetas)
-    kinds = [statement.split()[0] for statement in statements]
-    assert kinds.count("BEGIN") == kinds.count("COMMIT") == 1 and kinds.count("INSERT") == 600
-
-
-def test_a_stored_simulation_needs_the_fingerprint_of_its_model_once(path, monkeypatch):
-    """It is a digest of the record: 0.1 ms for a record of 10 000 samples."""
-    digest, digests = LinearOscillator.fingerprint.fget, []
-    model = LinearOscillator(Record("sine", 0.02, SINE), 0.6, 0.05)
-    likelihood = likelihood_of(model, path)
-    likelihood.misfit([[1.0, 1.0]])
-    rows, run = likelihood.simulator._checked.rows, likelihood.simulator._run
-    monkeypatch.setattr(LinearOscillator, "fingerprint", property(lambda each: digests.append(1) or digest(each)))
-    rows.store(likelihood.simulator.simulation_key, np.array([[1.1, 1.0]]), np.ones((1, 2)), [""], None, 1.0, run)
-    assert len(digests) == 1 + 1  # and once for the key
-    assert rows.look_up(likelihood.simulator.simulation_key, np.array([[1.1, 1.0]]), run).known.all()
 
 
 def test_a_batch_of_several_queries(path, rng):
@@ -179,17 +142,6 @@ def test_a_change_of_anything_the_misfit_depends_on_needs_a_simulation(path, cha
     assert (again.simulations, again.simulator.disk_hits) == (0, 1)
 
 
-@pytest.mark.parametrize("change", [{"substeps": 2}, {"tolerance": 2e-8}, {"mesh": 22}, {"n_elements": 3}], ids=str)
-def test_settings_of_the_integrator_are_part_of_the_key(path, change):
-    record = Record("pulse", 0.01, np.sin(np.arange(20) / 3))
-    theta = np.ones((1, 5))
-    for settings in ({"mesh": 20}, {"mesh": 20} | change):
-        model = RCColumn.lhpost(record, **settings)
-        likelihood = FELikelihood(model, Measurements(model.channels, 0.01, np.zeros((2, 20))), cache=path)
-        likelihood.misfit(theta)
-        assert (likelihood.simulations, likelihood.simulator.disk_hits) == (1, 0)
-
-
 def test_other_code_of_the_library_is_verified_and_adopted(path, monkeypatch):
     oscillator(path).misfit([[1.1, 0.9]])
     monkeypatch.setattr(label, "sources_digest", lambda *patterns: b"other code")
@@ -214,42 +166,14 @@ def test_noise_prior_and_display_units_change_nothing(path):
     assert shown.simulations == 0
 
 
-def test_a_model_that_changes_during_the_run_is_an_error(path, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.checked_model._SHARE_OF_TIME", np.inf)  # checked every time
-    likelihood = oscillator(path)
-    likelihood.misfit([[1.0, 1.0]])
-    likelihood.model.period = 0.7
-    with pytest.raises(ValueError, match="changed since the likelihood was made"):
-        likelihood.misfit([[1.1, 1.0]])
-    assert likelihood.simulator.cache.info().simulations == 1
+# failures, bounds, other files ----------------------------------------------------------------------------------------
 
 
-def test_fingerprint_and_parameters_cannot_be_confused():
-    thetas = np.arange(6.0).reshape(3, 2)
-    keys = [cache_rows.simulation_keys(fingerprint, thetas) for fingerprint in ("line", "line1", "", "lin")]
-    assert len({key for group in keys for key in group}) == 12
-    swapped = cache_rows.simulation_keys("line", thetas[:, ::-1])
-    assert not set(swapped) & set(keys[0])
-
-
-# retry of failures  ---------------------------------------------------------------------------------------------------
-
-
-def test_failures_are_run_again_with_retry_failures(path):
-    steep = [[0.0, 0.5], [0.0, 2.0], [0.0, 3.0]]
-    likelihood_of(Line(1.0), path).misfit(steep)
-    retried = likelihood_of(Line(2.5), SimulationCache(path, retry_failures=True))
-    for _ in range(2):
-        misfit = retried.misfit(steep)
-    assert (retried.model.runs - retried.simulator.verifications, retried.simulator.disk_hits) == (2, 1)
-    assert np.isfinite(misfit[:2]).all() and np.isnan(misfit[2]).all()
-    after = likelihood_of(Line(2.5), path)  # a success replaces a failure
-    np.testing.assert_array_equal(after.misfit(steep), misfit)
-    assert (after.simulations, after.simulator.failures.count) == (0, 1)
-    after.simulator.cache.store(
-        after.fingerprint, np.array([[0.0, 0.5]]), np.full((1, 2), np.nan), ["now it fails"], 0.1
-    )
-    assert np.isfinite(likelihood_of(Line(2.5), path).misfit(steep[:1])).all()  # a failure does not replace a success
+def test_a_success_replaces_a_failure_and_not_the_reverse(path):
+    theta, store = np.array([[0.0, 0.5]]), SimulationCache(path).store
+    for reason, known in (("fails", "fails"), ("", ""), ("fails now", "")):
+        store("f", theta, np.ones((1, 2)), [reason], 0.1)
+        assert SimulationCache(path).look_up("f", theta, 2).reasons == [known]
 
 
 def test_reasons_of_any_kind(path):
@@ -262,51 +186,14 @@ def test_reasons_of_any_kind(path):
     assert found.reasons == ["x" * 2000, "nul \0 byte", "lone surrogate \\udc80", ""]
 
 
-# bounds, statistics, other files --------------------------------------------------------------------------------------
-
-
-def test_the_oldest_are_evicted(path, rng):
-    cache = SimulationCache(path, max_rows=10)
-    thetas = rng.normal(size=(25, 2))
-    likelihood = likelihood_of(Batched(np.inf), cache)
-    likelihood.misfit(thetas[:8])
-    assert (len(likelihood.model.sizes), cache.evictions) == (1, 0)
-    likelihood.misfit(thetas[8:14])
-    assert (cache.info().simulations, cache.evictions) == (10, 4)
-    known = SimulationCache(path).look_up(likelihood.simulator.simulation_key, thetas, 2).known
-    assert np.flatnonzero(known).tolist() == list(range(4, 14))
-    likelihood.misfit(thetas)  # a batch larger than max_rows
-    assert (cache.info().simulations, cache.evictions) == (10, 15)
-
-
-def test_the_file_does_not_grow_beyond_its_bound(path, rng):
-    cache = SimulationCache(path, max_rows=500)
-    sizes = []
-    for _ in range(30):
-        thetas = rng.normal(size=(500, 2))
-        cache.store("f", thetas, thetas, [""] * 500, 1.0)
-        cache.close()  # moves the write-ahead log into the file
-        sizes.append(path.stat().st_size)
-    assert max(sizes) < 3 * sizes[0]
-
-
-def test_info_and_clear(path, thetas):
+def test_info(path, thetas):
     likelihood = likelihood_of(Line(), path)
     likelihood.misfit(thetas)
     info = likelihood.simulator.cache.info()
     assert info.path == path
     assert (info.simulations, info.failures) == (300, likelihood.simulator.failures.count)
     assert info.seconds == pytest.approx(likelihood.simulator.seconds)
-    assert (info.hits, info.misses, info.evictions, info.damaged, info.responses) == (0, 300, 0, 0, 0)
-    likelihood.simulator.cache.close()
-    full = path.stat().st_size
-    likelihood.simulator.cache.clear()
-    likelihood.simulator.cache.close()
-    assert likelihood.simulator.cache.info().simulations == 0
-    assert path.stat().st_size < full
-    again = likelihood_of(Line(), path)
-    again.misfit(thetas)
-    assert again.simulations == 300
+    assert info.responses == 0
 
 
 def test_forget_deletes_the_simulations_of_one_model(path, thetas):
@@ -341,25 +228,14 @@ def test_a_copy_and_the_rows_of_another_file(tmp_path, path, thetas):
         other.simulator.cache.add(tmp_path / "other.sqlite")
 
 
-@pytest.mark.parametrize("name", ["max_rows", "max_response_bytes"])
 @pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
-def test_invalid_bounds(path, name, value):
-    with pytest.raises(ValueError, match=f"{name} must be a whole number"):
-        SimulationCache(path, **{name: value})
+def test_invalid_bounds(path, value):
+    with pytest.raises(ValueError, match="max_response_bytes must be a whole number"):
+        SimulationCache(path, max_response_bytes=value)
     assert not path.exists()
 
 
 # chunks ---------------------------------------------------------------------------------------------------------------
-
-
-def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-    for model in (Line(), Batched(np.inf)):
-        likelihood = likelihood_of(model, path.with_name(type(model).__name__))
-        expected = likelihood_of(type(model)(model.steepest)).misfit(thetas)
-        np.testing.assert_array_equal(likelihood.misfit(thetas), expected)
-    assert model.sizes[0] == min(300, 8 * (os.cpu_count() or 1))  # every worker is busy
-    assert sum(model.sizes) == 300 + likelihood.simulator.verifications  # its own list changes, on a busy machine
 
 
 def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypatch):
@@ -378,44 +254,6 @@ def test_finished_chunks_of_an_interrupted_batch_are_stored(path, rng, monkeypat
     again = likelihood_of(Line(), path)
     again.misfit(thetas)
     assert (likelihood.simulations, again.simulator.disk_hits, again.simulations) == (7, 7, 13)
-
-
-class Pool:
-    """Pool that runs items in this process and records their number per call."""
-
-    def __init__(self, **attributes):
-        self.sizes = []
-        self.__dict__.update(attributes)
-
-    def map(self, function, items):
-        self.sizes.append(len(items))
-        return list(map(function, items))
-
-
-@pytest.mark.parametrize(
-    ("attributes", "sizes"),
-    [({"n_workers": 3}, [24] * 4 + [4]), ({"_max_workers": 20}, [100]), ({"_processes": 5}, [40, 40, 20]), ({}, [100])],
-    ids=str,
-)
-def test_chunks_keep_the_workers_of_a_pool_busy(path, thetas, monkeypatch, attributes, sizes):
-    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-    pool = Pool(**attributes)
-    likelihood = likelihood_of(Line(), path, pool=pool)
-    likelihood.misfit(thetas[:100])
-    if likelihood.simulator.verifications:  # of two points, on a busy machine, since the model counts its runs
-        pool.sizes.remove(2)
-    assert pool.sizes == sizes
-
-
-def test_chunks_grow_step_by_step_with_the_speed(path, rng):
-    class Fast(Batched):
-        def simulate_batch(self, thetas):
-            return SimulationBatch(np.zeros((len(thetas), 2, 8)), self.sizes.append(len(thetas)) or [""] * len(thetas))
-
-    model = Fast()
-    least = 8 * (os.cpu_count() or 1)
-    likelihood_of(model, path).misfit(rng.normal(size=(30 * least, 2)))
-    assert model.sizes == [least, 4 * least, 16 * least, 9 * least]
 
 
 # processes and threads ------------------------------------------------------------------------------------------------
@@ -444,20 +282,6 @@ def test_other_processes_share_the_file(path, thetas, method):
     likelihood.misfit(thetas)  # the rows of the other process
     assert likelihood.simulations == 200
     assert likelihood.simulator.disk_hits == 100
-
-
-def test_a_connection_does_not_go_through_a_fork(path, thetas):
-    if not hasattr(os, "fork"):
-        pytest.skip("NO fork ON THIS SYSTEM")
-    likelihood = likelihood_of(Line(), path)
-    likelihood.misfit(thetas)
-    assert likelihood.simulator.cache.file._connection is not None
-    context = multiprocessing.get_context("fork")
-    process = context.Process(target=lambda: sys.exit(17 if likelihood.simulator.cache.file._connection is None else 1))
-    process.start()
-    process.join(60)
-    assert process.exitcode == 17
-    assert likelihood.simulator.cache.info().simulations == 300
 
 
 def test_forks_while_threads_write(path, rng):
@@ -505,7 +329,7 @@ def test_threads_share_a_cache(path, rng):
 
 def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     monkeypatch.chdir(tmp_path)
-    cache = SimulationCache("relative.sqlite", max_rows=1000, retry_failures=True)
+    cache = SimulationCache("relative.sqlite", max_response_bytes=1000, verify="2 %")
     likelihood = likelihood_of(Line(), cache, memory_rows=0)
     likelihood.misfit(thetas)
     data = pickle.dumps(likelihood)
@@ -514,27 +338,10 @@ def test_pickles_by_path(tmp_path, monkeypatch, thetas):
     monkeypatch.chdir(tmp_path / "elsewhere")
     copy = pickle.loads(data)
     assert copy.simulator.cache.path == tmp_path / "relative.sqlite"
-    assert (copy.simulator.cache.max_rows, copy.simulator.cache.retry_failures, copy.simulator.cache.misses) == (
-        1000,
-        True,
-        0,
-    )
-    before = likelihood.model.runs - likelihood.simulator.verifications
+    settings = copy.simulator.cache
+    assert (settings.max_response_bytes, settings.verify) == (1000, "2 %")
     copy.misfit(thetas)
-    runs = copy.model.runs - copy.simulator.verifications - before
-    assert runs == likelihood.simulator.failures.count > 0
-
-
-def test_the_key_is_the_same_in_another_process():
-    code = (
-        "import numpy as np; from fe_likelihoods.cache.rows import simulation_keys; "
-        "print(b''.join(simulation_keys('any', np.array([[1.5, -0.0], [2.0, np.pi]]))).hex())"
-    )
-    root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONHASHSEED": "3", "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    here = b"".join(cache_rows.simulation_keys("any", np.array([[1.5, 0.0], [2.0, np.pi]])))
-    assert done.stdout.strip() == here.hex()
+    assert (copy.simulations, copy.simulator.disk_hits) == (likelihood.simulations, 300)
 
 
 # responses ------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ import pickle
 import subprocess
 import sys
 from dataclasses import dataclass
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 import numpy as np
@@ -46,21 +45,6 @@ def test_a_change_of_the_noise_needs_no_simulation(rng):
     x[3, 0] = np.nextafter(x[3, 0], 9.0)
     likelihood.log_likelihood(x)
     assert (likelihood.simulations, likelihood.simulator.cache_hits) == (21, 39)
-
-
-def test_hits_are_rows_from_memory_only():
-    model = Line()
-    likelihood = likelihood_of(model)
-    thetas = np.array([[0.0, 0.5], [-0.0, 0.5], [1.0, 0.5], [0.0, 0.5]])
-    likelihood.misfit(thetas)  # duplicates of the same batch
-    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (2, 0)
-    first = likelihood.misfit(np.vstack([thetas, [[2.0, 0.5], [2.0, 0.5], [np.nan, 0.5]]]))
-    assert (likelihood.simulations, likelihood.simulator.cache_hits) == (3, 4)
-    np.testing.assert_array_equal(first[:4], likelihood_of(Line()).misfit(thetas))
-    np.testing.assert_array_equal(first[4], first[5])
-    assert np.isnan(first[6]).all()
-    first[:] = 0.0  # the returned array is a copy of the cached one
-    assert (likelihood.misfit(thetas) > 0.0).all()
 
 
 def test_failures_are_cached_and_recorded_once():
@@ -109,31 +93,19 @@ def test_the_cache_is_not_pickled(rng):
     assert copy.model.runs == 200
 
 
-def test_threads_share_a_cache(rng):
-    likelihood = likelihood_of(Line(), memory_rows=50)
-    x = points(rng, 60)
-    expected = likelihood_of(Line()).log_likelihood(x)
-    batches = [np.arange(start, start + 20) % 60 for start in range(0, 400, 7)]
-    with ThreadPool(4) as pool:
-        for rows, values in zip(
-            batches, pool.map(lambda rows: likelihood.log_likelihood(x[rows]), batches), strict=True
-        ):
-            np.testing.assert_array_equal(values, expected[rows])
-    assert len(likelihood.simulator.memory_cache) == 50
-
-
 def test_the_least_recently_used_row_is_evicted():
     memory = MemoryCache(2)
     misfit, known = memory.look_up([], 3)
     assert misfit.shape == (0, 3)
     assert known == []
-    memory.store([b"a", b"b"], np.array([[1.0], [2.0]]))
+    memory.store([b"a", b"b"], np.array([[1.0], [np.nan]]), ["", "diverged"])
+    assert memory.reason(b"b") == "diverged"
     memory.look_up([b"a"], 1)
-    memory.store([b"c"], np.array([[3.0]]))  # b is the least recently used
+    memory.store([b"c"], np.array([[3.0]]), [""])  # b is the least recently used
     misfit, known = memory.look_up([b"a", b"b", b"c"], 1)
     assert known == [True, False, True]
     assert misfit[known].ravel().tolist() == [1.0, 3.0]
-    assert np.isnan(misfit[1, 0])
+    assert np.isnan(misfit[1, 0]) and not memory.reason(b"b")
 
 
 # fingerprint ----------------------------------------------------------------------------------------------------------

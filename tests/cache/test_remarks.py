@@ -69,5 +69,3 @@ def test_forgotten_with_the_rows_of_the_model(path):
     other.misfit(THETAS)
     assert first.simulator.cache.forget(*first.simulator.cache_keys) == 3  # two rows and the remark
     assert first.simulator.cache.look_up_remark(first.model) == "" != other.simulator.cache.look_up_remark(other.model)
-    first.simulator.cache.clear()
-    assert other.simulator.cache.look_up_remark(other.model) == ""

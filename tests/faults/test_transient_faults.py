@@ -119,8 +119,6 @@ def test_a_failure_of_the_model_is_not_repeated_for_other_measurements(responses
     assert other.simulator.failures.records == [
         {"parameters": {"offset": 0.4, "slope": 0.1}, "reason": "no convergence at step 3"}
     ]
-    retried = likelihood_of(Faulty(), SimulationCache(cache.path, retry_failures=True), data=2.0)
-    assert np.isfinite(retried.misfit(THETAS)).all()
 
 
 def _undefined(residuals):
@@ -294,8 +292,6 @@ def test_faults_are_recorded_after_many_other_failures():
     }
     assert (log.count, log.transient, len(log.records), len(log.reasons)) == (1501, 1, 1001, 102)
     assert log.reasons["No space left on device"] == 1
-    assert log.fault(fault) == log.fault(-fault * [-1, 1]) == "No space left on device"
-    assert log.fault(np.array([3.0, 0.0])) == ""
 
 
 class FullDisk(Treacherous):

@@ -62,10 +62,10 @@ def test_the_blocks_add_up_to_the_log_likelihood(name, data, rng):
     posterior = posterior_of(FELikelihood(model(), measure(rng, **data), noise))
     rows = np.hstack([STRUCTURAL, parameters])
     for seconds in (None, 0.35, 3.0, 100.0):
-        blocks = posterior.block_log_likelihood(rows, seconds)
+        blocks = posterior.predictive_draws(rows, seconds).blocks
         assert blocks.values.shape == (3, len(blocks.starts))
         assert np.allclose(blocks.values.sum(axis=1), posterior.log_likelihood(rows), rtol=1e-10)
-    assert len(posterior.block_log_likelihood(rows, 3.0).starts) == 4
+    assert len(posterior.predictive_draws(rows, 3.0).blocks.starts) == 4
     assert len(blocks.starts) == 1
 
 
@@ -78,7 +78,7 @@ def test_a_block_of_white_noise_is_the_density_of_its_samples(rng):
     measured = measure(rng, missing=True)
     posterior = posterior_of(FELikelihood(model(), measured))
     rows = np.hstack([STRUCTURAL, TWO])
-    blocks = posterior.block_log_likelihood(rows, 2.0)
+    blocks = posterior.predictive_draws(rows, 2.0).blocks
     for k, (start, stop) in enumerate(zip(blocks.starts, blocks.stops, strict=True)):
         inside = (TIME > start - 1e-9) & (TIME < stop - 1e-9)
         for row, found in zip(rows, blocks.values[:, k], strict=True):
@@ -89,7 +89,7 @@ def test_a_block_of_white_noise_is_the_density_of_its_samples(rng):
 def test_a_block_of_autoregressive_noise_is_conditional_on_those_before(rng):
     measured, (noise, parameters) = measure(rng), NOISES["autoregressive"]
     posterior = posterior_of(FELikelihood(model(), measured, noise))
-    blocks = posterior.block_log_likelihood(np.hstack([STRUCTURAL, parameters]), 4.0)
+    blocks = posterior.predictive_draws(np.hstack([STRUCTURAL, parameters]), 4.0).blocks
     ends = np.round(blocks.stops / DT).astype(int)
     for row, found in zip(np.hstack([STRUCTURAL, parameters]), blocks.values, strict=True):
         upto = np.zeros(len(ends))
@@ -107,7 +107,7 @@ def test_noise_that_was_integrated_out_is_drawn(rng):
     full = Posterior(likelihood, prior | {"sigma_top": HalfNormal(1.0), "sigma_base": HalfNormal(1.0)})
     drawn = full.marginal().predictive_draws(np.repeat(STRUCTURAL[:1], 2000, axis=0), 3.0).blocks.values
     sigma = np.stack(list(full.marginal().draw_noise(np.repeat(STRUCTURAL[:1], 2000, axis=0), 5).values()), axis=1)
-    expected = full.block_log_likelihood(sigma, 3.0).values
+    expected = full.predictive_draws(sigma, 3.0).blocks.values
     error = np.hypot(drawn.std(axis=0), expected.std(axis=0)) / np.sqrt(2000)
     assert np.all(np.abs(drawn.mean(axis=0) - expected.mean(axis=0)) < 4.0 * error)
 
@@ -123,7 +123,7 @@ def test_levels_per_event_and_joint_likelihoods(rng):
     }
     likelihood = FELikelihood(long, data, GaussianNoise(long.channels, groups="event"))
     rows = np.array([[1.0, 0.1, 0.2], [1.1, 0.15, 0.1]])
-    blocks = posterior_of(likelihood).block_log_likelihood(rows, 1.0)
+    blocks = posterior_of(likelihood).predictive_draws(rows, 1.0).blocks
     assert np.allclose(blocks.values.sum(axis=1), likelihood.log_likelihood(rows), rtol=1e-10)
     assert len(blocks.starts) < round(events.duration)  # the pause has no samples and is no observation
 
@@ -165,13 +165,13 @@ def test_what_is_refused(rng):
     posterior = posterior_of(FELikelihood(model(), measure(rng)))
     rows = np.hstack([STRUCTURAL, TWO])
     with pytest.raises(ValueError, match="length of a block"):
-        posterior.block_log_likelihood(rows, -1.0)
+        posterior.predictive_draws(rows, -1.0)
     with pytest.raises(ValueError, match="a, b, sigma_top, sigma_base"):
-        posterior.block_log_likelihood(rows[:, :2])
+        posterior.predictive_draws(rows[:, :2])
 
     def failing(theta):
         raise SimulationFailed("it does not converge")
 
     broken = FELikelihood(FunctionModel(failing, ["a", "b"], CHANNELS, DT, N), measure(rng))
     with pytest.raises(SimulationFailed, match="3 of 3 samples .* does not converge"):
-        posterior_of(broken).block_log_likelihood(rows)
+        posterior_of(broken).predictive_draws(rows)

@@ -133,7 +133,7 @@ def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path, sh
                     first += queue.collect()
                 assert {ticket for ticket, _ in first} == set(tickets[1:])
                 # also where nobody calls the queue any more
-                wait_until(lambda: stored.are_stored(key, thetas).tolist() == [False] + [True] * len(SHORT))
+                wait_until(lambda: stored.look_up(key, thetas, 1).known.tolist() == [False] + [True] * len(SHORT))
                 (tmp_path / "go").touch()
                 values = dict(first + queue.collect())
                 assert [values[ticket] for ticket in tickets] == expected.tolist()
@@ -141,12 +141,12 @@ def test_short_runs_are_stored_before_a_long_one_ends(asynchronous, tmp_path, sh
             results = []
             thread = threading.Thread(target=lambda: results.append(posterior(x)))
             thread.start()
-            wait_until(lambda: stored.are_stored(key, thetas).tolist() == [False] + [True] * len(SHORT))
+            wait_until(lambda: stored.look_up(key, thetas, 1).known.tolist() == [False] + [True] * len(SHORT))
             assert not results
             (tmp_path / "go").touch()
             thread.join(SECONDS)
             np.testing.assert_array_equal(results[0], expected)
-        assert stored.are_stored(key, thetas).all()
+        assert stored.look_up(key, thetas, 1).known.all()
 
 
 def test_items_that_kill_their_process(tmp_path, shared_pool):
@@ -302,8 +302,8 @@ def test_a_closed_queue_cancels_what_waits_and_caches_what_runs(tmp_path, shared
                 call()
         (tmp_path / "go").touch()
         stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
-        wait_until(lambda: stored.are_stored(key, LONG[:1, :2]).all())
-        assert not stored.are_stored(key, SHORT[:, :2]).any()
+        wait_until(lambda: stored.look_up(key, LONG[:1, :2], 1).known.all())
+        assert not stored.look_up(key, SHORT[:, :2], 1).known.any()
         assert posterior.likelihood.simulations == 1
         np.testing.assert_array_equal(posterior(SHORT), posterior_of(Treacherous())(SHORT))
 
@@ -316,7 +316,7 @@ def test_an_interrupt_loses_no_run_that_has_ended(asynchronous, tmp_path):
         stored, key = SimulationCache(path), posterior.likelihood.simulator.simulation_key
 
         def interrupt():
-            wait_until(lambda: stored.are_stored(key, SHORT[:, :2]).all())
+            wait_until(lambda: stored.look_up(key, SHORT[:, :2], 1).known.all())
             os.kill(os.getpid(), signal.SIGINT)
 
         x = np.concatenate([LONG[:1], SHORT])
@@ -369,7 +369,7 @@ def test_a_killed_process_loses_what_runs_and_the_last_second(kind, tmp_path):
     stored, key = SimulationCache(tmp_path / "cache.sqlite"), posterior.likelihood.simulator.simulation_key
     with subprocess.Popen([sys.executable, script, str(tmp_path), kind], env=environment) as process:
         try:
-            wait_until(lambda: process.poll() is not None or stored.are_stored(key, SHORT[:, :2]).all())
+            wait_until(lambda: process.poll() is not None or stored.look_up(key, SHORT[:, :2], 1).known.all())
         finally:
             process.kill()
     (tmp_path / "go").touch()

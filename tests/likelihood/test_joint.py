@@ -13,16 +13,12 @@ from fe_likelihoods import (
     GaussianNoise,
     HalfNormal,
     JointLikelihood,
-    LinearOscillator,
     Measurements,
     Posterior,
     RCColumn,
     Record,
-    SimulationCache,
     SimulationFailed,
     TruncatedNormal,
-    fragility,
-    peak,
     propagate,
 )
 from fe_likelihoods.noise.marginal import MarginalNoise
@@ -111,20 +107,6 @@ def test_nothing_is_simulated_where_a_noise_is_impossible(pieces):
     assert joint.simulations == 0
 
 
-def test_caches_of_the_parts_are_used(pieces, tmp_path, rng):
-    cache = SimulationCache(tmp_path / "cache.db")
-
-    def with_cache():
-        parts = {key: FELikelihood(each.model, each.measurements, cache=cache) for key, each in pieces.items()}
-        return JointLikelihood(parts)
-
-    points = points_of(with_cache(), rng)
-    expected, again = with_cache()(points), with_cache()
-    np.testing.assert_array_equal(again(points), expected)
-    report = again.report()
-    assert report["simulations"] == 0 and report["disk_hits"] == report["cache_hits"] == 2 * len(points)
-
-
 def test_fingerprints(pieces, rng):
     joint = JointLikelihood(pieces)
     posterior = Posterior(joint, prior_of(joint))
@@ -179,21 +161,6 @@ def test_predictions_are_of_one_part(pieces, rng):
     for message, (target, settings) in cases.items():
         with pytest.raises(ValueError, match=message):
             propagate(target, samples, progress=False, **settings)
-
-
-def test_fragility_of_a_part(rng):
-    oscillators = {
-        name: LinearOscillator(Record("noise", 0.02, rng.normal(size=80)), period)
-        for name, period in {"short": 0.4, "long": 0.8}.items()
-    }
-    data = {name: Measurements(o.channels, o.dt, o.simulate([1.0, 1.0])) for name, o in oscillators.items()}
-    joint = JointLikelihood({name: FELikelihood(o, data[name]) for name, o in oscillators.items()})
-    samples = np.abs(rng.normal(1.0, 0.1, size=(20, 4)))
-    record = oscillators["short"].record
-    records = [record.scale(factor) for factor in (0.5, 1.0, 1.5, 2.0)]
-    ours = fragility(joint, samples, records, peak("displacement"), 0.01, part="long", progress=False)
-    theirs = fragility(oscillators["long"], samples[:, :2], records, peak("displacement"), 0.01, progress=False)
-    np.testing.assert_array_equal(ours.probability, theirs.probability)
 
 
 def test_bad_input_is_refused_before_anything_is_simulated(pieces, rng):

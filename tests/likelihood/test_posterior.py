@@ -8,10 +8,9 @@ import time
 import warnings
 from multiprocessing.pool import ThreadPool
 
-import emcee
 import numpy as np
 import pytest
-from scipy import optimize, stats
+from scipy import stats
 
 from fe_likelihoods.likelihood.failure_log import FailureLog, reason_without_numbers
 from fe_likelihoods.likelihood.likelihood import FELikelihood
@@ -152,19 +151,6 @@ def test_equals_the_conjugate_posterior_up_to_a_constant():
     np.testing.assert_allclose(difference, difference[0], rtol=0, atol=1e-10)
 
 
-def test_display_units_change_nothing(oscillator, measurements):
-    # the same data under another display unit: nothing changes, values are SI everywhere
-    x = np.array([[1.1, 0.7, 0.06, 0.0012], [0.9, 1.2, 0.03, 0.004]])
-    other = tuple(
-        Channel(channel.name, channel.quantity, unit)
-        for channel, unit in zip(measurements.channels, ("in/s2", "ft"), strict=True)
-    )
-    shown = Measurements(other, measurements.dt, measurements.values)
-    np.testing.assert_array_equal(
-        FELikelihood(oscillator, shown).log_likelihood(x), FELikelihood(oscillator, measurements).log_likelihood(x)
-    )
-
-
 # shapes, names, orders ----------------------------------------------------------------------------------------------
 
 
@@ -259,13 +245,6 @@ def test_data_fingerprint_knows_the_measurements_only(oscillator, measurements, 
     assert Posterior(likelihood, prior).data_fingerprint == likelihood.data_fingerprint
     assert Posterior(likelihood, prior).marginal().data_fingerprint == likelihood.data_fingerprint
     assert FELikelihood(oscillator, other).data_fingerprint != likelihood.data_fingerprint
-
-
-def test_a_likelihood_is_callable(oscillator, measurements):
-    likelihood = FELikelihood(oscillator, measurements)
-    x = np.array([[1.1, 0.7, 0.06, 0.0012], [1.0, 0.7, -0.06, 0.0012]])
-    np.testing.assert_array_equal(likelihood(x), likelihood.log_likelihood(x))
-    assert likelihood(x[0]) == likelihood.log_likelihood(x[0])
 
 
 # failures ------------------------------------------------------------------------------------------------------------
@@ -507,42 +486,3 @@ def test_pickle(posterior):
     np.testing.assert_array_equal(copy(x), posterior(x))
     assert copy.parameter_names == posterior.parameter_names
     assert copy.likelihood.fingerprint == posterior.likelihood.fingerprint
-
-
-@pytest.mark.parametrize("settings", [{"vectorize": True}, {"parameter_names": "ours"}], ids=str)
-def test_emcee(posterior, settings, seed):
-    if "parameter_names" in settings:
-        settings = {"parameter_names": posterior.parameter_names}
-    start = posterior.sample_prior(10, seed)
-
-    def run(**settings):
-        sampler = emcee.EnsembleSampler(10, posterior.ndim, posterior, **settings)
-        sampler._random = np.random.RandomState(seed)
-        sampler.run_mcmc(start, 5)
-        return sampler.get_chain(), sampler.get_log_prob()
-
-    chain, log_prob = run(**settings)
-    reference, expected = run()
-    np.testing.assert_array_equal(chain, reference)
-    np.testing.assert_array_equal(log_prob, expected)
-    assert np.isfinite(log_prob[-1]).all()
-
-
-def test_optimum_is_near_the_truth(posterior):
-    x0 = np.array([1.0, 1.0, 0.1, 0.002])
-    result = optimize.minimize(
-        lambda x: -posterior(x),
-        x0,
-        method="Nelder-Mead",
-        options={"maxiter": 2000, "maxfev": 2000, "xatol": 1e-8, "fatol": 1e-8},
-    )
-    assert result.success
-    # standard deviations from the curvature at the optimum, with steps of 0.001
-    step = 1e-3 * result.x
-    sd = []
-    for k in range(4):
-        e = np.eye(4)[k] * step
-        curvature = (posterior(result.x + e) - 2 * posterior(result.x) + posterior(result.x - e)) / step[k] ** 2
-        sd.append((-curvature) ** -0.5)
-    assert (np.abs(result.x - np.concatenate([TRUTH, SIGMA])) < 4.5 * np.array(sd)).all()
-    assert (np.array(sd[:2]) < 0.05).all()

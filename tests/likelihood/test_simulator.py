@@ -1,16 +1,11 @@
 """Simulations of a likelihood: run once, counted, and cached, whether their responses or their statistics are asked."""
 
-import pickle
-import signal
-from queue import SimpleQueue
-
 import numpy as np
 import pytest
 
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.failure_log import TooManyFailures
 from fe_likelihoods.likelihood.likelihood import FELikelihood
-from fe_likelihoods.likelihood.simulator import Simulator
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.models.linear_structure import LinearStructure
@@ -24,13 +19,6 @@ from fe_likelihoods.simulation.model import simulate_batch
 from tests.lines import Batched, Line
 
 RECORD = Record("pulse", 0.01, np.sin(np.arange(40) / 3))
-
-
-class MapOnly:
-    """A pool that has map and nothing else."""
-
-    def map(self, function, items):
-        return list(map(function, items))
 
 
 def line(theta):
@@ -129,14 +117,6 @@ def test_a_response_is_simulated_again_and_a_failure_is_not(thetas):
     assert np.isfinite(batch.response[~failed]).all()
 
 
-def test_without_a_memory_cache(thetas):
-    likelihood = likelihood_of(Line(), memory_rows=0, memory_bytes=0)
-    batch = likelihood.simulate(thetas)
-    assert sum(map(bool, batch.reasons)) == likelihood.simulator.failures.count
-    likelihood.misfit(thetas)
-    assert likelihood.simulations == 80
-
-
 def test_responses_are_simulated_once(thetas):
     likelihood = likelihood_of(Line())
     batch = likelihood.simulate(thetas[:30])
@@ -201,15 +181,6 @@ def test_responses_in_memory_are_bounded(thetas, caplog):
         likelihood_of(Line(), memory_bytes=1.5)
 
 
-def test_responses_are_not_pickled(thetas):
-    likelihood = likelihood_of(Line())
-    small = len(pickle.dumps(likelihood))
-    likelihood.simulate(np.column_stack([np.arange(1000.0), np.full(1000, 0.5)]))
-    copy = pickle.loads(pickle.dumps(likelihood))
-    assert len(pickle.dumps(likelihood)) < small + 300  # 1000 responses have 128 000 bytes
-    assert (len(copy.simulator.response_memory), copy.simulator.response_memory.max_bytes) == (0, 2**28)
-
-
 @pytest.mark.parametrize("model", [Line, Batched])
 @pytest.mark.parametrize("responses", [False, True])
 def test_the_disk_cache_has_the_rows_of_statistics(model, responses, path, thetas):
@@ -244,14 +215,6 @@ def test_statistics_from_stored_responses(path, thetas):
     assert_same_log_likelihood(third, thetas, 0)  # the statistics have been stored
 
 
-def test_responses_of_any_size_are_stored(path):
-    expected = likelihood_of(Line()).simulate([[1e60, 0.5], [1.0, 0.5]]).response
-    for runs in (2, 0):
-        likelihood = likelihood_of(Line(), cache=path)
-        np.testing.assert_array_equal(likelihood.simulate([[1e60, 0.5], [1.0, 0.5]]).response, expected)
-        assert likelihood.simulations == runs
-
-
 def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
     good = thetas[thetas[:, 1] < 1.0]
     cache = SimulationCache(path, responses=True, max_response_bytes=10 * 2 * 8 * 8)
@@ -260,37 +223,6 @@ def test_a_response_that_is_no_longer_stored_is_simulated_again(path, thetas):
     np.testing.assert_array_equal(likelihood.simulate(good).response, expected)
     assert likelihood.simulations == len(good) - 10
     assert_same_log_likelihood(likelihood, good, len(good) - 10)
-
-
-def test_a_damaged_response_is_simulated_again(path, thetas):
-    expected = likelihood_of(Line(), cache=SimulationCache(path, responses=True)).simulate(thetas).response
-    cache = SimulationCache(path, responses=True)
-    places = [place for (place,) in cache.file.select("SELECT id FROM rows WHERE size > 0 ORDER BY id LIMIT 6")]
-    for value, some in (("x'00'", places[:5]), ("'text'", places[5:])):
-        cache.file.write((f"UPDATE rows SET value = {value} WHERE id = ?", [(place,) for place in some]))
-    likelihood = likelihood_of(Line(), cache=cache)
-    np.testing.assert_array_equal(likelihood.simulate(thetas).response, expected)
-    assert likelihood.simulations == cache.damaged == 6
-    assert cache.info().responses == np.isfinite(expected[:, 0, 0]).sum()
-
-
-def test_finished_chunks_of_an_interrupted_batch_are_stored(path, thetas, monkeypatch):
-    monkeypatch.setattr("fe_likelihoods.likelihood.simulator._SECONDS_PER_CHUNK", 0.0)
-
-    class Interrupted(Line):
-        def simulate(self, theta):
-            if self.runs == 25:
-                signal.raise_signal(signal.SIGINT)
-            return super().simulate(theta)
-
-    first = likelihood_of(Interrupted(), cache=path)
-    first.model.runs = 0
-    with pytest.raises(KeyboardInterrupt):
-        first.simulate(thetas)
-    assert first.simulator.cache.info().simulations == first.simulations == 25
-    second = likelihood_of(Interrupted(), cache=path)
-    second.misfit(thetas[:25])
-    assert second.model.runs == second.simulator.verifications == 2
 
 
 def test_chunks_do_not_change_a_bit(path, thetas, monkeypatch):
@@ -353,36 +285,6 @@ def test_known_statistics_are_recalled_without_a_simulation(thetas):
     second.simulator.recall(thetas, np.zeros_like(statistics), batch.reasons)  # cached rows are not changed
     np.testing.assert_array_equal(second.simulator.statistics(thetas), statistics)
     assert second.simulator.failures.count == first.simulator.failures.count
-    with pytest.raises(ValueError, match=r"statistics of shape \(40, 2\) and 40 reasons; got \(40, 2\) and 39"):
-        second.simulator.recall(thetas, statistics, batch.reasons[1:])
-    with pytest.raises(ValueError, match="for the same noise"):
-        second.simulator.recall(thetas, statistics[:, :1], batch.reasons)
-
-
-def test_a_simulator_stands_on_its_own(thetas):
-    model = Line()
-    simulator = Simulator(model, likelihood_of(model).measurements)
-    likelihood = likelihood_of(Line())
-    np.testing.assert_array_equal(simulator.misfit(thetas), likelihood.misfit(thetas))
-    assert simulator.report().keys() == likelihood.report().keys()
-    assert simulator.report()["simulations"] == model.runs == len(thetas)
-
-
-def test_what_is_requested_comes_through_a_queue_and_is_known_after_it(thetas, path, shared_pool):
-    expected = simulate_batch(Line(), thetas)
-    with shared_pool(2) as pool:
-        simulator, arrived = likelihood_of(Line(), pool=pool, cache=path).simulator, SimpleQueue()
-        for left in (len(thetas), 0):
-            requested = simulator.request(thetas, True, arrived)
-            assert sum(each.future is not None for each in requested) == left
-            for _ in range(left):
-                simulator.receive([arrived.get(timeout=60.0)])
-            for each, response, reason in zip(requested, *expected, strict=True):
-                np.testing.assert_array_equal(each.result.response, response)
-                assert each.result.reason == reason
-    assert arrived.empty() and simulator.simulations == simulator.cache.info().simulations == len(thetas)
-    simulator.simulate(thetas)
-    assert simulator.simulations == len(thetas)
 
 
 def test_one_point_has_the_value_of_a_batch(thetas):

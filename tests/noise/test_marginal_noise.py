@@ -218,38 +218,3 @@ def test_cache_and_failure_limit_are_kept(full, tmp_path):
 def test_problems_with_the_noise_integrated_out():
     marginal = isolated_bridge(noise="marginal", step=1e-3)
     assert marginal.ndim == 10 and marginal.likelihood.noise.noise.parameter_names == ("sigma",)
-
-
-@pytest.mark.slow
-def test_a_sampler_finds_the_same_evidence_with_fewer_simulations(full, seed):
-    """SMC against the exact evidence (a sum over stiffness and damping), with the noise parameters and without them."""
-    from samplers import SMCSampler
-    from samplers.tempering.recycling import search_draws
-
-    marginal = full.marginal()
-    ends = [(1.05, 1.25), (0.4, 1.4)]
-    axes = [np.linspace(*end, 161) for end in ends]
-    plane = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    values = marginal.log_prob(plane)
-    edge = values.reshape(161, 161)
-    assert max(edge[0].max(), edge[-1].max(), edge[:, 0].max(), edge[:, -1].max()) < values.max() - 18.0
-    exact = special.logsumexp(values) + math.log((axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0]))
-    weights = np.exp(values - values.max())
-    weights /= weights.sum()
-    mean = weights @ plane
-    simulations = {}
-    for name, posterior in (("full", full), ("marginal", full.marginal())):
-        found, means = [], []
-        for k in range(4):
-            sampler = SMCSampler(200, posterior.ndim, posterior, vectorize=True, seed=seed + k)
-            sampler.run_mcmc(None, 1, progress=False)
-            found.append(sampler.log_evidence)
-            means.append(sampler.get_chain(flat=True)[:, :2].mean(axis=0))
-        simulations[name] = posterior.likelihood.simulations
-        sd = np.sqrt(weights @ (plane - mean) ** 2)
-        # 800 points, worth about 400 independent ones; the standard deviation of the evidence of one run is about 0.05
-        assert np.all(np.abs(np.mean(means, axis=0) - mean) < 4.5 * sd / math.sqrt(400.0)), name
-        assert abs(np.mean(found) - exact) < 0.1, name
-    # of about 1800 and 2200 simulations of a run, 600 search for narrow modes, with or without noise parameters
-    search = 4 * search_draws(200)
-    assert simulations["marginal"] - search < 0.8 * (simulations["full"] - search), simulations

@@ -128,25 +128,6 @@ def test_marginal_noise_counts_the_samples_that_are_there(rng):
     np.testing.assert_allclose(draws.mean(axis=0), known, rtol=0.1)
 
 
-def test_nothing_missing_is_as_before(rng):
-    residuals = rng.normal(size=(2, 60))
-    assert count_samples(residuals) == 60
-    squares, steps = np.square(residuals).sum(axis=-1), np.square(np.diff(residuals, axis=-1)).sum(axis=-1)
-    expected = np.concatenate([squares, steps, residuals[:, 0] ** 2 + residuals[:, -1] ** 2])
-    np.testing.assert_array_equal(lag_one_sums(residuals), expected)
-    complete = measured(rng, np.ones((2, 60), dtype=bool))
-    model = FunctionModel(wave, ["size", "speed"], CHANNELS, 0.02, 60)
-    likelihood = FELikelihood(model, complete)
-    x = np.array([1.1, 0.9, 0.2, 0.03])
-    misfit = np.square(wave(x) - complete.values).sum(axis=-1)
-    ratio = np.sqrt(misfit) / x[2:]
-    terms = -60 * (0.5 * math.log(2.0 * math.pi) + np.log(x[2:])) - 0.5 * ratio * ratio
-    assert likelihood.log_likelihood(x) == terms.sum(axis=-1)
-    # digests of data without a gap are those of earlier files
-    fixed = Measurements(CHANNELS, 0.5, [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
-    assert fixed.fingerprint == "4eb0ce4a0d1f4d8d4c36612aa6cfbf39"
-
-
 def test_equals_the_density_with_all_samples_in_one_pattern(rng):
     """The form with gaps, where there are none, is the form without."""
     residuals = rng.normal(size=(2, 60))
@@ -307,17 +288,6 @@ def test_modes_are_those_of_the_samples_that_are_there(rng):
     np.testing.assert_allclose(found.parameters, expected.parameters, rtol=1e-6)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-8)
     assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-4)
-
-
-@pytest.mark.slow
-def test_modes_with_correlated_noise_and_channels_with_windows(rng):
-    there = rng.random((2, N_STEPS)) > 0.2
-    there[1, :90] = False  # no sample in the first parts of the record
-    posterior = gappy_vibration(AutoregressiveNoise, there)
-    mode = find_modes(posterior, starts=3, seed=0).modes[0]
-    density = posterior.log_likelihood(mode.parameters) + stats.norm.logpdf(mode.coords).sum()
-    assert mode.log_density == pytest.approx(density, abs=1e-3)  # residuals are kept in single precision
-    assert (np.abs(mode.parameters[:2] - [1.2, 0.8]) < 0.1).all()
 
 
 # checks of residuals --------------------------------------------------------------------------------------------------

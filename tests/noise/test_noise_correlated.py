@@ -1,6 +1,5 @@
 """Noise for real measurements: correlated errors, known sensor noise, effective samples, compared with white noise."""
 
-import functools
 import math
 import warnings
 
@@ -8,18 +7,16 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from fe_likelihoods import AutoregressiveNoise, GaussianNoise, interval_score
+from fe_likelihoods import AutoregressiveNoise, GaussianNoise
 from fe_likelihoods.cache.simulation_cache import SimulationCache
 from fe_likelihoods.likelihood.likelihood import FELikelihood
 from fe_likelihoods.likelihood.posterior import Posterior
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.draws import SampleNoise
-from fe_likelihoods.noise.residuals import effective_samples, lag_one_sums
+from fe_likelihoods.noise.residuals import lag_one_sums
 from fe_likelihoods.prediction.propagation import propagate
 from fe_likelihoods.priors.distributions import HalfNormal, TruncatedNormal, Uniform
 from fe_likelihoods.problems import bridge_column, bridge_column_prior, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.records import Record
 from fe_likelihoods.simulation.model import SimulationFailed
 from tests import lines
 
@@ -250,85 +247,6 @@ def test_predictions_draw_correlated_errors(rng):
     assert np.all(np.abs(low - 0.05) < 4.5 * math.sqrt(0.05 * 0.95 / n))
     with pytest.raises(ValueError, match="correlation between -1 and 1"):
         propagate(posterior, samples + [0, 0, 0, 0, 0.2, 0], noise=True, progress=False)
-
-
-# calibration ----------------------------------------------------------------------------------------------------------
-
-LEVEL, N_DATA, RHO = 0.9, 200, 0.9
-STEPS = 600
-# at this period [s] the spectrum of the errors is that assumed by effective_samples, (1 + rho^2) / (1 - rho^2) times
-# that of white noise; at a shorter period it is lower, and the effective number is conservative
-LIKE_THE_ERRORS = 1.2
-
-
-def credible_interval(likelihood, noise, statistics, grid, options):
-    """Central 90 % interval of the first parameter, by summation over a grid.
-
-    `grid` are its values, `options` those of the noise's parameters (rows), with flat priors over the grid.
-    """
-    rows = np.repeat(statistics, len(options), axis=0)
-    values = noise.log_likelihood(rows, likelihood.measurements.n_steps, np.tile(options, (len(grid), 1)))
-    density = np.exp(values - values.max()).reshape(len(grid), -1).sum(axis=1)
-    assert max(density[0], density[-1]) < 1e-2 * density.max(), "the grid is too narrow"
-    cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    return np.interp([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], cumulative / cumulative[-1], grid)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("period", [0.6, LIKE_THE_ERRORS])
-def test_coverage_of_each_noise_for_correlated_errors(rng, period):
-    """The 90 % interval of the stiffness over 200 data sets whose errors are AR(1) with rho = 0.9.
-
-    With the known covariance the interval score is 4.1 standard errors. That of white noise is the worst.
-    """
-    oscillator = LinearOscillator(Record("noise", 0.02, rng.normal(size=STEPS)), period=period, damping_ratio=0.05)
-
-    class OneChannel:
-        parameter_names, channels = ("stiffness",), oscillator.channels[1:]
-        dt, n_steps, fingerprint = oscillator.dt, STEPS, "stiffness alone"
-
-        def simulate(self, theta):
-            return respond(theta[0]).copy()
-
-    @functools.cache  # all data sets are compared with the same responses
-    def respond(stiffness):
-        return oscillator.simulate([stiffness, 1.0])[1:]
-
-    model = OneChannel()
-    clean = model.simulate([1.0])
-    sigma = 0.2 * clean.std()
-    sensitivity = (model.simulate([1.001]) - model.simulate([0.999]))[0] / 0.002
-    covariance = sigma**2 * linalg.toeplitz(RHO ** np.arange(STEPS))
-    sd = (sensitivity @ np.linalg.solve(covariance, sensitivity)) ** -0.5
-    grid = 1.0 + sd * np.linspace(-16.0, 16.0, 97)
-    sigmas = sigma * np.geomspace(0.4, 2.5, 15)
-    white = sigmas[:, None]
-    lasting = np.stack(np.meshgrid(sigmas, np.linspace(0.6, 0.98, 16), indexing="ij"), axis=-1).reshape(-1, 2)
-    autoregressive_noise = AutoregressiveNoise(model.channels)
-    intervals = {"white": [], "autoregressive": [], "effective": []}
-    for _ in range(N_DATA):
-        values = clean + sigma * autoregressive(rng, (1, STEPS), RHO)
-        likelihood = FELikelihood(model, Measurements(model.channels, model.dt, values), autoregressive_noise)
-        statistics = likelihood.simulator.statistics(grid[:, None])
-        misfit = statistics[:, :1]
-        residuals = likelihood.residuals(grid[[np.argmin(misfit)]])
-        effective = GaussianNoise(model.channels, effective_samples=effective_samples(residuals))
-        for name, noise, numbers, options in (
-            ("white", GaussianNoise(model.channels), misfit, white),
-            ("autoregressive", autoregressive_noise, statistics, lasting),
-            ("effective", effective, misfit, white),
-        ):
-            intervals[name].append(credible_interval(likelihood, noise, numbers, grid, options))
-    error = math.sqrt(LEVEL * (1.0 - LEVEL) / N_DATA)
-    ends = {name: np.transpose(each) for name, each in intervals.items()}
-    share = {name: np.mean((low < 1.0) & (1.0 < high)) for name, (low, high) in ends.items()}
-    score = {name: interval_score(*each, np.ones(N_DATA), LEVEL).mean() / sd for name, each in ends.items()}
-    assert share["white"] < LEVEL - 8.0 * error, share
-    assert score["autoregressive"] < 0.8 * score["white"] and score["effective"] < score["white"], score
-    assert abs(share["autoregressive"] - LEVEL) < 3.0 * error, share
-    assert share["effective"] > LEVEL - 3.0 * error, share
-    if period == LIKE_THE_ERRORS:
-        assert abs(share["effective"] - LEVEL) < 3.0 * error, share
 
 
 # problems -------------------------------------------------------------------------------------------------------------

@@ -108,38 +108,6 @@ def test_the_likelihood_is_the_multivariate_normal_density(kind, rng):
     assert likelihood([1.1, *(-parameters)]) == -np.inf and likelihood.simulations == 3
 
 
-@pytest.mark.parametrize("kind", ["modulated", pytest.param("shares in bands", marks=pytest.mark.slow)])
-def test_the_density_integrates_to_one_over_the_measurements(kind):
-    """Shares of the measured channel, the control, do not: their level is computed from the measurements."""
-    channel = (CHANNELS[0],)
-    model = FunctionModel(lambda theta: theta[0] * np.array([[1.0, -0.4]]), ["factor"], channel, DT, 2)
-    noise = {
-        "modulated": GaussianNoise(channel, level="response", window=3.0 * DT, sensor=(0.1,)),
-        "shares in bands": GaussianNoise(channel, groups=(10.0,), level="response", sensor=(0.1,)),
-    }[kind]
-    n = len(noise.parameter_names)
-
-    simulated = model.simulate([1.0])
-    axes = np.linspace(-3.0, 5.0, 61), np.linspace(-4.0, 3.2, 61)
-    step = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
-    fitted = FELikelihood(model, Measurements(channel, DT, simulated), noise).noise
-    density = [
-        np.exp(fitted.log_densities(simulated - [[one, two]], simulated, np.full(n, 0.8)).sum())
-        for one in axes[0]
-        for two in axes[1]
-    ]
-    # equal weights are exact up to exp(-2 (pi sd / step)^2) for normal densities that are zero at the ends
-    assert step * np.sum(density) == pytest.approx(1.0, abs=1e-4)
-    values = [np.array([[one, two]]) for one in axes[0] for two in axes[1]]
-    relative = [
-        GaussianNoise(channel, level="measured", scales=[np.sqrt(np.mean(each**2))]).log_likelihood(
-            np.sum((each - simulated) ** 2, axis=1)[None], 2, [[0.3]]
-        )[0]
-        for each in values
-    ]
-    assert step * np.sum(np.exp(relative)) > 1.05
-
-
 @EVERY
 def test_draws_have_the_covariance_of_the_density(kind, rng):
     """Predictions and replicated measurements: per step, and correlation from step to step, against the matrix."""
@@ -194,39 +162,6 @@ def test_levels_in_bands_are_those_of_the_errors_whatever_the_time_step():
     )
     spectrum = np.square(dct(errors[0], norm="ortho"))
     assert spectrum[:320].sum() > 30.0 * spectrum[320:].sum()  # below 2 Hz
-
-
-@pytest.mark.slow
-def test_calibrated_parameters_have_uniform_ranks(rng):
-    """Simulation-based calibration on a grid: exact posteriors, so that the ranks test the density alone."""
-    n, repeats, channel = 120, 120, (CHANNELS[0],)
-    model = FunctionModel(lambda theta: response(theta, n)[:1], ["factor"], channel, DT, n)
-    noises = [
-        GaussianNoise(channel, level="response", window=WINDOW, sensor=(0.02,)),
-        GaussianNoise(channel, groups=(5.0,), level="response", sensor=(0.02,)),
-        GaussianNoise(channel, groups=(5.0,), sensor=(0.02,)),
-    ]
-    axes = [np.linspace(0.4, 1.6, 21), np.linspace(0.05, 1.0, 14), np.linspace(0.05, 1.0, 14)]
-    for noise in noises:
-        d = 1 + len(noise.parameter_names)
-        grid = np.stack([each.ravel() for each in np.meshgrid(*axes[1:d], indexing="ij")], axis=1)
-        ranks = np.empty((repeats, d))
-        for k in range(repeats):
-            truth = [rng.integers(len(axis)) for axis in axes[:d]]
-            theta = np.array([axis[place] for axis, place in zip(axes, truth, strict=False)])
-            simulated = model.simulate(theta[:1])
-            fitted = noise.with_measurements(Measurements(channel, DT, simulated))
-            errors = draw(fitted, theta[1:], simulated, rng)
-            likelihood = FELikelihood(model, Measurements(channel, DT, simulated + errors), noise)
-            statistics = likelihood.simulator.statistics(axes[0][:, None])
-            repeated = np.repeat(statistics, len(grid), axis=0), n, np.tile(grid, (len(statistics), 1))
-            values = fitted.log_likelihood(*repeated)
-            weights = np.exp(np.array(values) - np.max(values)).reshape([len(axis) for axis in axes[:d]])
-            for j, place in enumerate(truth):
-                marginal = weights.sum(axis=tuple(i for i in range(d) if i != j)) / weights.sum()
-                ranks[k, j] = marginal[:place].sum() + rng.uniform() * marginal[place]
-        for j in range(d):
-            assert stats.kstest(ranks[:, j], "uniform").pvalue > 1e-3, (noise, j)
 
 
 def draw(noise, parameters, simulated, rng):

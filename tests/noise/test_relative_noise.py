@@ -113,45 +113,6 @@ def test_draws_have_the_stated_standard_deviations_whatever_the_batch_and_the_ch
     assert energy.mean == pytest.approx(measured.values[0].std() / np.sqrt(1.0 - 0.3**2), rel=0.02)
 
 
-def test_shares_that_were_found_with_one_motion_cover_another_ten_times_weaker(record, rng):
-    """Synthetic truth with errors of 20 % of the local level; the posterior's share is the ratio of error to signal."""
-    weaker = record.scale(0.1)
-
-    def motion(of):
-        response = LinearOscillator(of).simulate([1.0, 1.0])
-        error = 0.2 * local_level(response, 50.0) * rng.standard_normal(response.shape)
-        return Measurements(LinearOscillator(of).channels, of.dt, response + error)
-
-    model, measured = LinearOscillator(record), motion(record)
-    posterior = posterior_of(model, measured, window=1.0)
-    misfit = posterior.likelihood.misfit([[1.0, 1.0]])[0]
-    shares = np.sqrt(misfit / measured.n_steps) / posterior.likelihood.noise.scales
-    np.testing.assert_allclose(shares, 0.2, rtol=0.15)
-    samples = np.tile([1.0, 1.0, *shares], (400, 1))
-    prediction = propagate(posterior, samples, record=weaker, noise=True, seed=1, progress=False)
-    scores = prediction.score(motion(weaker))
-    assert (np.abs(scores.coverage - 0.9) < 0.06).all() and (np.abs(scores.coverage_strong - 0.9) < 0.06).all()
-
-
-@pytest.mark.parametrize("sensor", (0.0, 0.005))
-def test_a_large_share_covers_another_motion_because_the_measured_level_contains_the_error(sensor, rng):
-    """Errors of 50 to 200 % of the response: a share of the response alone would make the bands too narrow."""
-    n, ratio = 4000, np.array([0.5, 1.0, 2.0])
-    shape = 0.01 * np.cos(0.3 * np.arange(n))
-    deviations = np.hypot(sensor, ratio * np.sqrt(np.mean(shape**2)))
-    channels = [Channel(f"c{k}", "displacement", "mm") for k in range(3)]
-    errors = deviations[:, None] * rng.standard_normal((3, n))
-    measured = Measurements(channels, 0.02, shape + errors)
-    noise = GaussianNoise(measured.channels, level="measured", sensor=sensor * np.ones(3) if sensor else None)
-    noise = noise.with_measurements(measured)
-    misfit = np.sum(errors**2, axis=1)
-    shares = np.sqrt(misfit / n - sensor**2) / noise.scales  # at the maximum of the likelihood
-    found = noise.response_deviations(shares, np.tile(shape, (3, 1)), 0.02)[:, 0]
-    np.testing.assert_allclose(found, deviations, rtol=0.06)
-    narrow = np.hypot(sensor, shares * np.sqrt(np.mean(shape**2)))  # control: without the error in the level
-    assert narrow[1] < 0.9 * deviations[1] and narrow[2] < 0.7 * deviations[2]
-
-
 @pytest.mark.parametrize("own_times", (False, True))
 def test_replicated_measurements_have_the_noise_of_a_prediction(record, own_times):
     """Strong and quiet parts of the response have the same noise in both, also where samples have their own times."""

@@ -110,19 +110,6 @@ def test_invalid_residuals_are_refused(function):
             function(residuals)
 
 
-def test_figure_of_residuals(rng):
-    channels = (Channel("top", "absolute acceleration", "g"), Channel("drift", "relative displacement", "in"))
-    residuals = autoregressive(rng, 0.9, n=300, n_channels=2)
-    figure = plot_residuals(residuals, channels, 0.02)
-    axes = np.reshape(figure.axes, (2, 3))
-    time, values = axes[0, 0].lines[0].get_data()
-    assert time[-1] == pytest.approx(299 * 0.02) and np.allclose(values, residuals[0] / 9.80665)
-    lags = np.concatenate([line.get_xdata() for line in axes[0, 1].lines])
-    assert lags.max() > 0.1 and axes[1, 0].get_ylabel() == "drift [in]"
-    with pytest.raises(ValueError, match="one channel for each row.*got 1 and 2"):
-        plot_residuals(residuals, channels[:1], 0.02)
-
-
 def test_what_checks_say_of_residuals(rng):
     white, slow = rng.normal(size=800), autoregressive(rng, 0.9, n=800)[0]
     nearly = white + 0.12 * np.roll(white, 1)

@@ -275,13 +275,6 @@ def test_invalid_arguments_are_refused(make):
             make()
 
 
-def test_distributions_are_values():
-    assert TruncatedNormal(1, 2) == TruncatedNormal(1.0, 2.0, 0, math.inf)
-    assert repr(TruncatedNormal(1, 2)) == "TruncatedNormal(mean=1.0, sd=2.0, lower=0.0, upper=inf)"
-    assert pickle.loads(pickle.dumps(LogNormal(2.0, 0.3))) == LogNormal(2.0, 0.3)
-    assert len({HalfNormal(1), HalfNormal(1.0)}) == 1
-
-
 @pytest.fixture
 def prior():
     return Prior({name: ours for name, (ours, _) in PAIRS.items()})
@@ -311,13 +304,6 @@ def test_prior_has_the_attributes_that_clients_expect(prior):
     assert np.isfinite(prior.logpdf(x)).all()
     assert prior.rvs().shape == (1, prior.dim)
     assert prior.rvs(0).shape == (0, prior.dim)
-
-
-def test_priors_and_distributions_name_the_seed_alike(prior):
-    """As `scipy.stats`."""
-    distribution = Uniform(0.0, 1.0)
-    np.testing.assert_array_equal(distribution.rvs(size=3, random_state=1), distribution.rvs(3, 1))
-    np.testing.assert_array_equal(prior.rvs(size=3, random_state=1), prior.rvs(3, 1))
 
 
 def test_draws_depend_on_the_seed_only(prior):
