@@ -1,8 +1,7 @@
-"""Time per simulation of the isolated bridge, compared with OpenSees and with the solvers of scipy.
+"""Time per simulation of the isolated bridge, compared with the solvers of scipy.
 
 The record has 15 s at 200 samples/s. Errors are those of the worst of twelve channels, relative to its peak, against
-solvers with tight tolerances. OpenSees uses an elastic-plastic law for the sliders and no half loop of the rubber; the
-model has its default laws and the same step in that comparison.
+a solver with a tight tolerance.
 """
 
 import time
@@ -13,7 +12,6 @@ import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
 from fe_likelihoods.signals.records import Record
-from tests.opensees_bridge import run
 from tests.scipy_bridge import CHANNELS, Definition, peak_errors, solve
 
 from .rows import Row
@@ -22,9 +20,7 @@ __all__ = ["simulation"]
 
 DT, N_STEPS = 0.005, 3001
 STEPS = (5e-4, 2.5e-4)  # s; the second is the default
-TOLERANCE = 1e-8  # norm of the last increment in OpenSees [m and rad]; a smaller one does not change its error
 SOLVERS = (("LSODA", 1e-6), ("LSODA", 1e-8), ("DOP853", 1e-6), ("Radau", 1e-6))
-NO_LOOP = (0.0, 0.0, 0.0)
 NOMINAL = np.ones(10)
 
 
@@ -59,37 +55,29 @@ def _models(record: Record) -> dict[tuple[str, float], Callable[[], np.ndarray]]
 def simulation(repeats: int) -> list[Row]:
     """CPU time of one simulation on one core and its error; the codes run in alternation."""
     ground = _ground()
-    plain = Definition(loop=NO_LOOP)
-    reference = {
-        "bouc-wen": solve(Definition(), ground, DT, tolerance=1e-10).response,
-        "elastic-plastic": solve(plain, ground, DT, friction="elastic-plastic", tolerance=1e-10).response,
-    }
+    reference = solve(Definition(), ground, DT, tolerance=1e-10).response
     ours = _models(Record("noise", DT, ground))
     for function in ours.values():
         function()  # compile before the measurement
     seconds, errors = {}, {}
 
-    def note(key: tuple, law: str, cost: float, response: np.ndarray) -> None:
+    def note(key: tuple, cost: float, response: np.ndarray) -> None:
         seconds.setdefault(key, []).append(cost)
-        complete = response.shape == reference[law].shape
-        errors[key] = peak_errors(response, reference[law]).max() if complete else None
+        errors[key] = peak_errors(response, reference).max() if response.shape == reference.shape else None
 
     for _ in range(repeats):
         for key, function in ours.items():
             for _ in range(5):  # one run is too short for the resolution of the clock
-                note(key, key[0], *_timed(function))
-        for step in STEPS:
-            done = run(plain, ground, DT, step=step, tolerance=TOLERANCE)
-            note(("OpenSees", step), "elastic-plastic", done.seconds, done.response)
+                note(key, *_timed(function))
         for method, tolerance in SOLVERS:
             options = dict(method=method, tolerance=tolerance)
             cost, response = _timed(lambda options=options: solve(Definition(), ground, DT, **options).response)
-            note((method, tolerance), "bouc-wen", cost, response)
+            note((method, tolerance), cost, response)
     return _rows(seconds, errors)
 
 
 def _rows(seconds: dict[tuple, list[float]], errors: dict[tuple, float | None]) -> list[Row]:
-    """Rows of times, errors and ratios: to OpenSees at the same step, to scipy at its own tolerance."""
+    """Rows of times, errors and ratios to scipy at its own tolerance."""
 
     def spread(key: tuple) -> str:
         error = "did not finish" if errors[key] is None else f"worst peak error {errors[key]:.1e}"
@@ -102,10 +90,6 @@ def _rows(seconds: dict[tuple, list[float]], errors: dict[tuple, float | None]) 
     for step in STEPS:
         key, case = ("bouc-wen", step), f"bouc-wen, {1e3 * step:g} ms"
         rows.append(Row("IsolatedBridge, CPU time", case, median(seconds[key]), "s", spread(key)))
-        key, case = ("OpenSees", step), f"elastic-plastic, {1e3 * step:g} ms"
-        rows.append(Row("OpenSees, CPU time", case, median(seconds[key]), "s", spread(key)))
-        note = "same step"
-        rows.append(Row("IsolatedBridge, times faster", case, ratio(key, ("bouc-wen", step)), "", note))
     for key in SOLVERS:
         case = f"bouc-wen, {key[0]} {key[1]:g}"
         rows.append(Row("scipy, CPU time", case, median(seconds[key]), "s", spread(key)))

@@ -46,7 +46,7 @@ class PeerColumn(NamedTuple):
     steel: tuple  # ReinforcingSteel: fy, fu, Es, Esh, eps_sh, eps_u
     fibers: np.ndarray  # (3, n): y, area, material (CORE, COVER, STEEL)
     mass: tuple  # along x, along y, rotational
-    node_masses: tuple  # of the column itself, from the first node above the base; vertical too where the top has it
+    node_masses: tuple  # of the column itself, from the first node above the base
     axial_load: float
     a0: float
     a1: float
@@ -117,7 +117,7 @@ def peer_of(model: RCColumn, theta: np.ndarray) -> PeerColumn:
         steel=tuple(values[name] / KSI for name in ("fy", "fu", "Es", "Esh"))
         + (steel.hardening_strain, steel.ultimate_strain),
         fibers=np.concatenate(fibers).T,
-        mass=(mass, mass * model.vertical_mass, model.rotational_inertia / (KIP * INCH)),
+        mass=(mass, mass, model.rotational_inertia / (KIP * INCH)),
         node_masses=tuple(
             np.append(np.ones(model.n_elements - 1), 0.5) * model.column_mass / model.n_elements / TO_MASS
         ),
@@ -195,7 +195,7 @@ def _build(ops, column: PeerColumn, tolerance: float) -> None:
     x, y, rotational = column.mass
     for i, own in enumerate(column.node_masses):
         top = i + 1 == n
-        ops.mass(i + 2, own + x * top, own * bool(y) + y * top, rotational * top)
+        ops.mass(i + 2, own + x * top, own + y * top, rotational * top)
     ops.uniaxialMaterial("Concrete04", CORE, *column.core)
     ops.uniaxialMaterial("Concrete04", COVER, *column.cover)
     ops.uniaxialMaterial("ReinforcingSteel", STEEL, *column.steel)

@@ -2,13 +2,7 @@
 
 This implementation shares no code with the kernels of the library. It uses the free bodies of the deck and of the two
 blocks on their piers (moments about the centre of mass of a block, not assembled matrices), rate equations of friction
-and dampers, and outputs from the equations of motion. `Definition` repeats the nominal values; the peer in OpenSees
-reads them from here.
-
-Friction is the Bouc-Wen law with exponent 2, or an elastic-plastic spring that slips at the friction of the current
-velocity. The latter becomes a differential equation by letting the stretch of the spring exceed the slip for a short
-relaxation time; the force itself is limited to the slip force. The remaining error is of first order in this time and
-arises where the slip force decreases before a reversal. It is 1e-4 of the peaks at a relaxation time of 1e-6 s.
+and dampers, and outputs from the equations of motion. Friction is the Bouc-Wen law with exponent 2.
 """
 
 from typing import NamedTuple
@@ -88,12 +82,12 @@ class Solution(NamedTuple):
 
 # one structured array: scipy passes it at every evaluation, and passing a tuple of arrays takes longer than that
 _CONSTANTS = np.dtype(
-    [(name, float) for name in ("dt", "overshoot", "k_uu", "k_up", "k_pp", "retardation", "deck")]
+    [(name, float) for name in ("dt", "k_uu", "k_up", "k_pp", "retardation", "deck")]
     + [(name, float) for name in ("mass", "rotary", "height", "centre", "rubber_length", "rubber_limit")]
     + [(name, float) for name in ("slip", "gamma", "beta")]
     + [(name, float, 2) for name in ("p_uu", "p_up", "p_pp", "weight", "slow", "rise", "rate")]
     + [(name, float, 2) for name in ("spring", "relaxation")]
-    + [("rubber", float, 6), ("loop", float, 3), ("elastic_plastic", np.int64)]
+    + [("rubber", float, 6), ("loop", float, 3)]
 )
 
 
@@ -118,14 +112,7 @@ def _odd(coefficients, s):
 def _isolator(c, i, u, v, z, damper, load):
     """Return the force of an isolator and the rate of its friction variable."""
     friction = c.slow[i] + c.rise[i] * (1.0 - np.exp(-c.rate[i] * abs(v)))
-    if c.elastic_plastic:
-        bound = friction / c.slow[i] * load
-        share = min(max(z / bound, -1.0), 1.0) if bound > 0.0 else 0.0
-        excess = np.sign(z) * max(abs(z) - bound, 0.0)
-        rate = v / c.slip - excess / c.overshoot
-    else:
-        share = z
-        rate = v / c.slip * (1.0 - z * z * (c.gamma * np.sign(v * z) + c.beta))
+    rate = v / c.slip * (1.0 - z * z * (c.gamma * np.sign(v * z) + c.beta))
     s = u / c.rubber_length
     inside = min(max(s, -c.rubber_limit), c.rubber_limit)
     skeleton, slope = _odd(c.rubber, inside)
@@ -133,7 +120,7 @@ def _isolator(c, i, u, v, z, damper, load):
     half = 0.0
     for m in range(len(c.loop)):
         half += c.loop[m] * inside ** (2 * m)
-    return (friction * c.weight[i] * load + half) * share + skeleton + damper, rate
+    return (friction * c.weight[i] * load + half) * z + skeleton + damper, rate
 
 
 @njit(cache=True)
@@ -180,16 +167,12 @@ def _outputs(times, states, constants, motion, lift):
     return response
 
 
-def _constants(bridge, dt, friction, p_delta, overshoot) -> np.ndarray:
-    if friction not in ("bouc-wen", "elastic-plastic"):
-        raise ValueError(f"expected the friction 'bouc-wen' or 'elastic-plastic'; got {friction!r}")
+def _constants(bridge, dt, p_delta) -> np.ndarray:
     k, weight, length = bridge.stiffness, np.array(bridge.weight), bridge.length
     on_pier = (weight + bridge.mass * GRAVITY) / (30.0 * length) * bool(p_delta)
     overturning = (weight * bridge.height + bridge.mass * GRAVITY * bridge.centre) * bool(p_delta)
     derived = dict(
         dt=dt,
-        elastic_plastic=friction == "elastic-plastic",
-        overshoot=overshoot,
         k_uu=k[0, 0],
         k_up=k[0, 1],
         k_pp=k[1, 1],
@@ -212,25 +195,21 @@ def solve(
     acceleration: np.ndarray,
     dt: float,
     *,
-    friction: str = "bouc-wen",
     method: str = "LSODA",
     tolerance: float = 1e-9,
     every: int = 1,
     p_delta: bool = False,
     vertical: np.ndarray | None = None,
-    overshoot: float = 1e-8,
 ) -> Solution:
     """Simulate the bridge at its parameters (``Definition().at(theta)``) from rest.
 
     `acceleration` (n,) and `vertical` (n,), which changes the load on the bearings, belong to the table [m/s²], with
-    step `dt` [s]; there is one output per `every` samples. `friction` is "bouc-wen" or "elastic-plastic", whose
-    relaxation time is `overshoot` [s]: LSODA may not progress with much shorter ones, and explicit methods of
-    `solve_ivp` are very slow for it. `tolerance` is relative; the absolute one is a tenth of it, times the typical size
-    of each state. With `p_delta`, weights act on the deformed piers.
+    step `dt` [s]; there is one output per `every` samples. `tolerance` is relative; the absolute one is a tenth of it,
+    times the typical size of each state. With `p_delta`, weights act on the deformed piers.
     """
     motion = np.ascontiguousarray(acceleration, dtype=float)
     lift = np.zeros_like(motion) if vertical is None else np.ascontiguousarray(vertical, dtype=float)
-    arguments = (_constants(bridge, dt, friction, p_delta, overshoot), motion, lift)
+    arguments = (_constants(bridge, dt, p_delta), motion, lift)
     times = np.arange(len(acceleration)) * dt
     run = solve_ivp(
         _right_hand_side,

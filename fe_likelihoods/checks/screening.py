@@ -19,6 +19,7 @@ __all__ = [
     "check_data",
     "check_gaps",
     "check_noise_prior",
+    "check_phases",
     "check_sensors",
     "check_steps_of_mass",
     "repair_lines",
@@ -31,6 +32,7 @@ LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacemen
 SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
+REAL_PHASES = 10.0  # [deg]: the modal assurance of a complex shape and its real part is the squared cosine, 0.97
 LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
@@ -247,3 +249,14 @@ def check_steps_of_mass(names: Sequence[str], step: float) -> list[Finding]:
     )
     action = f"Give substeps= so that a step is {SHORT_STEP:.2g} s or shorter, and compare different n_elements."
     return [Finding("The steps are long for an acceleration", CARE, text, action, {"step": step})]
+
+
+def check_phases(scatter: np.ndarray) -> list[Finding]:
+    """Whether complex mode shapes are real up to a factor, by the scatter of the phases of each (m,) [deg]."""
+    modes = np.flatnonzero(np.asarray(scatter) > REAL_PHASES)
+    if not len(modes):
+        return []
+    found = ", ".join(f"{scatter[mode]:.0f} degrees (shape {mode + 1})" for mode in modes)
+    text = f"The phases of complex mode shapes scatter by {found}; their real parts are taken."
+    action = "Identify these modes again, or leave their shapes out: dampers or noise make shapes complex."
+    return [Finding("Mode shapes are complex", CARE, text, action, {"degrees": float(np.max(scatter))})]

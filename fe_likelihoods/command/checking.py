@@ -18,6 +18,7 @@ from ..units import from_si
 from .events import Event, read_events
 from .job import Job, read_job
 from .models import Problem, make_problem, noise_channels_of
+from .results import names_of
 from .runs import CACHE, default_folder, is_free
 from .sampling import is_emcee, make_sampler
 
@@ -40,8 +41,9 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
     events = read_events(job, problem)
     _say_data(problem, say)
     checked = _say_simulation(problem, events, say, progress)
-    repairs = repair_lines(screen(problem.posterior.likelihood.measurements), job.measurements)
-    if repairs:
+    parts = [part for part, _ in problem.posterior.likelihood.parts()]
+    repairs = [line for part in parts for line in repair_lines(screen(part.measurements), job.measurements)]
+    if repairs and job.measurements:
         say("Lines of [measurements] that deal with the sensors, instead of lines with the same keys:")
         for line in repairs:
             say(f"  {line}")
@@ -55,9 +57,10 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
         say(f"emcee makes {simulations} simulations: {sampler.nwalkers} walkers, {job.sampler['steps']} steps")
     else:
         _say_cost(make_problem(job).posterior, sampler, guided, job.budget, checked, say)
-    _draw(problem, checked.seconds, picture)
-    say(f"{picture}: the measurements should lie within the band of the simulations at draws of the prior")
-    made, cache = checked.simulations, problem.posterior.likelihood.simulator.cache
+    pictures = _draw(problem, checked.seconds, picture)
+    names = ", ".join(map(str, pictures))
+    say(f"{names}: the measurements should lie within the band of the simulations at draws of the prior")
+    made, cache = checked.simulations, parts[0].simulator.cache
     stored = (
         "" if cache is None else f", those of the calibrated model are stored in {default_folder(file)}/ for the run"
     )
@@ -67,26 +70,29 @@ def check_job(file: Path, picture: Path, say: Callable[[str], None], progress: b
 
 def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
     posterior, record = problem.posterior, problem.record
-    likelihood = posterior.likelihood
-    measured, model = likelihood.measurements, likelihood.model
     if record is not None:
         peak = from_si(np.abs(record.acceleration).max(), "g").item()
         say(f"Record: {record.name}, {record.n_steps} samples at {record.dt:g} s, peak {peak:.3g} g")
         if record.source:
             say(f"  from {record.source}")
-    say(f"Measurements: {measured.description or 'without a description'}")
-    modal = likelihood.is_modal
-    if modal:
-        say(str(model.data))
-    for channel, values in () if modal else zip(measured.channels, measured.values, strict=True):
-        shown = from_si(values[np.isfinite(values)], channel.unit)
-        missing = f", {len(values) - len(shown)} missing" if len(shown) < len(values) else ""
-        what = "samples" if measured.is_history else "values"
-        say(f"  {channel.name}: {len(shown)} {what}{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
-    inner = getattr(model, "model", model) if modal else model
-    name, n = type(getattr(inner, "parts", inner)).__name__, len(model.parameter_names)
-    say(f"Model: {name}, {n} parameters; with the noise {posterior.ndim}:")
-    width, channels = max(len(parameter.label) for parameter in posterior.parameters), noise_channels_of(likelihood)
+    channels, largest = {}, {}
+    for likelihood, _ in posterior.likelihood.parts():
+        measured, model, modal = likelihood.measurements, likelihood.model, likelihood.is_modal
+        say(f"Measurements: {measured.description or 'without a description'}")
+        if modal:
+            say(str(model.data))
+        for channel, values in () if modal else zip(measured.channels, measured.values, strict=True):
+            shown = from_si(values[np.isfinite(values)], channel.unit)
+            missing = f", {len(values) - len(shown)} missing" if len(shown) < len(values) else ""
+            what = "samples" if measured.is_history else "values"
+            say(f"  {channel.name}: {len(shown)} {what}{missing}, peak {np.abs(shown).max():.3g} {channel.unit}")
+        inner = getattr(model, "model", model) if modal else model
+        say(f"Model: {type(getattr(inner, 'parts', inner)).__name__}, {len(model.parameter_names)} parameters")
+        for name, channel in noise_channels_of(likelihood).items():
+            channels[name] = channel
+            largest[name] = float(np.nanmax(np.abs(measured.channel(channel.name))))
+    say(f"{posterior.ndim} parameters with the noise:")
+    width = max(len(parameter.label) for parameter in posterior.parameters)
     for parameter in posterior.parameters:
         prior = posterior.prior.distributions[parameter.name]
         mean, sd = (parameter.shown(value) for value in prior.moments)
@@ -94,8 +100,8 @@ def _say_data(problem: Problem, say: Callable[[str], None]) -> None:
         say(f"  {parameter.label:<{width}}  prior mean {mean:.3g}, standard deviation {sd:.3g}{note}")
         channel = channels.get(parameter.name)
         if channel is not None:
-            largest = float(np.nanmax(np.abs(measured.channel(channel.name))))
-            for line in labelled(check_noise_prior(channel.name, channel.unit, float(prior.moments[0]), largest)):
+            expected = float(prior.moments[0])
+            for line in labelled(check_noise_prior(channel.name, channel.unit, expected, largest[parameter.name])):
                 say(f"  {line}")
 
 
@@ -116,8 +122,8 @@ def _say_simulation(
     """Check the model, and say what was found."""
     posterior = problem.posterior
     likelihood, mean = posterior.likelihood, posterior.prior.mean()
-    measured, n = likelihood.measurements, len(likelihood.model.parameter_names)
-    point = mean if likelihood.ndim == len(mean) else mean[:n]
+    n = len(mean) if likelihood.ndim == len(mean) else len(likelihood.model.parameter_names)
+    point = mean[:n]
     if not np.isfinite(likelihood.log_likelihood(point)):
         raise ValueError(
             f"the simulation at the mean of the prior has failed: {likelihood.fault(point) or 'no finite likelihood'}; "
@@ -125,11 +131,13 @@ def _say_simulation(
         )
     checked = check_model(posterior, {event.name: event.record for event in events}, progress=progress)
     say(f"One simulation takes {checked.seconds:.2g} s")
-    if likelihood.is_modal:
-        say(f"At the mean of the prior:\n{likelihood.predict_modes(mean[None, :n]).short()}")
-    else:
-        response = likelihood.simulate(mean[None, :n]).response[0]
-        errors = rrmse(measured.values - likelihood.residuals_of(response), measured.values)
+    for part, columns in likelihood.parts():
+        theta, measured = mean[None, columns[: len(part.model.parameter_names)]], part.measurements
+        if part.is_modal:
+            say(f"At the mean of the prior:\n{part.predict_modes(theta).short()}")
+            continue
+        response = part.simulate(theta).response[0]
+        errors = rrmse(measured.values - part.residuals_of(response), measured.values)
         fit = ", ".join(f"{c.name} {100 * e:.0f} %" for c, e in zip(measured.channels, errors, strict=True))
         say(f"At the mean of the prior the error of the response (RRMSE) is {fit}")
     for line in labelled(checked.findings):
@@ -174,24 +182,25 @@ def _say_cost(
             )
 
 
-def _draw(problem: Problem, seconds: float, picture: Path) -> None:
-    """Simulations at draws of the prior with the measurements, as a PNG file."""
+def _draw(problem: Problem, seconds: float, picture: Path) -> list[Path]:
+    """Simulations at draws of the prior with the measurements, as a PNG file for each data set."""
     from ..plots.predictions import plot_bands
     from ..plots.without_time import plot_modes, plot_points
     from ..prediction.propagation import propagate
     from ..reporting.pictures import save_picture
 
-    posterior = problem.posterior
+    posterior, files = problem.posterior, []
     n = int(np.clip(PICTURE_SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))
-    structural = len(posterior.likelihood.model.parameter_names)
-    draws = posterior.sample_prior(n, np.random.RandomState(1))[:, :structural]
-    if posterior.likelihood.is_modal:
-        save_picture(
-            plot_modes(posterior.likelihood.predict_modes(draws), label=f"{n} draws of the prior, 90 %"), picture
-        )
-        return
-    prediction = propagate(posterior.likelihood.model, draws, quantiles=(0.05, 0.95), progress=False)
-    measured = posterior.likelihood.measurements
-    figure = plot_bands(prediction, measured) if measured.is_history else plot_points(measured, prediction=prediction)
-    figure.suptitle(f"{n} draws of the prior and the measurements")
-    save_picture(figure, picture)
+    points = posterior.sample_prior(n, np.random.RandomState(1))
+    for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
+        draws, measured = points[:, columns[: len(part.model.parameter_names)]], part.measurements
+        files.append(picture.with_name(f"{picture.stem}-{key}{picture.suffix}") if key else picture)
+        if part.is_modal:
+            figure = plot_modes(part.predict_modes(draws), label=f"{n} draws of the prior, 90 %")
+        else:
+            prediction = propagate(part.model, draws, quantiles=(0.05, 0.95), progress=False)
+            history = measured.is_history
+            figure = plot_bands(prediction, measured) if history else plot_points(measured, prediction=prediction)
+            figure.suptitle(f"{n} draws of the prior and the measurements")
+        save_picture(figure, files[-1])
+    return files

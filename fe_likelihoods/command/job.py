@@ -12,7 +12,7 @@ from .schema import EVENT, FREE_SECTIONS, MODEL_KINDS, SECTIONS, Key, did_you_me
 __all__ = ["Job", "parse_job", "read_job"]
 
 
-_WITHOUT_TIME = "modes", "load_test"  # sections of data instead of [measurements]
+DATA = "measurements", "modes", "load_test"  # sections of data sets; each may have its own model, [modes.model]
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,29 @@ class Job:
     prediction: dict[str, Any]
     modes: dict[str, Any] = field(default_factory=dict)
     load_test: dict[str, Any] = field(default_factory=dict)
+    own_models: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)  # kind and model of data sets
     events: dict[str, dict[str, Any]] = field(default_factory=dict)  # keys of the events to predict, by name
+    model_section: str = "model"  # the section of the model, such as modes.model
     event: str = ""  # to which record and measurements belong; empty for the calibration
 
     def where(self, section: str) -> str:
         """File and section, for messages."""
         own = self.event and section in ("record", "measurements")
+        section = self.model_section if section == "model" else section
         return f"{self.file.name}: [{f'events.{self.event}' if own else section}]"
+
+    def data_sets(self) -> dict[str, "Job"]:
+        """The same update with one data set each, by section; the section may have a model of its own."""
+        there = [name for name in DATA if getattr(self, name)] or ["measurements"]
+        found = {}
+        for name in there:
+            kind, model = self.own_models.get(name, (self.kind, self.model))
+            others: dict[str, Any] = {other: {} for other in DATA if other != name and len(there) > 1}
+            if name != "measurements" and len(there) > 1:
+                others |= {"record": {}, "noise": {}}
+            where = f"{name}.model" if name in self.own_models else "model"
+            found[name] = replace(self, kind=kind, model=model, model_section=where, **others)
+        return found
 
     def of_event(self, name: str) -> "Job":
         """The same update with record and measurements of one event; `measurements` is empty without them."""
@@ -98,17 +114,21 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
             raise ValueError(f"{file.name}: {name}: expected a section [{name}]; got {value!r}")
     if "model" not in content:
         raise ValueError(f"{file.name}: [model]: this section is missing; it says what the structure is")
-    kind, model = _read_model(content["model"], file.name)
+    kind, model = _read_model(content["model"], f"{file.name}: [model")
+    own = {
+        name: _read_model(content[name].pop("model"), f"{file.name}: [{name}.model")
+        for name in DATA
+        if isinstance(content.get(name, {}).get("model"), dict)
+    }
     values = {
         name: read_keys(content[name], keys, f"{file.name}: [{name}]") if name in content else {}
         for name, keys in SECTIONS.items()
     }
-    data = [name for name in ("measurements", *_WITHOUT_TIME) if name in content]
-    if len(data) > 1 or (data[0:1] != ["measurements"] and data and "record" in content):
-        raise ValueError(
-            f"{file.name}: [{data[-1]}]: a file describes one data set, and modes and load tests have no [record]; "
-            f"got {', '.join(data)}: use JointLikelihood in Python for several"
-        )
+    data = [name for name in DATA if name in content]
+    if data and "measurements" not in data and "record" in content:
+        raise ValueError(f"{file.name}: [record]: modes and load tests have no [record]; it belongs to [measurements]")
+    if len(data) > 1 and "events" in content:
+        raise ValueError(f"{file.name}: [events]: only a file with one data set predicts events; got {', '.join(data)}")
     priors = content.get("priors", {})
     for name, prior in priors.items():
         try:
@@ -116,7 +136,7 @@ def parse_job(text: str, file: Path, folder: Path) -> Job:
         except ValueError as error:
             raise ValueError(f"{file.name}: [priors] {name}: {error}") from None
     events = _read_events(content.get("events", {}), file.name)
-    return Job(file, text, folder, kind, model, priors=priors, events=events, **values)
+    return Job(file, text, folder, kind, model, priors=priors, events=events, own_models=own, **values)
 
 
 def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:
@@ -135,22 +155,24 @@ def _read_events(given: dict[str, Any], file: str) -> dict[str, dict[str, Any]]:
     return events
 
 
-def _read_model(given: dict[str, Any], file: str) -> tuple[str, dict[str, Any]]:
+def _read_model(given: dict[str, Any], where: str) -> tuple[str, dict[str, Any]]:
     kind = given.get("kind")
     if kind not in MODEL_KINDS:
         known = did_you_mean(kind, MODEL_KINDS) if isinstance(kind, str) else f"known are {', '.join(MODEL_KINDS)}"
-        raise ValueError(f"{file}: [model] kind: expected the kind of the structure; got {kind!r}; {known}")
+        raise ValueError(f"{where}] kind: expected the kind of the structure; got {kind!r}; {known}")
     parts = part_keys(kind)
     keys = (*model_keys(kind), Key("kind", "text", "Kind of the structure", True))
     known = (*(key.name for key in keys), *parts)  # the names of parts are proposed as well
     plain = {name: value for name, value in given.items() if name not in parts}
     if unknown := [name for name in plain if name not in known]:
-        raise ValueError(f"{file}: [model] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
-    values = read_keys(plain, keys, f"{file}: [model]")
+        raise ValueError(f"{where}] {unknown[0]}: unknown key of kind {kind}; {did_you_mean(unknown[0], known)}")
+    values = read_keys(plain, keys, f"{where}]")
     for name, keys in parts.items():
         if name in given:
             if not isinstance(given[name], dict):
-                raise ValueError(f"{file}: [model] {name}: expected a section [model.{name}]; got {given[name]!r}")
-            values[name] = read_keys(given[name], keys, f"{file}: [model.{name}]")
+                raise ValueError(
+                    f"{where}] {name}: expected a section {where.partition(': ')[2]}.{name}]; got {given[name]!r}"
+                )
+            values[name] = read_keys(given[name], keys, f"{where}.{name}]")
     values.pop("kind")
     return kind, values

@@ -109,9 +109,9 @@ def run(ctx: click.Context, file: Path, out: Path | None, resume: bool, overwrit
 
 def _show(outcome: Any) -> None:
     click.echo((outcome.folder / "summary.txt").read_text(encoding="utf-8").rstrip())
-    description = outcome.problem.posterior.likelihood.measurements.description
-    if "CAUTION" in description:
-        click.echo(f"Measurements: {description}")
+    for part, _ in outcome.problem.posterior.likelihood.parts():
+        if "CAUTION" in part.measurements.description:
+            click.echo(f"Measurements: {part.measurements.description}")
     _say_assumed(outcome.problem)
     for finding in outcome.findings:
         click.echo(f"CAUTION: {finding}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..cache.simulation_cache import SimulationCache
+from ..likelihood.joint import JointLikelihood
 from ..likelihood.likelihood import FELikelihood
 from ..likelihood.parameters import channels_of_deviations
 from ..likelihood.posterior import Posterior
@@ -27,7 +28,15 @@ from .noises import make_noise
 from .priors import parse_prior
 from .schema import did_you_mean, part_keys
 
-__all__ = ["USER_MODELS", "Problem", "load_function", "make_problem", "noise_channels_of", "reduce_data"]
+__all__ = [
+    "USER_MODELS",
+    "Problem",
+    "load_function",
+    "make_problem",
+    "noise_channels_of",
+    "reduce_data",
+    "runs_code_of_user",
+]
 
 USER_MODELS = ("function", "opensees", "executable")
 ERRORS_OF_MODES = {"frequency_error": 0.01, "shape_error": 0.03}  # medians of log-normal priors without one (assumed)
@@ -45,8 +54,26 @@ class Problem(NamedTuple):
 
 def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
     """Read the data, make the model and the posterior; ValueError, which names section and key, for any fault."""
+    jobs, made, known, record = job.data_sets(), {}, {}, None
+    for section, each in jobs.items():
+        made[section], numbers, motion = _data_set(each, cache)
+        known, record = known | numbers, motion if motion is not None else record
+    if twice := [name for name in known if name in job.priors]:
+        raise ValueError(
+            f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
+        )
+    likelihood = made.popitem()[1] if len(made) == 1 else _located(job, "model", lambda: JointLikelihood(made))
+    priors, assumed = _make_priors(job, likelihood, known)
+    posterior = Posterior(likelihood, priors)
+    posterior = _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior
+    truth = _truth(job, posterior, record) if len(jobs) == 1 else None
+    return Problem(posterior, record, assumed, truth)
+
+
+def _data_set(job: Job, cache: SimulationCache | None) -> tuple[FELikelihood, dict[str, float], Record | None]:
+    """The likelihood of one data set, its known errors by the names of parameters, and its excitation."""
     if has_no_time(job):
-        return _without_time(job, cache)
+        return *_without_time(job, cache), None
     record = read_base_motion(job)
     sensors = _all_channels(job, record)
     measured = read_measured(job, sensors, record)
@@ -59,44 +86,35 @@ def make_problem(job: Job, cache: SimulationCache | None = None) -> Problem:
             f"{job.where('budget')} workers: a built-in model uses all cores by itself; leave this key out"
         )
     law = _located(job, "noise", lambda: make_noise(job, model))
-    likelihood = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
-    priors, assumed = _make_priors(job, likelihood)
-    posterior = Posterior(likelihood, priors)
-    posterior = _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior
-    return Problem(posterior, record, assumed, _truth(job, posterior, record))
+    made = _located(job, "measurements", lambda: FELikelihood(model, measured, law, pool=workers, cache=cache))
+    return made, {}, record
 
 
-def _without_time(job: Job, cache: SimulationCache | None) -> Problem:
-    """The posterior of modes or of a load test."""
-    workers, known = job.budget.get("workers"), {}
+def _without_time(job: Job, cache: SimulationCache | None) -> tuple[FELikelihood, dict[str, float]]:
+    """The likelihood of modes or of a load test, and known errors."""
+    workers = job.budget.get("workers")
     section = "modes" if job.modes else "load_test"
     if job.kind not in USER_MODELS and (job.kind not in FRAMES or not job.modes):
         kinds = (*(FRAMES if job.modes else ()), *USER_MODELS)
-        raise ValueError(f"{job.where('model')} kind: with [{section}], expected one of {', '.join(kinds)}")
+        raise ValueError(
+            f"{job.where('model')} kind: with [{section}], expected one of {', '.join(kinds)}; beside other data, "
+            f"[{section}.model] is its own model"
+        )
 
     def make_model(make: Any, channels: tuple[Channel, ...], dt: float | None, n_steps: int | None) -> Model:
         return _user_model(job, None, channels, make, {"dt": dt, "n_steps": n_steps} if n_steps else {})
 
     if job.modes:
-        likelihood = _located(
-            job, "modes", lambda: modal_likelihood(job, workers, cache, lambda: _frame(job), make_model)
-        )
-    else:
-        channels = _user_channels(job)
-        likelihood, known = _located(
-            job, "load_test", lambda: load_likelihood(job, workers, cache, channels, make_model)
-        )
-        if job.noise:
-            likelihood = likelihood.with_noise(_located(job, "noise", lambda: make_noise(job, likelihood.model)))
-    if twice := [name for name in known if name in job.priors]:
-        raise ValueError(
-            f"{job.where('priors')} {twice[0]}: this error is known from [load_test]: leave one of them out"
-        )
-    priors, assumed = _make_priors(job, likelihood, known)
-    posterior = Posterior(likelihood, priors)
-    return Problem(
-        _located(job, "noise", posterior.marginal) if job.noise.get("marginal") else posterior, None, assumed
-    )
+        made = _located(job, "modes", lambda: modal_likelihood(job, workers, cache, lambda: _frame(job), make_model))
+        return made, {}
+    channels = _user_channels(job)
+    made, known = _located(job, "load_test", lambda: load_likelihood(job, workers, cache, channels, make_model))
+    return made.with_noise(_located(job, "noise", lambda: make_noise(job, made.model))) if job.noise else made, known
+
+
+def runs_code_of_user(job: Job) -> bool:
+    """Whether one of the models is a user's function, script or program."""
+    return any(each.kind in USER_MODELS for each in job.data_sets().values())
 
 
 def _frame(job: Job) -> Any:
@@ -308,11 +326,13 @@ def load_function(job: Job, text: str) -> Callable:
 
 
 def _make_priors(
-    job: Job, likelihood: FELikelihood, known: Mapping[str, float] | None = None
+    job: Job, likelihood: FELikelihood | JointLikelihood, known: Mapping[str, float]
 ) -> tuple[dict[str, Any], dict[str, Distribution]]:
     """The priors of all parameters, numbers for `known` ones, and the assumed ones, which the file does not give."""
-    names, structural = likelihood.parameter_names, tuple(likelihood.model.parameter_names)
-    channels = noise_channels_of(likelihood)
+    names, parts = likelihood.parameter_names, [part for part, _ in likelihood.parts()]
+    structural = dict.fromkeys(name for part in parts for name in part.model.parameter_names)
+    channels = {name: channel for part in parts for name, channel in noise_channels_of(part).items()}
+    measured = {channel.name: part.measurements for part in parts for channel in part.model.channels}
     for name in job.priors:
         if name not in names:
             raise ValueError(
@@ -330,11 +350,11 @@ def _make_priors(
             f'{missing[0]} = "normal(1, 0.3)"'
         )
     assumed = {
-        name: _default_prior(name, channels.get(name), likelihood.measurements)
+        name: _default_prior(name, channels.get(name), measured)
         for name in names
-        if name not in given and name not in (known or {})
+        if name not in given and name not in known
     }
-    return {name: (given | assumed | dict(known or {}))[name] for name in names}, assumed
+    return {name: (given | assumed | dict(known))[name] for name in names}, assumed
 
 
 def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
@@ -342,7 +362,7 @@ def noise_channels_of(likelihood: FELikelihood) -> dict[str, Channel]:
     return channels_of_deviations(likelihood.noise, likelihood.model.channels)
 
 
-def _default_prior(name: str, channel: Channel | None, measured: Measurements) -> Distribution:
+def _default_prior(name: str, channel: Channel | None, measured: Mapping[str, Measurements]) -> Distribution:
     if name.startswith("rho_"):
         return Uniform(-1.0, 1.0)
     for error, median in ERRORS_OF_MODES.items():
@@ -350,5 +370,5 @@ def _default_prior(name: str, channel: Channel | None, measured: Measurements) -
             return LogNormal(median, 1.0)
     if channel is None:
         return HalfNormal(NOISE_SCALE)
-    rms = measured.select([channel.name]).root_mean_squares[0]
+    rms = measured[channel.name].select([channel.name]).root_mean_squares[0]
     return HalfNormal(float(f"{NOISE_SCALE * rms:.3g}") if math.isfinite(rms) and rms > 0.0 else 1.0)

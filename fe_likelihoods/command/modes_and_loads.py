@@ -1,6 +1,7 @@
 """Likelihoods of modes and load tests that a TOML file describes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -70,11 +71,11 @@ def _modal_data(job: Job, given: dict[str, Any]) -> ModalData:
     sensors = tuple(columns.values()) if "variables" not in given else tuple(columns)
     data = read_modal_data(path, sensors, **more)
     if columns and "variables" not in given:
-        data = data.named(tuple(columns))
+        data = replace(data, sensors=tuple(columns))
     data = data.select(given["modes"]) if "modes" in given else data
     if given.get("mean"):
         data = data.mean()
-    return data.with_errors(**options)
+    return replace(data, **options)
 
 
 def load_likelihood(

@@ -11,11 +11,11 @@ from ..checks.finding import Judgement
 from ..checks.run import FinishedRun
 from ..checks.table import moments_of
 from ..likelihood.likelihood import FELikelihood
-from ..likelihood.posterior import Posterior
+from ..modal.modal_likelihood import ModalLikelihood
 from ..prediction.prediction import Prediction
 from ..signals.error_measures import rrmse
 
-__all__ = ["write_csv", "write_samples", "write_tables"]
+__all__ = ["names_of", "write_csv", "write_samples", "write_tables"]
 
 
 def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[str, ...]:
@@ -31,8 +31,9 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     with np.errstate(divide="ignore", invalid="ignore"):
         cv = sd / np.abs(mean)
     moments = summary(run.samples, labels)._replace(mean=mean, sd=sd, cv=cv, mean_error=errors, sd_error=of_sd)
-    modal = posterior.likelihood.is_modal
-    fit = _mode_rows(posterior, run.samples) if modal else _fit_rows(posterior, run.samples)
+    fits = {}  # of each data set: rows of a table, and lines of text
+    for key, (part, columns) in zip(names_of(posterior.likelihood), posterior.likelihood.parts(), strict=True):
+        fits[key] = (_modes if part.is_modal else _fit)(part, run.samples[:, columns])
     simulations = run.sampler.simulations if run.tempered else 0.0
     lines = [
         str(judgement),
@@ -40,14 +41,10 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
         str(moments),
         "",
         *_of_the_sampler(run),
-        *_model_runs(posterior.likelihood, simulations),
+        *_model_runs(next(iter(posterior.likelihood.parts()))[0], simulations),
         "",
     ]
-    if modal:
-        lines.append(str(posterior.likelihood.predict_modes(run.samples)))
-    else:
-        lines.append("Relative RMS error of the response (RRMSE):")
-        lines += [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in fit]
+    lines += [line for _, text in fits.values() for line in text]
     (folder / "summary.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     columns = ("parameter", "mean", "mean_error", "sd", "sd_error", "cv", "q05", "median", "q95", "nominal")
     nominal = [parameter.shown(parameter.nominal) for parameter in run.parameters]
@@ -55,9 +52,10 @@ def write_tables(folder: Path, run: FinishedRun, judgement: Judgement) -> tuple[
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     write_csv(folder / "summary.csv", rows)
     files = ["summary.txt", "summary.csv"]
-    if fit:
-        write_csv(folder / "fit.csv", fit)
-        files.append("fit.csv")
+    for key, (rows, _) in fits.items():
+        name = f"fit-{key}.csv" if key else "fit.csv"
+        write_csv(folder / name, rows)
+        files.append(name)
     if run.tempered:
         (folder / "stages.txt").write_text(ladder_table(run.sampler) + "\n", encoding="utf-8")
         files.append("stages.txt")
@@ -100,26 +98,26 @@ def _model_runs(likelihood: FELikelihood, simulations: float) -> list[str]:
     ]
 
 
-def _fit_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
-    """RRMSE of every channel at the posterior mean; one simulation."""
-    likelihood = posterior.likelihood
-    n = len(likelihood.model.parameter_names)
-    residuals = (
-        likelihood.residuals(samples[:, :n].mean(axis=0))
-        if likelihood.ndim == n
-        else likelihood.residuals(samples.mean(axis=0))
-    )
+def names_of(likelihood: Any) -> list[str]:
+    """Names of the data sets of a likelihood, an empty one for a single data set."""
+    return list(getattr(likelihood, "likelihoods", {"": likelihood}))
+
+
+Table = tuple[list[dict[str, Any]], list[str]]
+
+
+def _fit(likelihood: FELikelihood, samples: np.ndarray) -> Table:
+    """RRMSE of every channel at the posterior mean, as rows and as lines; one simulation."""
     measured = likelihood.measurements
-    errors = rrmse(measured.values - residuals, measured.values)
-    return [
-        {"channel": channel.name, "rrmse": float(error)}
-        for channel, error in zip(measured.channels, errors, strict=True)
-    ]
+    errors = rrmse(measured.values - likelihood.residuals(samples.mean(axis=0)), measured.values)
+    rows = [{"channel": c.name, "rrmse": float(error)} for c, error in zip(measured.channels, errors, strict=True)]
+    shown = [f"  {row['channel']}: {100 * row['rrmse']:.1f} %" for row in rows]
+    return rows, ["Relative RMS error of the response (RRMSE):", *shown]
 
 
-def _mode_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]]:
-    """Measured and computed modes [Hz] at samples of the posterior."""
-    modes = posterior.likelihood.predict_modes(samples)
+def _modes(likelihood: ModalLikelihood, samples: np.ndarray) -> Table:
+    """Measured and computed modes [Hz] at samples of the posterior, as rows and as lines."""
+    modes = likelihood.predict_modes(samples)
     low, high = modes.interval()
     columns = {
         "mode": modes.data.mode_numbers,
@@ -129,7 +127,7 @@ def _mode_rows(posterior: Posterior, samples: np.ndarray) -> list[dict[str, Any]
         "q95_Hz": high.tolist(),
         "mac": np.median(modes.assurance, axis=0).tolist(),
     }
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)], [str(modes)]
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -33,7 +33,7 @@ from .events import (
     write_events,
 )
 from .job import Job, parse_job, read_job
-from .models import USER_MODELS, Problem, make_problem
+from .models import Problem, make_problem, runs_code_of_user
 from .results import write_samples, write_tables
 from .sampling import STEPS, discarded, is_emcee, make_sampler, run_sampler
 
@@ -83,7 +83,7 @@ def run_job(
     events = read_events(job, tried)
     _prepare(job, folder, getattr(tried.posterior, "fingerprint", None), resume, overwrite)
     problem = make_problem(job, SimulationCache(folder / CACHE) if job.budget.get("cache", True) else None)
-    if job.kind in USER_MODELS and not (folder / CHAIN).exists():
+    if runs_code_of_user(job) and not (folder / CHAIN).exists():
         refuse_chance(problem.posterior)
     sampler = _stored_sampler(job, problem, folder)
     run_sampler(job, problem, sampler, progress)
@@ -104,7 +104,7 @@ def report_run(path: Path, runs_code: bool = False) -> Outcome:
         )
     origin = _origin(folder)
     job = parse_job((folder / SETTINGS).read_text(encoding="utf-8"), folder / SETTINGS, Path(origin["folder"]))
-    if job.kind in USER_MODELS and not runs_code:
+    if runs_code_of_user(job) and not runs_code:
         raise ValueError(
             f"the model of {folder} is a Python file or program that its settings name, and nothing was run: give "
             "--run-code if you trust this code"
@@ -263,7 +263,7 @@ def _drawn(job: Job, problem: Problem, sampler: Any) -> np.ndarray:
 
 
 def _predict(job: Job, problem: Problem, drawn: np.ndarray, progress: bool) -> Prediction | None:
-    if not len(drawn) or job.modes:  # modes are in the table and the figure of the fit
+    if not len(drawn) or job.modes or job.load_test and job.measurements:  # the report has a figure of each fit
         return None
     cache = problem.posterior.likelihood.simulator.cache
     try:

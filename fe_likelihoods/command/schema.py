@@ -146,7 +146,7 @@ _BUILT_IN: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "grouped frame": (
         "tall_buildings.GroupedFrame",
-        dict(names="groups rayleigh", required="groups", rayleigh="whole numbers"),
+        dict(names="groups", required="groups"),
     ),
     "bridge deck": ("linear_structure_parts.BridgeDeck", {}),
 }

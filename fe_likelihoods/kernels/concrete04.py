@@ -38,7 +38,6 @@ __all__ = [
     "stress_tangent",
     "commit",
     "stress_history",
-    "fiber_stresses",
 ]
 
 # Layout of the concrete constants.
@@ -158,12 +157,3 @@ def stress_history(strain, c, stress):
         stress[i], _ = stress_tangent(strain[i], eps_min, eps_max, eps_end, slope, tension_slope, c)
         eps_min, eps_max = commit(strain[i], eps_min, eps_max)
         eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
-
-
-@kernel
-def fiber_stresses(strain, memory, c, stress):
-    """Write the `stress` (n,) of fibers at the trial `strain` (n,); `memory` (n, 2) has their extreme strains."""
-    for i in range(strain.shape[0]):
-        eps_min, eps_max = memory[i, 0], memory[i, 1]
-        eps_end, slope, tension_slope = unloading(eps_min, eps_max, c)
-        stress[i], _ = stress_tangent(strain[i], eps_min, eps_max, eps_end, slope, tension_slope, c)

@@ -13,7 +13,6 @@ from ..signals.channels import Channel, Measurements
 from ..signals.tables import read_table, stated_unit
 from ..text_tables import text_table
 from ..units import from_si, to_si
-from .modal_readers import cells_of
 
 __all__ = ["LoadTest", "read_load_test"]
 
@@ -122,8 +121,7 @@ def read_load_test(
     channels : sequence of Channel
         The sensors.
     columns : mapping of str to str, optional
-        Names of the columns, by the names of channels. Default: the column with the name of the channel, with or
-        without a unit.
+        Names of the columns, by the names of channels. Default: the name of the channel, with or without a unit.
     units : mapping of str to str, optional
         Units by the names of channels, where the file does not state them.
     cases : str, optional
@@ -171,9 +169,7 @@ def read_load_test(
     if chosen not in names:
         raise ValueError(f"{table.file}: no column {chosen!r} of load cases; the columns are {', '.join(names)}")
     column = table.columns[names.index(chosen)]
-    points: list[Any] = column.values.tolist()
-    axis = chosen
-    if column.kind == "text" or np.isnan(points).any():  # names
-        cells = cells_of(Path(path))[-len(table.lines) :]
-        points, axis = [row[names.index(chosen)] for row in cells], "load case"
+    points, axis = column.values.tolist(), chosen
+    if column.kind == "text" or np.isnan(column.values).any():  # names
+        points, axis = column.cells, "load case"
     return LoadTest(channels, points, values, errors=errors, axis=axis, description=f"load test of {Path(path).name}")

@@ -25,7 +25,8 @@ class ModalData:
     frequencies : (m,) or (n_sets, m) array_like
         Natural frequencies of m modes [Hz], of one or several identifications. NaN: one of several missed the mode.
     shapes : (m, n_sensors) or (n_sets, m, n_sensors) array_like, optional
-        Mode shapes, a row for each mode. Scale and sign are arbitrary. A row of NaN: no shape for this mode.
+        Mode shapes, a row for each mode. Scale and sign are arbitrary; the attribute has a norm of 1, and a dimension
+        n_sets as all attributes. A row of NaN: no shape for this mode.
     sensors : sequence of str
         Names of the sensors, in the order of the components of a shape. The model has sensors of these names.
     damping : (m,) or (n_sets, m) array_like, optional
@@ -43,12 +44,6 @@ class ModalData:
         Numbers of the modes, used as names and to find the computed modes without a measured shape. Default: 1 to m.
     description : str
         What was measured, where and when.
-
-    Attributes
-    ----------
-    frequencies, damping : (n_sets, m) ndarray
-    shapes : (n_sets, m, n_sensors) ndarray
-        With a norm of 1.
 
     Raises
     ------
@@ -122,10 +117,7 @@ class ModalData:
         m = frequencies.shape[1]
         covariance = np.array(self.covariance, dtype=float)
         if self.frequency_cv is not None or np.isnan(frequencies).any():
-            raise ValueError(
-                "ModalData: covariance= is for frequencies without missing ones, instead of frequency_cv; leave one of "
-                "the two out, or the modes that an identification missed"
-            )
+            raise ValueError("ModalData: covariance= is instead of frequency_cv, and for modes that were never missed")
         symmetric = covariance.shape == (m, m) and np.allclose(covariance, covariance.T, rtol=1e-8, atol=0.0)
         if not symmetric or not np.linalg.eigvalsh(covariance)[0] > 0.0:
             raise ValueError(
@@ -136,17 +128,14 @@ class ModalData:
 
     @property
     def n_sets(self) -> int:
-        """Number of identifications."""
         return len(self.frequencies)
 
     @property
     def n_modes(self) -> int:
-        """Number of modes."""
         return self.frequencies.shape[1]
 
     @property
     def n_sensors(self) -> int:
-        """Number of sensors."""
         return len(self.sensors)
 
     @property
@@ -202,15 +191,6 @@ class ModalData:
         columns = [self.sensors.index(name) for name in sensors]
         return replace(self, shapes=self.shapes[:, :, columns], sensors=tuple(sensors))
 
-    def named(self, sensors: Sequence[str]) -> "ModalData":
-        """Return the data with other names of the sensors, in their order."""
-        return replace(self, sensors=tuple(sensors))
-
-    def with_errors(self, frequency_cv: Any = None, shape_error: Any = None) -> "ModalData":
-        """Return the data with known errors, as those of the class; None keeps the present ones."""
-        errors = {"frequency_cv": frequency_cv, "shape_error": shape_error}
-        return replace(self, **{name: value for name, value in errors.items() if value is not None})
-
     def mean(self) -> "ModalData":
         """Return the mean of several identifications, with their scatter as the errors `frequency_cv`, `shape_error`.
 
@@ -256,22 +236,11 @@ class ModalData:
 
 
 def real_shapes(shapes: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Real parts of complex mode shapes after a rotation by their mean phases, and the scatter of the phases.
+    """Real parts of complex mode shapes (..., n_sensors) after a rotation by their mean phases, and their scatter.
 
-    A shape of proportional damping is real up to a factor. The rotation makes the real part as large as possible.
-
-    Parameters
-    ----------
-    shapes : (..., n_sensors) array_like
-        Complex shapes.
-
-    Returns
-    -------
-    shapes : (..., n_sensors) float
-        Real shapes.
-    scatter : (...,) float
-        Angles whose tangent is the norm of the imaginary parts over the norm of the real parts that is left [deg]:
-        below about 10 degrees, little is lost.
+    A shape of proportional damping is real up to a factor. The rotation makes the real part as large as possible. The
+    tangent of the scatter (...,) [deg] is the norm of the imaginary parts that are left over the norm of the real
+    parts: below about 10 degrees, little is lost.
 
     Examples
     --------

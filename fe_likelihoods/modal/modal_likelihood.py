@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from ..likelihood.likelihood import FELikelihood
 from ..models.linear_structure import LinearStructure
@@ -19,6 +20,7 @@ from .paired_modes import PairedModes
 
 __all__ = ["ModalLikelihood", "PredictedModes"]
 
+_NORMAL_QUANTILES = ndtri((np.arange(32) + 0.5) / 32)  # of an error, for each sample
 _CLOSE = 0.02  # ratio of frequencies, less 1, below which an identification finds the plane of two shapes only
 
 
@@ -103,26 +105,10 @@ class ModalLikelihood(FELikelihood):
     def predict_modes(self, samples: Any, data: ModalData | None = None, most: int = 400) -> "PredictedModes":
         """Modes that samples of a posterior predict, beside measured ones, which may be others than the data.
 
-        Parameters
-        ----------
-        samples : (n, n_parameters) array_like, or mapping
-            Samples of the structural parameters; the parameters of the errors may follow.
-        data : ModalData, optional
-            Measured modes for the comparison, such as modes that were held out. Default: the data.
-        most : int
-            Largest number of samples that are simulated, evenly spaced among all.
-
-        Returns
-        -------
-        PredictedModes
-            Print it for a table.
-
-        Raises
-        ------
-        ValueError
-            For samples of another shape, or if the model has other sensors or fewer modes than the data.
-        SimulationFailed
-            If no sample can be simulated.
+        `samples` (n, n_parameters), or a mapping of names to samples, have the structural parameters; the parameters of
+        the errors may follow, and enter the intervals. Default of `data`: the data of the likelihood. At most `most`
+        samples are simulated, evenly spaced among all. Raises ValueError for samples of another shape, or if the model
+        has other sensors or fewer modes than the data, and SimulationFailed if no sample can be simulated.
 
         Examples
         --------
@@ -135,8 +121,13 @@ class ModalLikelihood(FELikelihood):
         paired = self.model if data is None else PairedModes(self.model.model, data, self.model.close)
         names = paired.parameter_names
         short = isinstance(samples, Mapping) or np.shape(samples)[-1:] == (len(names),)
-        rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))[:, : len(names)]
+        rows = np.atleast_2d(as_points(samples, names if short else self.parameter_names))
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int))]
+        rows, parameters, errors = rows[:, : len(names)], rows[:, len(names) :], np.zeros(len(rows))
+        if parameters.shape[1] == len(self.noise.parameter_names):
+            known = np.zeros(1) if self.model.frequency_cv is None else self.model.frequency_cv
+            squares = np.square(self.noise.standard_deviations(parameters)) - np.square(known)
+            errors = np.sqrt(np.maximum(squares.mean(axis=1), 0.0))  # of the modes of the data, for any modes
         cheap = isinstance(paired.model, StructureModes)
         batch = simulate_batch(paired.model, paired.of_model(rows), None if cheap else self.simulator.pool)
         batch.response[:, 0] *= paired.at_mean_temperature(rows)
@@ -144,7 +135,7 @@ class ModalLikelihood(FELikelihood):
         if not good.any():
             reason = batch.reasons[0] or "a frequency is not positive"
             raise SimulationFailed(f"none of {len(rows)} samples can be simulated; the first reason: {reason}")
-        return PredictedModes.of(paired, batch.response[good])
+        return PredictedModes.of(paired, batch.response[good], errors[good])
 
 
 def _with_modes(model: Any) -> Model:
@@ -195,31 +186,21 @@ def _error(what: str, given: Any, known: np.ndarray | None, m: int) -> tuple[str
 class PredictedModes(NamedTuple):
     """Modes of a model for n parameter samples, paired with m measured modes.
 
-    Attributes
-    ----------
-    paired : PairedModes
-        The measured modes (``paired.data``), and the model.
-    computed : ndarray, shape (n, 1 + n_sensors, n_modes)
-        All computed modes: frequencies [Hz], and shapes at the sensors of the model.
-    frequencies : ndarray, shape (n, m)
-        Computed frequencies of the measured modes [Hz].
-    assurance : ndarray, shape (n, m)
-        Modal assurance criterion; NaN for modes without a measured shape.
-    numbers : ndarray, shape (n, m)
-        Numbers of the computed modes, from 1.
-    shapes : ndarray, shape (n, m, n_sensors)
-        Computed shapes with the scale and sign of the measured ones (of the first identification that has them).
+    Shapes have the scale and sign of the measured ones (of the first identification that has them).
     """
 
-    paired: PairedModes
-    computed: np.ndarray
-    frequencies: np.ndarray
-    assurance: np.ndarray
-    numbers: np.ndarray
-    shapes: np.ndarray
+    paired: PairedModes  # the measured modes (``paired.data``), and the model
+    computed: np.ndarray  # (n, 1 + n_sensors, n_modes) all computed modes: frequencies [Hz], and shapes
+    frequencies: np.ndarray  # (n, m) computed frequencies of the measured modes [Hz]
+    assurance: np.ndarray  # (n, m) modal assurance criterion; NaN for modes without a measured shape
+    numbers: np.ndarray  # (n, m) numbers of the computed modes, from 1
+    shapes: np.ndarray  # (n, m, n_sensors)
+    unknown: (
+        np.ndarray
+    )  # (n,) unknown relative error of a frequency, such as the error of the model; 0 if there is none
 
     @classmethod
-    def of(cls, paired: PairedModes, computed: np.ndarray) -> "PredictedModes":
+    def of(cls, paired: PairedModes, computed: np.ndarray, unknown: np.ndarray | None = None) -> "PredictedModes":
         """Pair computed modes (n, 1 + n_sensors, n_modes) with the measured ones; ValueError if n is zero."""
         found, first = [paired.pair(modes) for modes in computed], paired.data.has_shape.argmax(axis=0)
         return cls(
@@ -229,6 +210,7 @@ class PredictedModes(NamedTuple):
             np.stack([each.assurance for each in found]),
             np.stack([each.columns for each in found]) + 1,
             np.stack([each.shapes[first, np.arange(len(first))] for each in found]),
+            np.zeros(len(found)) if unknown is None else unknown,
         )
 
     @property
@@ -238,14 +220,20 @@ class PredictedModes(NamedTuple):
 
     def against(self, data: ModalData) -> "PredictedModes":
         """The same computed modes beside other measured ones; nothing is simulated."""
-        return self.of(PairedModes(self.paired.model, data, self.paired.close), self.computed)
+        return self.of(PairedModes(self.paired.model, data, self.paired.close), self.computed, self.unknown)
 
     def interval(self, level: float = 0.9) -> np.ndarray:
-        """Central intervals (2, m) of the computed frequencies [Hz], without the error of the identification."""
-        return np.quantile(self.frequencies, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+        """Central intervals (2, m) of an identified frequency [Hz], with its known and unknown errors."""
+        known = self.data.frequency_cv
+        if self.data.covariance is not None:
+            known = np.sqrt(np.diag(self.data.covariance)) / self.data.mean_frequencies
+        errors = np.hypot(self.unknown[:, None], 0.0 if known is None else known)
+        errors = np.broadcast_to(errors, self.frequencies.shape)
+        drawn = self.frequencies * (1.0 + errors * _NORMAL_QUANTILES[:, None, None])
+        return np.quantile(drawn, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=(0, 1))
 
     def rows(self) -> list[list[str]]:
-        """The table as texts: number, measured frequency, median and 90 % interval of the computed one, median MAC."""
+        """The table as texts: number, measured frequency, median of the computed one, `interval`, median MAC."""
         rows, (low, high) = [["mode", "measured [Hz]", "computed [Hz]", "5 %", "95 %", "MAC"]], self.interval()
         for k, number in enumerate(self.data.mode_numbers):
             values = [self.data.mean_frequencies[k], np.median(self.frequencies[:, k]), low[k], high[k]]

@@ -1,26 +1,24 @@
 """Modal data from files and from programs of operational modal analysis."""
 
-import logging
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..signals.tables import Table, read_table, stated_unit
+from ..checks.finding import warn
+from ..checks.screening import check_phases
+from ..signals.tables import Column, Table, read_table, stated_unit
 from ..units import to_si
 from .modal_data import ModalData, real_shapes
 
-__all__ = ["cells_of", "read_modal_data"]
-
-logger = logging.getLogger(__name__)
+__all__ = ["read_modal_data"]
 
 # words in the names of columns that are no sensors, and whole names
 _WORDS = {
     "deviation": ("std", "stdev", "sd", "cv"),
-    "frequency": ("frequency", "frequencies", "freq", "eigenfrequency"),
+    "frequency": ("frequency", "frequencies", "freq", "eigenfrequency", "omega"),
     "period": ("period",),
     "damping": ("damping",),
     "temperature": ("temperature", "temp"),
@@ -46,10 +44,12 @@ def read_modal_data(
         * A CSV file, a text file or a workbook with a header line and a line for each mode: a column ``frequency`` with
           its unit, such as ``frequency_Hz``, or ``period_s``; optional columns ``mode`` (its number), ``damping``,
           ``frequency_std`` [Hz] or ``frequency_cv``, ``temperature`` [°C] and ``set`` (the number of the
-          identification, where there are several); all other columns are sensors. A CSV file with a column for each
-          mode is transposed.
+          identification, where there are several); all other columns of
+          numbers are sensors. A table with a column for each mode
+          is transposed.
         * A MATLAB file (``.mat``, up to version 7.2) with the `variables`, the modes in the columns of the shapes.
-        * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``.
+        * A result of pyOMA2, such as ``ssi.result`` after the choice of the modes: ``Fn``, ``Phi``, ``Xi``, ``Fn_std``,
+          ``Phi_std``.
     sensors : sequence of str, optional
         Names of the sensors. In a table: the columns that are sensors, in this order. Needed for other sources.
     unit : str, optional
@@ -74,7 +74,7 @@ def read_modal_data(
     Warns
     -----
     UserWarning
-        If the phases of a complex shape scatter by more than 10 degrees.
+        If the phases of a complex shape scatter (`fe_likelihoods.checks.screening.check_phases`).
 
     Examples
     --------
@@ -93,7 +93,7 @@ def read_modal_data(
         return _of_matlab(Path(source), sensors, unit, variables or {}, options)
     table = read_table(source)
     if not {"frequency", "period"} & set(map(_kind, _names_of(table))):
-        table = _transposed(Path(source)) or table
+        table = _transposed(table)
     return _of_table(table, sensors, unit, options)
 
 
@@ -109,28 +109,18 @@ def _kind(name: str) -> str:
     return next((kind for kind, known in _WORDS.items() if words & set(known)), _NAMES.get(name, ""))
 
 
-def cells_of(path: Path) -> list[list[str]]:
-    """Cells of a text file with one delimiter, without empty lines and comments."""
-    lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip(" ,;\t")]
-    lines = [line for line in lines if not line.startswith("#")]
-    delimiter = max(";\t,", key=lines[0].count)
-    return [[cell.strip(' "') for cell in line.split(delimiter)] for line in lines]
-
-
-def _transposed(path: Path) -> Table | None:
-    """Table of a text file with a column for each mode, below a line of their names; None if it is no such file."""
-    if path.suffix.lower() not in (".csv", ".txt", ".dat", ".tsv"):
-        return None
-    first, *others = cells_of(path)
-    if not {"frequency", "period"} & {_kind(row[0]) for row in others} or {len(row) for row in others} != {len(first)}:
-        return None
-    digits = [re.sub(r"\D", "", name) for name in first[1:]]
-    numbers = digits if all(digits) else [str(k + 1) for k in range(len(digits))]
-    lines = zip(["mode", *numbers], *others, strict=True)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / path.name
-        file.write_text("\n".join("\t".join(line) for line in lines), encoding="utf-8")
-        return read_table(file)
+def _transposed(table: Table) -> Table:
+    """A table with a column for each mode with a line for each mode; any other table as it is."""
+    names = table.columns[0].cells
+    if table.columns[0].kind != "text" or not {"frequency", "period"} & set(map(_kind, names)):
+        return table
+    digits = [re.sub(r"\D", "", column.name) for column in table.columns[1:]]
+    numbers = np.array(digits if all(digits) else range(1, len(digits) + 1), dtype=float)
+    rows = np.array([column.values for column in table.columns[1:]]).T
+    columns = [
+        Column(name, values, 0, "", "number") for name, values in zip(("mode", *names), (numbers, *rows), strict=True)
+    ]
+    return table._replace(columns=tuple(columns), lines=tuple(range(len(numbers))))
 
 
 def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: dict[str, Any]) -> ModalData:
@@ -141,7 +131,8 @@ def _of_table(table: Table, sensors: Sequence[str], unit: str | None, options: d
         raise ValueError(
             f"{table.file}: expected a column of frequencies, such as frequency_Hz; the columns are {', '.join(names)}"
         )
-    others = [name for place, name in enumerate(names) if place not in found.values()]
+    texts = [place for place, column in enumerate(table.columns) if column.kind == "text"]  # such as remarks
+    others = [name for place, name in enumerate(names) if place not in (*found.values(), *texts)]
     if unknown := [name for name in sensors if name not in others]:
         raise ValueError(f"{table.file}: no columns {', '.join(unknown)}; the sensors are {', '.join(others)}")
     sensors = tuple(sensors) or tuple(others)
@@ -216,8 +207,15 @@ def _of_matlab(
     values = {what: np.squeeze(content[name]) for what, name in variables.items()}
     values["frequencies"] = _in_hertz(np.atleast_1d(values["frequencies"]), None, unit, str(path))
     if "shapes" in values:
-        m = len(values["frequencies"])
-        values["shapes"] = _real(np.reshape(content[variables["shapes"]], (-1, m)).T)
+        m, shapes = len(values["frequencies"]), content[variables["shapes"]]
+        if m == 1:
+            shapes = shapes.reshape(-1, 1)
+        if shapes.ndim != 2 or shapes.shape[1] != m:
+            raise ValueError(
+                f"{path}: expected {m} modes in the columns of {variables['shapes']}; got the shape {shapes.shape}: "
+                "transpose it"
+            )
+        values["shapes"] = _real(shapes.T)
     return ModalData(sensors=sensors, **values, **options)
 
 
@@ -230,7 +228,11 @@ def _of_result(result: Any, sensors: Sequence[str], options: dict[str, Any]) -> 
         options = {"frequency_cv": np.ravel(deviations) / frequencies} | options
     if (damping := getattr(result, "Xi", None)) is not None:
         options = {"damping": np.ravel(damping)} | options
-    return ModalData(frequencies, _real(np.asarray(result.Phi).T), sensors, **options)
+    shapes = np.asarray(result.Phi).T
+    if (deviations := getattr(result, "Phi_std", None)) is not None:
+        squares = np.square(np.abs(np.asarray(deviations).T)).mean(axis=1)
+        options = {"shape_error": np.sqrt(squares) / np.linalg.norm(shapes, axis=1)} | options
+    return ModalData(frequencies, _real(shapes), sensors, **options)
 
 
 def _in_hertz(values: np.ndarray, stated: str | None, given: str | None, where: str) -> np.ndarray:
@@ -247,5 +249,5 @@ def _real(shapes: np.ndarray) -> np.ndarray:
     if not np.iscomplexobj(shapes):
         return shapes
     real, scatter = real_shapes(shapes)
-    logger.info("complex shapes: their real parts are taken; the phases scatter by %s degrees", scatter.round(1))
+    warn(check_phases(scatter), stacklevel=4)
     return real

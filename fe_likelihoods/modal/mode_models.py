@@ -39,19 +39,9 @@ def modal_channels(sensors: Sequence[str]) -> tuple[Channel, ...]:
 def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) -> np.ndarray:
     """Response (1 + n_sensors, n_modes) of a model that has modes.
 
-    Parameters
-    ----------
-    frequencies : (n,) array_like
-        Natural frequencies [Hz].
-    shapes : (n, n_sensors) array_like
-        Mode shapes in any scale, a row for each mode.
-    n_modes : int, optional
-        Number of modes in the response; others are left out.
-
-    Raises
-    ------
-    SimulationFailed
-        If a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies differ.
+    Of natural frequencies (n,) [Hz] and mode shapes (n, n_sensors) in any scale, the lowest `n_modes` are kept. Raises
+    SimulationFailed if a frequency is not positive, there are fewer modes, or the numbers of rows and frequencies
+    differ.
 
     Examples
     --------
@@ -78,19 +68,9 @@ def modal_response(frequencies: Any, shapes: Any, n_modes: int | None = None) ->
 def opensees_modes(ops: Any, n_modes: int, sensors: Sequence[tuple[int, int]]) -> np.ndarray:
     """Modes of the present OpenSees model as the response (1 + n_sensors, n_modes) of a model that has modes.
 
-    Parameters
-    ----------
-    ops : module
-        ``openseespy.opensees``, as an `OpenSeesModel` passes it.
-    n_modes : int
-        Number of modes, less than the number of degrees of freedom that have a mass.
-    sensors : sequence of (node, degree of freedom)
-        Where the sensors are, in the order of the channels.
-
-    Raises
-    ------
-    SimulationFailed
-        If ``ops.eigen`` fails, or an eigenvalue is not positive.
+    `ops` is ``openseespy.opensees``, as an `OpenSeesModel` passes it; `n_modes` is less than the number of degrees of
+    freedom that have a mass; `sensors` are nodes and degrees of freedom in the order of the channels. Raises
+    SimulationFailed if ``ops.eigen`` fails, or an eigenvalue is not positive.
 
     Examples
     --------
@@ -187,22 +167,11 @@ class FunctionModes(FunctionModel):
 
 
 class StructureModes(ExternalModel):
-    """Modes of a linear structure of this library, such as a `ShearFrame`, as a model.
+    """Modes of a linear structure of this library, such as a `ShearFrame`, as a model with derivatives.
 
     Its parameters are those of the structure except dampings, which the undamped modes do not depend on. Its sensors
-    are the channels of the structure. It has derivatives.
-
-    Parameters
-    ----------
-    parts : Parts
-        Structure with a method ``assemble``.
-    n_modes : int, optional
-        Number of modes. Default: all of a frame or a `ModalModel`.
-
-    Raises
-    ------
-    ValueError
-        If the number of modes is not known, or the structure has fewer.
+    are the channels of the structure. The default of `n_modes` are all of a frame or a `ModalModel`; ValueError if the
+    number is not known, or the structure has fewer.
     """
 
     path_dependent = False
@@ -236,13 +205,9 @@ class StructureModes(ExternalModel):
         system, modes = self._modes(theta)
         steps = _STEP * np.where(theta == 0.0, 1.0, np.abs(theta))
         ends = [[self._system(theta + sign * step) for sign in (1.0, -1.0)] for step in np.diag(steps)]
+        pairs = list(zip(ends, steps, strict=True))
         stiff, heavy, sensors = (
-            np.stack(
-                [
-                    (getattr(up, what) - getattr(down, what)) / (2.0 * step)
-                    for (up, down), step in zip(ends, steps, strict=True)
-                ]
-            )
+            np.stack([(getattr(up, what) - getattr(down, what)) / (2.0 * h) for (up, down), h in pairs])
             for what in ("stiffness", "mass", "shape")
         )
         slopes = mode_derivatives(modes, stiff, heavy)

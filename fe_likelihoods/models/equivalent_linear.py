@@ -33,7 +33,7 @@ from ..simulation.model import SimulationFailed
 from .linear_system import LinearSystem, Parts, complex_modes, superpose
 from .validation import check_positive
 
-__all__ = ["EquivalentLinear", "Settled", "response_level"]
+__all__ = ["EquivalentLinear", "Settled"]
 
 _LARGEST_LOG = math.log(1000.0)  # of a level as a multiple of the reference
 _STEP = 0.5  # of the search for a sign change, in the logarithm of the level
@@ -78,8 +78,8 @@ class EquivalentLinear:
     Notes
     -----
     One level holds for the whole record: the properties do not change within a motion, and differ between motions only
-    through their levels. The structure has no memory and no residual displacement. `fixed_points` finds all levels that
-    agree with a motion.
+    through their levels. The structure has no memory and no residual displacement. If
+    several levels agree with a motion, the first one in the direction of the search is used.
 
     Examples
     --------
@@ -134,24 +134,9 @@ class EquivalentLinear:
         The search goes from the reference level towards the response level, each time by a factor of 1.65, until it
         passes the response level. Brent's method then finds the fixed point in between to a relative error of 1e-13.
 
-        Parameters
-        ----------
-        theta : ndarray[n_parameters]
-            Values of `parameter_names`.
-        support_acceleration : ndarray[n_supports, n_steps]
-            Absolute accelerations of the supports [m/s²].
-        dt : float
-            Time step of the samples [s].
-
-        Returns
-        -------
-        Settled
-
-        Raises
-        ------
-        SimulationFailed
-            As `assemble` and `respond_structure`, and if there is no fixed point between 1/1000 and 1000 times the
-            reference level.
+        `theta` are the parameters, and the support accelerations are (n_supports, n_steps) [m/s²]. Raises
+        SimulationFailed as `assemble`, and if there is no fixed point between 1/1000 and 1000 times the reference
+        level.
         """
         reference, excess = self._excess(theta, support_acceleration, dt)
         first = excess(0.0)
@@ -169,29 +154,6 @@ class EquivalentLinear:
                 )
             below, end = end, end + step
         return self._settled(_root(excess, below, end) if last else end, theta, reference)
-
-    def fixed_points(self, theta: np.ndarray, support_acceleration: np.ndarray, dt: float) -> np.ndarray:
-        """Find all levels that agree with their own properties, from 1/1000 to 1000 times the reference level.
-
-        There are several levels where the response grows faster than the level while the frequency moves through a peak
-        of the response spectrum. `settle` uses the first level in its direction of search, and the likelihood may jump
-        where this level disappears. Two fixed points within a factor of 1.65 of each other may be missed.
-
-        Parameters
-        ----------
-        theta, support_acceleration, dt
-            As for `settle`.
-
-        Returns
-        -------
-        ndarray[n]
-            Levels in ascending order [m]; an odd number, or none if the search range is too small.
-        """
-        _, excess = self._excess(theta, support_acceleration, dt)
-        grid = _STEP * np.arange(-math.ceil(_LARGEST_LOG / _STEP), math.ceil(_LARGEST_LOG / _STEP) + 1.0)
-        values = np.array([excess(x) for x in grid])
-        changes = np.flatnonzero((values[:-1] >= 0.0) != (values[1:] >= 0.0))
-        return self.reference * np.exp([_root(excess, grid[i], grid[i + 1]) for i in changes])
 
     def _excess(
         self, theta: np.ndarray, support_acceleration: np.ndarray, dt: float
@@ -211,7 +173,7 @@ class EquivalentLinear:
             modes = complex_modes(self._settled(x, theta, reference).system._replace(influence=influence))
             displacement[:] = 0.0
             superpose(modes, modes.shapes[:, :1] @ shape, motion, dt, displacement)
-            level = response_level(displacement[0])
+            level = _response_level(displacement[0])
             if not level < math.inf:
                 raise SimulationFailed(f"the response at {math.exp(x):.3g} times the reference level is not finite")
             if level == 0.0:
@@ -232,7 +194,7 @@ class EquivalentLinear:
         return Settled(self.reference * math.exp(x), float(stiffness), float(damping), system)
 
 
-def response_level(displacement: np.ndarray) -> float:
+def _response_level(displacement: np.ndarray) -> float:
     """Energy-weighted root mean square of a relative displacement (n_steps,) [m]: sqrt(sum u^4 / sum u^2)."""
     largest = np.abs(displacement).max()
     if not 0.0 < largest < math.inf:

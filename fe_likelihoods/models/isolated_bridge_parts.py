@@ -76,16 +76,6 @@ class Pier:
         lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(self.mass_matrix, self.stiffness)).real.min())
         return 2.0 * self.damping_ratio / lowest * self.stiffness
 
-    def geometric_stiffness(self, load: float, gravity: float) -> np.ndarray:
-        """Geometric stiffness (2, 2) to be added, for the `load` [N] on the block and the block weight.
-
-        The slider is on the block, and the sliding plate on the deck.
-        """
-        length, axial = self.length, load + self.mass * gravity
-        matrix = -axial / (30.0 * length) * np.array([[36.0, -3.0 * length], [-3.0 * length, 4.0 * length**2]])
-        matrix[1, 1] -= load * self.height + self.mass * gravity * self.center
-        return matrix
-
 
 @dataclass(frozen=True)
 class Bearing:

@@ -1,4 +1,4 @@
-"""Linear part of the isolated bridge: matrices of deck and piers, and the matrices of one exact integration step.
+"""One simulation of the isolated bridge: matrices of deck and piers, of one exact integration step, and the run.
 
 Degrees of freedom, relative to the table: q = [deck, pier 1 and its rotation, pier 2 and its rotation]. The linear part
 holds the structure, its damping, the dampers (Maxwell elements) and the linear term of the rubber ::
@@ -12,16 +12,31 @@ the rubber). Between two instants a_g and F are linear in time, so that a step i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
+from ..kernels.bearings import BOUC_WEN, COULOMB, RubberLaw, Slider
 from ..kernels.exponential import matrix_exponential
-from ..kernels.isolated_bridge import N_STATES, StepMatrices
-from .isolated_bridge_parts import Bearing, Damper, Pier, Rubber
+from ..kernels.isolated_bridge import N_OUT, N_STATES, Isolators, StepMatrices, step_isolated
+from ..simulation.model import SimulationFailed
+from .isolated_bridge_channels import OF_A_PIER, at_pier
+from .isolated_bridge_parts import Damper, Pier, Rubber
+from .validation import check_values
 
-__all__ = ["BridgeMatrices", "BridgeStateSpace"]
+__all__ = ["FORMS", "BridgeMatrices", "BridgeRun", "PreparedBridge", "channel_matrix", "prepare_bridge", "run_bridge"]
+
+GRAVITY = 9.81  # [m/s²]
+TOLERANCE = 1e-5  # largest last correction of the isolator forces, as a multiple of the smaller bearing load
+MAX_ITERATIONS = 50  # of Newton's method per step
+FORMS = {"bouc-wen": BOUC_WEN, "coulomb": COULOMB}
+COULOMB_HALVINGS = 6
+"""How often a step with Coulomb's law is halved to find the instant at which a bearing begins or ceases to stick."""
+
+_MAY_BE_ZERO = ("df_1", "a_1", "df_2", "a_2")
 
 
 class BridgeMatrices(NamedTuple):
@@ -38,22 +53,42 @@ class BridgeMatrices(NamedTuple):
         cls,
         deck_mass: float,
         piers: Sequence[Pier],
-        bearings: Sequence[Bearing],
         rubber: Rubber,
-        gravity: float,
-        p_delta: bool,
     ) -> BridgeMatrices:
-        """Assemble the matrices; with `p_delta` the piers have their geometric stiffness."""
+        """Assemble the matrices."""
         mass, damping, stiffness = np.zeros((3, 5, 5))
         mass[0, 0] = deck_mass
-        for i, (pier, bearing) in enumerate(zip(piers, bearings, strict=True)):
+        for i, pier in enumerate(piers):
             own = slice(1 + 2 * i, 3 + 2 * i)
             mass[own, own], damping[own, own], stiffness[own, own] = pier.mass_matrix, pier.damping, pier.stiffness
-            if p_delta:
-                stiffness[own, own] += pier.geometric_stiffness(bearing.load, gravity)
         h1, h2 = (pier.height for pier in piers)
         kinematics = np.array([[1.0, -1.0, -h1, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0, -h2]])
         return cls(mass, damping, stiffness, kinematics, rubber.linear_stiffness)
+
+
+def channel_matrix(matrices: BridgeMatrices, piers: Sequence[Pier], names: Sequence[str]) -> np.ndarray:
+    """Matrix (n_channels, 15) that gives the channels; accelerations follow from the equations of motion.
+
+    Columns: 5 displacements, 5 velocities, 2 damper forces, 2 isolator forces F and the table acceleration.
+    """
+    mass, damping, stiffness, b = matrices.mass, matrices.damping, matrices.stiffness, matrices.kinematics
+    q, ground = np.eye(15)[:5], np.eye(15)[14]
+    force = np.zeros((2, 15))
+    force[:, :5], force[:, 10:12], force[:, 12:14] = matrices.rubber_stiffness * b, np.eye(2), np.eye(2)
+    influence = np.outer([1.0, 1.0, 0.0, 1.0, 0.0], ground)
+    restoring = np.zeros((5, 15))
+    restoring[:, :5], restoring[:, 5:10] = stiffness, damping
+    acceleration = np.linalg.solve(mass, -restoring - b.T @ force) - influence
+    rows = {"Ud": q[0], "acc_d": acceleration[0] + ground}
+    for i, pier in enumerate(piers, 1):
+        u, phi = 2 * i - 1, 2 * i
+        rows |= {f"Ub_{i}": b[i - 1] @ q, f"Fb_{i}": force[i - 1], f"drift_{i}": q[u] + pier.height * q[phi]}
+        rows[f"shear_{i}"] = pier.stiffness[0] @ q[u : phi + 1]
+        rows[f"acc_p{i}"] = acceleration[u] + pier.height * acceleration[phi] + ground
+    for name in OF_A_PIER:
+        pair = [rows[at_pier(name, i)] for i in (1, 2)]
+        rows[f"mean_{name}"] = 0.5 * (pair[0] + pair[1])
+    return np.array([rows[name] for name in names])
 
 
 class BridgeStateSpace(NamedTuple):
@@ -145,3 +180,81 @@ class BridgeStateSpace(NamedTuple):
             a[10 + i, 5:10] = damper.count * damper.stiffness * self.kinematics[i]
             a[10 + i, 10 + i] = -damper.stiffness / damper.viscosity
         return a
+
+
+class PreparedBridge(NamedTuple):
+    """Inputs of the kernel that are the same for every theta."""
+
+    linear: BridgeStateSpace
+    to_channels: csr_array
+    weights: np.ndarray  # (n_steps, 2) load on the bearings at the samples of the record, negative in uplift [N]
+    law: RubberLaw
+    tolerance: float  # of a correction to the isolator forces [N]
+    rubber_range: float  # bearing displacement up to which the rubber law holds [m]
+
+
+class BridgeRun(NamedTuple):
+    """Result of one simulation, up to the last sample of the response."""
+
+    values: np.ndarray  # (16, n) state, isolator forces F and Z at the samples of the record
+    drivers: np.ndarray  # (15, n) state, F and table acceleration: channels are linear combinations of them
+    iterations: float  # of Newton's method per step
+
+
+def prepare_bridge(model: Any) -> PreparedBridge:
+    """Inputs of the kernel for a bridge."""
+    matrices, rubber = model.matrices, model.rubber
+    load = np.array([bearing.load for bearing in model.bearings])
+    lift = np.zeros(model.record.n_steps) if model.vertical is None else model.vertical.acceleration / GRAVITY
+    return PreparedBridge(
+        linear=BridgeStateSpace.of(matrices),
+        # Sparse, because a dense product is left to BLAS, whose last bit depends on its number of threads.
+        to_channels=csr_array(channel_matrix(matrices, model.piers, model.outputs)),
+        weights=(1.0 + lift)[:, None] * load,
+        law=RubberLaw(*map(float, (*rubber.skeleton[1:], *rubber.half_loop, rubber.scale, rubber.limit))),
+        tolerance=TOLERANCE * load.min(),
+        rubber_range=rubber.limit * rubber.scale,
+    )
+
+
+def run_bridge(model: Any, prepared: PreparedBridge, theta: np.ndarray) -> BridgeRun:
+    """Simulate for multiples `theta` (n_parameters,) of the nominal parameters.
+
+    Raises SimulationFailed if the parameters describe no structure, or the solution does not converge.
+    """
+    v = model.physical_values(theta)
+    check_values(v, _MAY_BE_ZERO)
+    dampers = [Damper(v[f"Kd_{i}"], v[f"C0_{i}"], damper.count) for i, damper in enumerate(model.dampers, 1)]
+    step = model.integration_step
+    coulomb = model.friction == "coulomb"
+    matrices = prepared.linear.step_matrices(dampers, step, COULOMB_HALVINGS if coulomb else None)
+    sliders = tuple(
+        Slider(
+            f_min=float(v[f"fmin_{i}"]),
+            df=float(v[f"df_{i}"]),
+            a=float(v[f"a_{i}"]),
+            yield_displacement=float(bearing.yield_displacement),
+        )
+        for i, bearing in enumerate(model.bearings, 1)
+    )
+    c = math.sqrt(2.0 * model.bearings[0].gamma - 1.0)
+    ground = model.record.acceleration[: (model.n_steps - 1) * model.every + 1]  # up to the last sample of the response
+    out = np.zeros((ground.size, N_OUT))
+    n_sub = round(model.record.dt / step)
+    status, iterations = step_isolated(
+        matrices,
+        Isolators(sliders, prepared.law, c, FORMS[model.friction]),
+        ground,
+        prepared.weights,
+        n_sub,
+        prepared.tolerance,
+        MAX_ITERATIONS,
+        np.zeros((2, 16)),
+        out,
+    )
+    if status:
+        n_steps = n_sub * (ground.size - 1)
+        raise SimulationFailed(f"step {status} of {n_steps} (t = {status * step:.4g} s) did not converge")
+    if coulomb:
+        prepared.linear.hold_stuck_bearings(dampers, ground, out)
+    return BridgeRun(out.T, np.vstack([out.T[:14], ground]), iterations / max(1, n_sub * (ground.size - 1)))

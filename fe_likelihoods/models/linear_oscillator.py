@@ -86,41 +86,13 @@ class LinearOscillator(StructuralModel):
     def first(self, seconds: float) -> LinearOscillator:
         """Return the same oscillator under the first part of its record.
 
-        Parameters
-        ----------
-        seconds : float
-            Time of the last sample of the response [s]; between two samples, the earlier one is the last.
-
-        Returns
-        -------
-        LinearOscillator
-            Its response is the first part of this model's response.
-
-        Raises
-        ------
-        ValueError
-            If the time is not within the response, or fewer than two samples remain.
+        `seconds` is the time of the last sample of the response [s]. ValueError if it is not within the response, or
+        fewer than two samples remain.
         """
         return self.with_record(self.record.trim(0.0, seconds))
 
     def jacobian(self, theta: ArrayLike) -> np.ndarray:
-        """Exact derivatives of the response by the parameters.
-
-        Parameters
-        ----------
-        theta : (2,) float
-            Multiples of the nominal stiffness and damping ratio.
-
-        Returns
-        -------
-        (2, 2, n_steps) float
-            [SI] by parameter, channel and sample.
-
-        Raises
-        ------
-        SimulationFailed, ValueError
-            As `simulate`.
-        """
+        """Exact derivatives (2, 2, n_steps) of the response [SI] by parameter, channel and sample."""
         frequency, damping_ratio = self._frequency_and_damping(check_theta(theta, self.parameter_names))
         by_frequency, by_damping = response_slopes(self.record.acceleration, self.dt, frequency, damping_ratio)
         factors = 0.5 * frequency / float(np.asarray(theta)[0]), self.damping_ratio

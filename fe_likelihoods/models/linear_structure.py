@@ -21,6 +21,7 @@ A. K. Chopra, Dynamics of Structures, 4th edition, Prentice Hall, 2012.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -89,10 +90,6 @@ class LinearStructure(ExternalModel):
     lead : float
         Time before the first sample of the channels [s]. The motion of the supports during this time is simulated but
         not compared with measurements, so that a part of a record need not start from rest.
-    until : float, optional
-        Time of the last sample of the channels, from the first sample of the supports [s]; between two samples, the
-        earlier one is the last. Default: the end of the records. Later motion changes the response only if the
-        properties depend on its amplitude (`EquivalentLinear`).
     outputs : sequence of str, optional
         Names of the channels. ``"roof"``, a channel of `parts`, is the absolute acceleration there.
         ``"displacement@roof"``, ``"velocity@roof"`` and ``"relative_acceleration@roof"`` are relative to the support,
@@ -103,7 +100,7 @@ class LinearStructure(ExternalModel):
     ------
     ValueError
         If an output is unknown or repeated, there are no supports, their steps or lengths differ, `parts` has another
-        number of supports, or fewer than two samples are between `lead` and `until`.
+        number of supports, or fewer than two samples are after `lead`.
 
     Examples
     --------
@@ -121,7 +118,6 @@ class LinearStructure(ExternalModel):
         supports: Record | Sequence[Record],
         unit: str = "g",
         lead: float = 0.0,
-        until: float | None = None,
         outputs: Sequence[str] | None = None,
     ) -> None:
         supports = (supports,) if isinstance(supports, Record) else tuple(supports)
@@ -147,33 +143,32 @@ class LinearStructure(ExternalModel):
         channels = tuple(
             Channel(each.name, each.quantity, units.get(each.quantity.split()[-1], unit)) for each in self.sensors
         )
-        self._window = sample_window("the supports", first.n_steps, first.dt, lead, until)
+        self._window = sample_window("the supports", first.n_steps, first.dt, lead, None)
         super().__init__(tuple(parts.parameter_names), channels, first.dt, self._window.stop - self._window.start)
         self.parts = parts
         self.supports = supports
         self.unit = unit
         self.lead = float(lead)
         self._acceleration = np.stack([support.acceleration for support in supports])
-        self.fingerprint = self._digest(
-            repr(parts), self._window.start, [s.fingerprint for s in supports], *(self.outputs or ())
-        )
+        self._stamp()
+
+    def _stamp(self) -> None:
+        supports = [support.fingerprint for support in self.supports]
+        self.fingerprint = self._digest(repr(self.parts), self._window.start, supports, *(self.outputs or ()))
 
     def with_record(self, record: Record | Sequence[Record]) -> LinearStructure:
         """Return the same structure under other support accelerations; errors as for a new structure.
 
-        The lead is kept, `until` is not.
+        The lead is kept.
         """
-        return type(self)(self.parts, record, self.unit, self.lead, None, self.outputs)
+        return type(self)(self.parts, record, self.unit, self.lead, self.outputs)
 
     def followed_by(self, record: Record | Sequence[Record], rest: float = 10.0) -> LinearStructure:
         """Return the same structure under its present motions, a pause of `rest` [s] and further support motions.
 
         Its response ends with the samples of ``with_record(record)``.
 
-        Raises
-        ------
-        ValueError
-            As `Record.followed_by`, and if the properties depend on the amplitude (`EquivalentLinear`).
+        ValueError as `Record.followed_by`, and if the properties depend on the amplitude (`EquivalentLinear`).
         """
         if isinstance(self.parts, EquivalentLinear):
             raise ValueError(
@@ -188,27 +183,17 @@ class LinearStructure(ExternalModel):
     def first(self, seconds: float) -> LinearStructure:
         """Return the same structure under the first part of its records.
 
-        Parameters
-        ----------
-        seconds : float
-            Time of the last sample of the response [s], which starts after the lead; between two samples, the earlier
-            one is the last.
-
-        Returns
-        -------
-        LinearStructure
-            Its response is the first part of this model's response.
-
-        Raises
-        ------
-        ValueError
-            If the time is not within the response, or fewer than two samples remain.
+        `seconds` is the time of the last sample of the response [s], which starts after the lead. ValueError if it is
+        not within the response, or fewer than two samples remain.
         """
-        last = self._window.start + sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop - 1
-        until = last * self.dt
-        if isinstance(self.parts, EquivalentLinear):  # later motion counts: its level
-            return type(self)(self.parts, self.supports, self.unit, self.lead, until, self.outputs)
-        return self.with_record([support.trim(0.0, until) for support in self.supports])
+        kept = sample_window("the response", self.n_steps, self.dt, 0.0, seconds).stop
+        last = self._window.start + kept
+        if not isinstance(self.parts, EquivalentLinear):
+            return self.with_record([support.trim(0.0, (last - 1) * self.dt) for support in self.supports])
+        part = copy.copy(self)  # later motion counts: its level
+        part.n_steps, part._window = kept, slice(self._window.start, last)
+        part._stamp()
+        return part
 
     def modes(self, theta: ArrayLike, n: int | None = None) -> Modes:
         """Return the lowest n undamped modes (default: all), with shapes (n, n_channels) at the channels of the parts.

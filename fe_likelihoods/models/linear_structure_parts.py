@@ -122,9 +122,8 @@ class ShearFrame:
 
     Storey i, below floor i, has the shear stiffness theta_i k_i; floor i has the mass m_i. The modes have the given
     ratios of critical damping, lowest frequency first. The parameters are ``stiffness_1``, ``stiffness_2``, ...,
-    multiples of the nominal stiffnesses; ``damping_1``, ``damping_2``, ..., ratios [-]; and ``mass_i`` of the floors in
-    `free_masses`, multiples of their nominal masses. At least one mass must be fixed, because accelerations identify
-    only the ratios of stiffness to mass.
+    multiples of the nominal stiffnesses; and ``damping_1``, ``damping_2``, ..., ratios [-]. Masses are known, because
+    accelerations identify only the ratios of stiffness to mass.
 
     Parameters
     ----------
@@ -134,13 +133,11 @@ class ShearFrame:
         Nominal mass of each floor, in any unit; relative masses are sufficient.
     stiffnesses : sequence of float
         Nominal stiffness of each storey, in the unit of the masses times 1/s² (N/m if the masses are in kg).
-    free_masses : sequence of int
-        Floors, counted from 1, whose masses are parameters.
 
     Raises
     ------
     ValueError
-        If a floor does not exist, values are not positive, their numbers differ, or no mass is fixed.
+        If a floor does not exist, values are not positive, or their numbers differ.
 
     Examples
     --------
@@ -151,38 +148,30 @@ class ShearFrame:
     (2, 200)
     """
 
-    floors: tuple[tuple[str, int], ...]
-    masses: tuple[float, ...]
-    stiffnesses: tuple[float, ...]
-    free_masses: tuple[int, ...] = ()
+    floors: Mapping[str, int] | Sequence[tuple[str, int]]
+    masses: Sequence[float]
+    stiffnesses: Sequence[float]
 
     n_supports = 1
 
-    def __init__(self, floors, masses: Sequence[float], stiffnesses: Sequence[float], free_masses=()) -> None:
-        floors = tuple(floors.items() if isinstance(floors, Mapping) else floors)
-        for value in (*masses, *stiffnesses):
+    def __post_init__(self) -> None:
+        floors = tuple(self.floors.items() if isinstance(self.floors, Mapping) else self.floors)
+        for value in (*self.masses, *self.stiffnesses):
             check_positive("mass or stiffness of a ShearFrame", value)
-        n = len(masses)
-        if n < 1 or len(stiffnesses) != n:
-            raise ValueError(f"ShearFrame: expected a stiffness for each of {n} masses; got {len(stiffnesses)}")
-        for floor in (*(floor for _, floor in floors), *free_masses):
+        n = len(self.masses)
+        if n < 1 or len(self.stiffnesses) != n:
+            raise ValueError(f"ShearFrame: expected a stiffness for each of {n} masses; got {len(self.stiffnesses)}")
+        for _, floor in floors:
             if floor not in range(1, n + 1):
                 raise ValueError(f"ShearFrame: expected floors from 1 to {n}; got {floor!r}")
-        if len(set(free_masses)) >= n or len(set(free_masses)) != len(free_masses):
-            raise ValueError(
-                f"ShearFrame: expected different floors, fewer than {n}, as free_masses; got {free_masses}"
-            )
         object.__setattr__(self, "floors", tuple((str(name), int(floor)) for name, floor in floors))
-        object.__setattr__(self, "masses", tuple(float(mass) for mass in masses))
-        object.__setattr__(self, "stiffnesses", tuple(float(stiffness) for stiffness in stiffnesses))
-        object.__setattr__(self, "free_masses", tuple(int(floor) for floor in free_masses))
+        object.__setattr__(self, "masses", tuple(map(float, self.masses)))
+        object.__setattr__(self, "stiffnesses", tuple(map(float, self.stiffnesses)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``stiffness_1``, ..., ``damping_1``, ..., and ``mass_i`` of the floors in `free_masses`."""
-        numbers = range(1, len(self.masses) + 1)
-        names = [f"{what}_{i}" for what in ("stiffness", "damping") for i in numbers]
-        return (*names, *(f"mass_{i}" for i in self.free_masses))
+        """``stiffness_1``, ..., and ``damping_1``, ..."""
+        return tuple(f"{what}_{i}" for what in ("stiffness", "damping") for i in range(1, len(self.masses) + 1))
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -195,23 +184,26 @@ class ShearFrame:
         Raises
         ------
         SimulationFailed
-            If a stiffness, mass or damping is not positive.
+            If a stiffness or damping is not positive.
         """
         if not (theta > 0.0).all():
             bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
-            raise SimulationFailed(f"stiffnesses, dampings and masses must be positive; not positive: {', '.join(bad)}")
+            raise SimulationFailed(f"stiffnesses and dampings must be positive; not positive: {', '.join(bad)}")
+        n = sum(name.startswith("stiffness") for name in self.parameter_names)
+        return self._system(theta[:n], theta[n:])
+
+    def _system(self, factors: np.ndarray, ratios: np.ndarray) -> LinearSystem:
+        """Matrices for multiples of the stiffnesses (n,) and damping ratios (n,)."""
         n = len(self.masses)
-        masses = np.array(self.masses)
-        masses[[floor - 1 for floor in self.free_masses]] *= theta[2 * n :]
-        storeys = theta[:n] * self.stiffnesses
+        storeys = factors * self.stiffnesses
         above = np.append(storeys[1:], 0.0)
         stiffness = np.diag(storeys + above) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1)
-        mass = np.diag(masses)
+        mass = np.diag(self.masses)
         shape = np.zeros((len(self.floors), n))
         shape[np.arange(len(self.floors)), [floor - 1 for _, floor in self.floors]] = 1.0
         return LinearSystem(
             mass=mass,
-            damping=modal_damping(mass, stiffness, theta[n : 2 * n]),
+            damping=modal_damping(mass, stiffness, ratios),
             stiffness=stiffness,
             influence=np.ones((n, 1)),
             shape=shape,

@@ -16,10 +16,8 @@ __all__ = [
     "ComplexModes",
     "LinearSystem",
     "Parts",
-    "StructureResponse",
     "complex_modes",
     "modal_damping",
-    "respond_structure",
     "superpose",
 ]
 
@@ -62,14 +60,6 @@ class Parts(Protocol):
         """Matrices at the parameters (n_parameters,); raises `SimulationFailed` if they describe no structure."""
 
 
-class StructureResponse(NamedTuple):
-    """Response at the degrees of freedom, (n, n_steps) each; displacement and velocity are relative to R g."""
-
-    displacement: np.ndarray  # [m]
-    velocity: np.ndarray  # [m/s]
-    acceleration: np.ndarray  # absolute [m/s²]
-
-
 def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -> np.ndarray:
     """Damping matrix (n, n) of modal damping ratios (n,): C = M Phi diag(2 zeta omega) Phi^T M.
 
@@ -84,19 +74,6 @@ def modal_damping(mass: np.ndarray, stiffness: np.ndarray, ratios: np.ndarray) -
     return mass @ (modes * (2.0 * np.asarray(ratios) * np.sqrt(squares))) @ modes.T @ mass
 
 
-def respond_structure(system: LinearSystem, support_acceleration: np.ndarray, dt: float) -> StructureResponse:
-    """Exact response, from rest, to support accelerations (n_supports, n_steps) [m/s²] that are linear between samples.
-
-    Raises SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly
-    critical damping, or without stiffness), or if the mass is singular.
-    """
-    modes = complex_modes(system)
-    n, n_steps = len(system.mass), support_acceleration.shape[1]
-    response = np.zeros((3 * n, n_steps))
-    superpose(modes, modes.shapes.reshape(-1, 3 * n), support_acceleration, dt, response)
-    return StructureResponse(*response.reshape(3, n, n_steps))
-
-
 class ComplexModes(NamedTuple):
     """Complex modes; of each conjugate pair only one is stored, with doubled shapes."""
 
@@ -106,7 +83,11 @@ class ComplexModes(NamedTuple):
 
 
 def complex_modes(system: LinearSystem) -> ComplexModes:
-    """Compute the complex modes of a structure; raises `SimulationFailed` as `respond_structure`."""
+    """Compute the complex modes of a structure.
+
+    Raises SimulationFailed if two complex modes coincide, so that the equations do not uncouple (a mode with exactly
+    critical damping, or without stiffness), or if the mass is singular.
+    """
     n = len(system.mass)
     try:
         lower = -np.linalg.solve(system.mass, np.hstack([system.stiffness, system.damping]))

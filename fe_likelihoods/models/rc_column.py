@@ -39,13 +39,11 @@ from ..checks.screening import check_steps_of_mass
 from ..signals.channels import Channel
 from ..signals.records import DisplacementHistory, Record
 from ..signals.sampling import sample_window
-from .circular_section import Confinement, gauss_lobatto
-from .rc_column_analysis import ColumnHistory, check_loading
+from ..units import G0, to_si
+from .circular_section import Confinement, ReinforcedSection, gauss_lobatto
+from .rc_column_analysis import ColumnHistory, PreparedColumn, check_loading, run_column
 from .rc_column_outputs import Output, Sections, check_units, display_channels, parse_outputs, section_heights
-from .rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Patches, Steel
-from .rc_column_presets import lhpost_arguments
-from .rc_column_run import PreparedColumn, prepare_column, run_column
-from .rc_column_section import ReinforcedSection
+from .rc_column_parts import Bars, Concrete, Hoops, LowCycleFatigue, Steel
 from .threaded import ThreadedModel
 from .validation import (
     check_fields,
@@ -59,25 +57,12 @@ from .validation import (
 __all__ = ["PARAMETERS", "RCColumn"]
 
 
-PARAMETERS = {
-    "Ec": "modulus of concrete [Pa]",
-    "Es": "modulus of steel [Pa]",
-    "a0": "mass-proportional damping [1/s]",
-    "a1": "stiffness-proportional damping [s]",
-    "ft": "tensile strength of concrete [Pa]",
-    "fc": "compressive strength of concrete [Pa]",
-    "fy": "yield strength of steel [Pa]",
-    "fu": "ultimate strength of steel [Pa]",
-    "Esh": "hardening modulus of steel [Pa]",
-    "mass": "mass at the top [kg]",
-    "penetration": "length of strain penetration into the foundation [m]",
-    "Cf": "coefficient of the fatigue of bars [-]",
-    "Cd": "coefficient of the loss of strength of bars [-]",
-}
 _OF_FATIGUE = ("Cf", "Cd")
-_NOMINAL_UNITS = dict(
-    zip(PARAMETERS, ("GPa", "GPa", "1/s", "s", "MPa", "MPa", "MPa", "MPa", "GPa", "kg", "m"), strict=False)
-)
+_NOMINAL_UNITS = {
+    **dict(Ec="GPa", Es="GPa", a0="1/s", a1="s", ft="MPa", fc="MPa", fy="MPa", fu="MPa", Esh="GPa"),
+    **dict(mass="kg", penetration="m"),
+}
+PARAMETERS = (*_NOMINAL_UNITS, *_OF_FATIGUE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +96,6 @@ class RCColumn(ThreadedModel):
     column_mass : float
         Mass of the column itself [kg], with its weight. Half of each element's share is at either end, so that the
         nodes below the top have velocities and accelerations. The default is zero: a column without a mass and weight.
-    vertical_mass : bool
-        Whether the masses also act vertically.
     a0 : float
         Rayleigh damping: factor of the mass [1/s].
     a1 : float
@@ -136,8 +119,8 @@ class RCColumn(ThreadedModel):
         Number of elements.
     n_points : int
         Number of Gauss-Lobatto points per element, 2 to 7.
-    mesh : int or Patches
-        Number of strips (even), or rings and wedges.
+    mesh : int
+        Number of strips of the section (even).
     geometry : str
         "corotational" or "linear".
     substeps : int
@@ -150,12 +133,6 @@ class RCColumn(ThreadedModel):
         Display units of the channels, by name or by the part of the name before the ``@``.
     tolerance : float
         Norm of the last Newton correction [m and rad].
-    element_tolerance : float
-        Work of the last correction of an element [J].
-    max_iterations : int
-        Newton iterations per attempt.
-    halvings : int
-        How often a step may be halved before the simulation counts as failed.
 
     Raises
     ------
@@ -231,7 +208,6 @@ class RCColumn(ThreadedModel):
     axial_load: float | None = None
     rotational_inertia: float = 0.0
     column_mass: float = 0.0
-    vertical_mass: bool = True
     a0: float = 0.0
     a1: float = 0.0
     penetration: float = 0.0
@@ -240,7 +216,7 @@ class RCColumn(ThreadedModel):
     parameters: tuple[str, ...] = ("Ec", "Es", "a0", "a1", "ft")
     n_elements: int = 2
     n_points: int = 3
-    mesh: int | Patches = 40
+    mesh: int = 40
     geometry: str = "corotational"
     substeps: int = 1
     max_increment: float | None = None
@@ -248,17 +224,14 @@ class RCColumn(ThreadedModel):
     units: tuple[tuple[str, str], ...] = ()
     _nominal_units: ClassVar[dict[str, str]] = _NOMINAL_UNITS
     tolerance: float = 1e-8
-    element_tolerance: float = 1e-10
-    max_iterations: int = 20
-    halvings: int = 10
 
     @classmethod
     def lhpost(cls, loading: Record | DisplacementHistory, **changes) -> RCColumn:
         """Build the full-scale column tested on the LHPOST shake table (UC San Diego, 2010).
 
-        The values and their sources are in `fe_likelihoods.models.rc_column_presets.lhpost_arguments`. Ramancha et al.
-        do not give, and this model assumes: the peak strain 2 fc/Ec, tension softening over a strain of 0.001 to a
-        tenth of ft, and no rotational inertia of the superstructure.
+        Height, diameter, Ec, Es, ft, damping and weight are from Ramancha et al. (2022), the other values from a
+        published model of the same column. They do not give, and this model assumes: the peak strain 2 fc/Ec, tension
+        softening over a strain of 0.001 to a tenth of ft, and no rotational inertia of the superstructure.
 
         Parameters
         ----------
@@ -276,7 +249,21 @@ class RCColumn(ThreadedModel):
         >>> RCColumn.lhpost(record, substeps=2, outputs=("displacement", "base_shear")).simulate(np.ones(5)).shape
         (2, 200)
         """
-        return cls(loading, **(lhpost_arguments() | changes))
+        ksi, inch = to_si(1.0, "ksi").item(), to_si(1.0, "in").item()
+        arguments = dict(
+            diameter=48.0 * inch,
+            height=288.0 * inch,
+            cover=2.0 * inch,
+            concrete=Concrete(fc=6.1 * ksi, ec=3320.0 * ksi, ft=0.306 * ksi),
+            steel=Steel(75.2 * ksi, 102.4 * ksi, 28400.0 * ksi, 456.0 * ksi, 0.0110, 0.1220),
+            bars=Bars(number=18, diameter=1.41 * inch, area=1.56 * inch**2),
+            hoops=Hoops(diameter=0.625 * inch, spacing=6.0 * inch, fy=54.8 * ksi, area=0.62 * inch**2),
+            mass=to_si(522.0, "kip").item() / G0,
+            a0=0.737,
+            a1=0.0002016,
+            units=(("acceleration", "g"), ("displacement", "in"), ("force", "kip")),
+        )
+        return cls(loading, **(arguments | changes))
 
     def __post_init__(self) -> None:
         self._check_arguments()
@@ -328,7 +315,7 @@ class RCColumn(ThreadedModel):
         """Heights of the integration points above the base [m], where curvatures and strains are not interpolated."""
         return section_heights(self._sections)
 
-    @property
+    @cached_property
     def section(self) -> ReinforcedSection:
         """Cross-section: dimensions, fibers and confinement."""
         return ReinforcedSection(self.diameter, self.cover, self.bars, self.hoops, self.mesh)
@@ -376,21 +363,8 @@ class RCColumn(ThreadedModel):
     def first(self, seconds: float) -> RCColumn:
         """Return the same column under the first part of its loading.
 
-        Parameters
-        ----------
-        seconds : float
-            Time of the last sample of the response [s]; between two samples, the earlier one is the last. Under a
-            `DisplacementHistory`, the number of the last step.
-
-        Returns
-        -------
-        RCColumn
-            Its response is the first part of this model's response.
-
-        Raises
-        ------
-        ValueError
-            If the time is not within the response, or fewer than two samples remain.
+        `seconds` is the time of the last sample of the response [s], under a `DisplacementHistory` the number of the
+        last step. ValueError if it is not within the response, or fewer than two samples remain.
         """
         window = sample_window("the response", self.n_steps, self.dt, 0.0, seconds)
         if isinstance(self.loading, Record):
@@ -415,10 +389,10 @@ class RCColumn(ThreadedModel):
         return replace(history, names=(*history.names, *sensors), values=values)
 
     def _respond(self, theta: np.ndarray) -> np.ndarray:
-        return np.stack(list(run_column(self, self._prepared, theta).outputs.values()))
+        return np.stack(list(run_column(self, self._prepared, theta)[1].values()))
 
     def _prepare(self) -> PreparedColumn:
-        return prepare_column(self, self._parsed_outputs)
+        return PreparedColumn.of(self, self._parsed_outputs)
 
     @property
     def time_label(self) -> str:
@@ -451,10 +425,7 @@ class RCColumn(ThreadedModel):
                 raise invalid(f"{kind.__name__}(...) as {name}", part, "import it from fe_likelihoods")
         check_fields(
             self,
-            positive=(
-                *("diameter", "height", "mass", "tolerance", "element_tolerance", "max_increment"),
-                "collapse_drift",
-            ),
+            positive=(*("diameter", "height", "mass", "tolerance", "max_increment", "collapse_drift"),),
             non_negative=("cover", "rotational_inertia", "column_mass", "a0", "a1", "penetration"),
             finite=("axial_load",),
             optional=("max_increment", "axial_load"),
@@ -463,8 +434,6 @@ class RCColumn(ThreadedModel):
         check_integer("n_elements", self.n_elements, 1, 50)
         check_integer("n_points", self.n_points, 2, 7)
         check_integer("substeps", self.substeps, 1, 1000)
-        check_integer("max_iterations", self.max_iterations, 2, 1000)
-        check_integer("halvings", self.halvings, 0, 30)
         _ = self.section  # checks its dimensions
         if self.geometry not in ("corotational", "linear"):
             raise invalid('geometry "corotational" or "linear"', self.geometry, "the default is corotational")

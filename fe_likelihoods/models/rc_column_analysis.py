@@ -1,4 +1,4 @@
-"""Analysis of the reinforced-concrete column: material constants of the kernels, and the two kinds of excitation.
+"""One simulation of the reinforced-concrete column: constants of the materials, excitation, reasons of failures.
 
 A base acceleration is integrated by Newmark's method (`fe_likelihoods.kernels.newmark`), an imposed displacement of the
 top is solved as a sequence of static steps (`fe_likelihoods.kernels.static`). Both start from the gravity load.
@@ -7,54 +7,37 @@ top is solved as a sequence of static steps (`fe_likelihoods.kernels.static`). B
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..kernels import bar_fatigue, concrete04, reinforcing_steel
 from ..kernels.fiber_section import Sections
-from ..kernels.frame import Column, recorder
+from ..kernels.frame import Column, allocate, recorder
 from ..kernels.newmark import HISTORY_ROWS, Dynamics, newmark
 from ..kernels.static import Iteration, impose_displacement
 from ..signals.records import DisplacementHistory, Record
 from ..simulation.model import SimulationFailed
+from ..units import G0
 from .base import BuiltInModel, History, remark_on_range
-from .circular_section import Confinement
-from .rc_column_parts import Concrete, LowCycleFatigue, Steel, hardening_fault
+from .circular_section import gauss_lobatto
+from .rc_column_outputs import Output, Recording
+from .rc_column_parts import hardening_fault
 from .validation import check_values, invalid
 
-__all__ = [
-    "Analysis",
-    "BaseMotion",
-    "ColumnHistory",
-    "ImposedMotion",
-    "ToRecord",
-    "check_loading",
-    "check_physical_values",
-    "checked_history",
-    "expect_fracture",
-    "set_materials",
-]
-
+__all__ = ["ColumnHistory", "PreparedColumn", "check_loading", "expect_fracture", "make_column", "run_column"]
 
 LARGEST_DRIFT = 0.5
 """Largest imposed displacement by the height; tested columns have failed at 0.05 to 0.15."""
-
 LOST_BARS = 0.5
 """Share of the bar area in a section: with more fractured bars, a column without equilibrium has collapsed."""
+MAX_ITERATIONS, HALVINGS = 20, 10  # of Newton's method per attempt, and how often a step may be halved
+ELEMENT_TOLERANCE = 1e-10  # work of the last correction of an element [J]
 
 _MAY_BE_ZERO = ("a0", "a1", "ft", "penetration")
-
-IMPOSED_ROWS = (
-    "displacement",
-    "vertical displacement",
-    "rotation",
-    "force",
-    "base axial strain",
-    "base curvature",
-    "base axial force",
-    "base moment",
-    "base shear",
+_IMPOSED_ROWS = (
+    *("displacement", "vertical displacement", "rotation", "force", "base axial strain", "base curvature"),
+    *("base axial force", "base moment", "base shear"),
 )
 
 
@@ -65,95 +48,31 @@ class ColumnHistory(History):
     Above 1, `beyond_range` means that the steel law was continued along its tangent where real bars fracture; this
     warns once per model, also for simulations from a cache on disk. `bar_damage` is Miner's sum of each bar of
     ``model.section.fibers()[2]`` at the last sample, in its worst section: a bar has fractured above 1; two bars at the
-    same position count as one. `lowerings` counts how often the column could not carry the axial load at an imposed
-    displacement, and its top came down until the cracks were closed (``docs/theory/time_integration.rst``); 0 under a
-    base acceleration.
+    same position count as one.
     """
 
     retries: int  # steps repeated with half their size
     beyond_range: float  # largest strain of a bar in the base section / ultimate strain of the steel
     bar_damage: np.ndarray | None = None  # (n_bars,); None without fatigue
-    lowerings: int = 0
 
 
-class ToRecord(NamedTuple):
-    """What an analysis shall record besides its rows."""
+class PreparedColumn(NamedTuple):
+    """Inputs of the kernels that are the same for every theta."""
 
-    sections: bool = False  # deformations of all sections
-    motion: bool = False  # motion of all nodes
-    fibers: tuple[tuple[int, int], ...] = ()  # section and number of fibers, for stresses (`Recorder`)
-
-
-class Analysis(NamedTuple):
-    """Result of one analysis; what was not recorded has no steps, (0, ...)."""
-
-    names: tuple[str, ...]
-    values: np.ndarray  # (n_rows, n_steps), the rows of `names`
-    retries: int  # steps repeated with half their size
-    sections: np.ndarray  # (n_steps, n_sections, 2) axial strain and curvature [1/m], from the base up
-    motion: np.ndarray  # (n_steps, 1 or 3, n_dof) of the nodes relative to the base
-    stresses: np.ndarray  # (n_steps, n_fibers) of the recorded fibers [Pa]
-    ground: np.ndarray | None = None  # (n_steps,) base acceleration [m/s²]
-    lowerings: int = 0  # as of `ColumnHistory`
-
-
-class BaseMotion(NamedTuple):
-    """Base acceleration, interpolated to the integration steps."""
-
-    acceleration: np.ndarray  # (n_substeps + 1,) at the integration steps [m/s²]
-    dt: float  # integration step [s]
-    substeps: int  # integration steps per sample of the response
-    n_steps: int  # response samples
+    excitation: np.ndarray  # base accelerations at the integration steps [m/s²], or displacements of the top [m]
+    kept: np.ndarray  # (n_steps,) which of them are samples of the response
+    outputs: tuple[Output, ...]
 
     @classmethod
-    def of(cls, record: Record, substeps: int) -> BaseMotion:
-        """Motion of a record, linear between its samples."""
-        instants = np.arange((record.n_steps - 1) * substeps + 1) / substeps
-        acceleration = np.interp(instants, np.arange(record.n_steps), record.acceleration)
-        return cls(acceleration, record.dt / substeps, substeps, record.n_steps)
-
-    def run(self, column: Column, dynamics: Dynamics, iteration: Iteration, recorded: ToRecord) -> Analysis:
-        """Integrate the equations of motion to `HISTORY_ROWS`; SimulationFailed at collapse, or without convergence."""
-        history = np.zeros((len(HISTORY_ROWS), self.n_steps))
-        out = recorder(
-            column, self.n_steps, sections=recorded.sections, motion=3 * recorded.motion, fibers=recorded.fibers
-        )
-        loading = self.acceleration, self.dt, self.substeps
-        status, retries, _ = newmark(column, dynamics, *loading, iteration, history, out)
-        if status < -1:
-            raise SimulationFailed(
-                f"collapse: at t = {-(status + 1) * self.dt:.4g} s, the displacement of the top exceeded the limit of "
-                f"{dynamics.collapse:.4g} m (collapse_drift)"
-            )
-        if status:
-            at = f" (t = {status * self.dt:.4g} s)"
-            raise SimulationFailed(_reason(status, len(self.acceleration), at, iteration.halvings, column.sections))
-        ground = self.acceleration[:: self.substeps]
-        return Analysis(HISTORY_ROWS, history, retries, _by_section(out.sections), out.motion, out.stresses, ground)
-
-
-class ImposedMotion(NamedTuple):
-    """Lateral displacement imposed on the top."""
-
-    targets: np.ndarray  # (n_increments,) displacements in their order [m]
-    kept: np.ndarray  # (n_steps,) indices of the targets that are samples of the response
-
-    @classmethod
-    def of(cls, history: DisplacementHistory, max_increment: float) -> ImposedMotion:
-        """Motion of a displacement history in increments of at most `max_increment` [m]."""
-        finer = history.subdivide(max_increment)
-        return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices))
-
-    def run(self, column: Column, gravity: np.ndarray, iteration: Iteration, recorded: ToRecord) -> Analysis:
-        """Solve the static equilibrium at each target, as `IMPOSED_ROWS`; SimulationFailed without convergence."""
-        history = np.zeros((len(IMPOSED_ROWS), len(self.targets)))
-        n = len(self.targets)
-        out = recorder(column, n, sections=recorded.sections, motion=int(recorded.motion), fibers=recorded.fibers)
-        status, retries, lowerings = impose_displacement(column, gravity, self.targets, iteration, history, out)
-        if status:
-            raise SimulationFailed(_reason(status, len(self.targets), "", iteration.halvings, column.sections))
-        kept = [each[self.kept] if len(each) else each for each in (out.sections, out.motion, out.stresses)]
-        return Analysis(IMPOSED_ROWS, history[:, self.kept], retries, *kept, None, lowerings)
+    def of(cls, model: Any, outputs: tuple[Output, ...]) -> PreparedColumn:
+        """Inputs for a column and its resolved outputs; both kinds of loading are linear between their samples."""
+        loading = model.loading
+        if isinstance(loading, Record):
+            instants = np.arange((loading.n_steps - 1) * model.substeps + 1) / model.substeps
+            acceleration = np.interp(instants, np.arange(loading.n_steps), loading.acceleration)
+            return cls(acceleration, np.arange(0, len(instants), model.substeps), outputs)
+        finer = loading.subdivide(model.max_increment or model.height / 5000.0)
+        return cls(np.asarray(finer.history.displacement), np.asarray(finer.indices), outputs)
 
 
 def check_loading(loading: object, height: float) -> None:
@@ -174,7 +93,95 @@ def check_loading(loading: object, height: float) -> None:
             )
 
 
-def check_physical_values(values: dict[str, float], steel: Steel) -> None:
+def make_column(model: Any, theta: np.ndarray, n_elements: int, n_points: int) -> tuple[Column, dict[str, float]]:
+    """Column with its materials for multiples `theta` of the nominal parameters, and its physical parameters [SI].
+
+    Raises SimulationFailed if the parameters describe no column.
+    """
+    values = model.physical_values(theta)
+    _check_physical_values(values, model.steel)
+    points, weights = gauss_lobatto(n_points)
+    core, cover, bars = model.section.fibers()
+    column = allocate(
+        n_elements=n_elements,
+        height=model.height,
+        corotational=model.geometry == "corotational",
+        element_tolerance=ELEMENT_TOLERANCE,
+        points=points,
+        weights=weights,
+        core=core,
+        cover=cover,
+        bars=bars,
+        penetration=values["penetration"],
+        bars_fail=model.fatigue is not None,
+    )
+    _set_materials(column.sections, values, model)
+    return column, values
+
+
+def run_column(model: Any, prepared: PreparedColumn, theta: np.ndarray) -> tuple[ColumnHistory, dict[str, np.ndarray]]:
+    """Histories of the kernels, and the outputs (n_steps,) by name, for multiples `theta` of the nominal parameters.
+
+    Raises SimulationFailed if the parameters describe no structure, the column collapses, or the solution does not
+    converge.
+    """
+    column, values = make_column(model, theta, model.n_elements, model.n_points)
+    shaken, excitation, kept = isinstance(model.loading, Record), prepared.excitation, prepared.kept
+    fibers = tuple(dict.fromkeys(output.fiber for output in prepared.outputs if output.fiber is not None))
+    names = HISTORY_ROWS if shaken else _IMPOSED_ROWS
+    history = np.zeros((len(names), len(kept) if shaken else len(excitation)))
+    out = recorder(
+        column,
+        history.shape[1],
+        sections=any(output.curvature is not None for output in prepared.outputs),
+        motion=(3 if shaken else 1) * any(output.motion is not None for output in prepared.outputs),
+        fibers=fibers,
+    )
+    iteration = Iteration(float(model.tolerance), MAX_ITERATIONS, HALVINGS)
+    own = np.full(model.n_elements, model.column_mass / model.n_elements)  # at the nodes
+    own[-1] *= 0.5
+    gravity = np.zeros(3 * model.n_elements)
+    gravity[1::3] = -own * G0
+    gravity[-2] -= model.axial_load if model.axial_load is not None else values["mass"] * G0
+    if shaken:
+        own[-1] += values["mass"]
+        mass = np.zeros((model.n_elements, 3))
+        mass[:, 0], mass[:, 1], mass[-1, 2] = own, own, model.rotational_inertia
+        dt, limit = model.dt / model.substeps, model.collapse_drift * model.height
+        dynamics = Dynamics(gravity, mass.ravel(), float(values["a0"]), float(values["a1"]), 0.0, limit)
+        status, retries, _ = newmark(column, dynamics, excitation, dt, model.substeps, iteration, history, out)
+        if status < -1:
+            raise SimulationFailed(
+                f"collapse: at t = {-(status + 1) * dt:.4g} s, the displacement of the top exceeded the limit of "
+                f"{limit:.4g} m (collapse_drift)"
+            )
+        at = f" (t = {status * dt:.4g} s)"
+        rows, sections, motion, stresses = history, out.sections, out.motion, out.stresses
+    else:
+        status, retries, _ = impose_displacement(column, gravity, excitation, iteration, history, out)
+        at, rows = "", history[:, kept]
+        sections, motion, stresses = (x[kept] if len(x) else x for x in (out.sections, out.motion, out.stresses))
+    if status:
+        raise SimulationFailed(_reason(status, len(excitation), at, HALVINGS, column.sections))
+    # the samples of a section are put side by side in memory: hundreds of sensors are read faster
+    seen = Recording(
+        dict(zip(names, rows, strict=True)),
+        np.ascontiguousarray(sections.transpose(1, 2, 0)).transpose(2, 0, 1),
+        motion,
+        excitation[kept],
+        dict(zip(fibers, stresses.T, strict=True)),
+        values["penetration"],
+        column.length if column.corotational else np.inf,
+    )
+    outputs = {output.name: output.evaluate(seen) for output in prepared.outputs}
+    damage = None
+    if model.fatigue is not None:
+        damage = column.sections.steel_memory[:, :, bar_fatigue.DAMAGE].max(axis=0)
+    beyond = _strain_beyond_range(model, seen.rows, theta, damage)
+    return ColumnHistory(names, rows, retries, beyond, damage), outputs
+
+
+def _check_physical_values(values: dict[str, float], steel: Any) -> None:
     """Raise SimulationFailed for physical parameter `values` [SI] that describe no column."""
     check_values(values, _MAY_BE_ZERO)
     fc = values["fc"]
@@ -206,21 +213,16 @@ def check_physical_values(values: dict[str, float], steel: Steel) -> None:
         raise SimulationFailed(f"the steel has no hardening branch: {fault}")
 
 
-def checked_history(
-    model: BuiltInModel,
-    steel: Steel,
-    bar_radius: float,
-    analysis: Analysis,
-    theta: np.ndarray,
-    bar_damage: np.ndarray | None = None,
-) -> ColumnHistory:
-    """History of a simulation; warns once per model if bars exceed the strain at which real bars fracture.
+def _strain_beyond_range(
+    model: Any, rows: dict[str, np.ndarray], theta: np.ndarray, bar_damage: np.ndarray | None
+) -> float:
+    """Largest strain of a bar at the base by the strain at which real bars fracture; above 1 it warns once per model.
 
     There is no warning if a bar has fractured in the simulation.
     """
-    strain, curvature = (analysis.values[analysis.names.index(f"base {row}")] for row in ("axial strain", "curvature"))
-    limit = steel.ultimate_strain
-    beyond = float((np.abs(strain) + bar_radius * np.abs(curvature)).max()) / limit
+    limit = model.steel.ultimate_strain
+    strain = np.abs(rows["base axial strain"]) + model.bar_circle_radius * np.abs(rows["base curvature"])
+    beyond = float(strain.max()) / limit
     if beyond > 1.0 and (bar_damage is None or bar_damage.max() < 1.0):
         advice = "Use RCColumn(..., fatigue=LowCycleFatigue()) for bars that lose strength and fracture"
         if bar_damage is not None:
@@ -232,7 +234,7 @@ def checked_history(
             f"at which bars fracture; the law was continued along its tangent, at {at}. {advice}, "
             "or a weaker loading. This model gives no further warnings: check history(theta).beyond_range",
         )
-    return ColumnHistory(analysis.names, analysis.values, analysis.retries, beyond, bar_damage, analysis.lowerings)
+    return beyond
 
 
 def expect_fracture(model: BuiltInModel) -> None:
@@ -240,16 +242,10 @@ def expect_fracture(model: BuiltInModel) -> None:
     remark_on_range(model, "")
 
 
-def set_materials(
-    sections: Sections,
-    values: dict[str, float],
-    concrete: Concrete,
-    steel: Steel,
-    confinement: Confinement,
-    fatigue: LowCycleFatigue | None = None,
-) -> None:
+def _set_materials(sections: Sections, values: dict[str, float], model: Any) -> None:
     """Write the constants of core, cover and bars at the physical parameter `values` [SI] into `sections`."""
     fc, ec, ft = values["fc"], values["Ec"], values["ft"]
+    concrete, steel, confinement = model.concrete, model.steel, model.section.confinement(fc)
     peak = concrete.peak_strain if concrete.peak_strain is not None else 2.0 * fc / ec
     core_peak = peak * confinement.strain_ratio
     core_ultimate = max(confinement.ultimate_strain, 1.05 * core_peak)
@@ -258,22 +254,10 @@ def set_materials(
     core, cover = sections.concrete
     concrete04.constants(-fc * confinement.strength_ratio, -core_peak, -core_ultimate, *tension, core)
     concrete04.constants(-fc, -peak, -cover_ultimate, *tension, cover)
-    reinforcing_steel.constants(
-        values["fy"],
-        values["fu"],
-        values["Es"],
-        values["Esh"],
-        steel.hardening_strain,
-        steel.ultimate_strain,
-        sections.steel,
-    )
-    if fatigue is not None:
-        bar_fatigue.constants(values["Cf"], fatigue.alpha, values["Cd"], sections.failure)
-
-
-def _by_section(sections: np.ndarray) -> np.ndarray:
-    """The same array with the samples of a section side by side in memory: hundreds of sensors are read faster."""
-    return np.ascontiguousarray(sections.transpose(1, 2, 0)).transpose(2, 0, 1)
+    moduli = (values[name] for name in ("fy", "fu", "Es", "Esh"))
+    reinforcing_steel.constants(*moduli, steel.hardening_strain, steel.ultimate_strain, sections.steel)
+    if model.fatigue is not None:
+        bar_fatigue.constants(values["Cf"], model.fatigue.alpha, values["Cd"], sections.failure)
 
 
 def _reason(status: int, n_steps: int, at: str, halvings: int, sections: Sections) -> str:

@@ -13,13 +13,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ..kernels import bar_fatigue, concrete04, reinforcing_steel
-from ..kernels.fiber_section import Sections
-from ..kernels.frame import allocate
+from ..kernels.fiber_section import Sections, commit, forces, reset
 from ..simulation.model import SimulationFailed
 from ..units import G0
-from .circular_section import gauss_lobatto
 from .rc_column import RCColumn
-from .rc_column_analysis import check_physical_values, set_materials
+from .rc_column_analysis import make_column
 from .validation import check_theta, invalid
 
 __all__ = ["MaterialCurve", "MomentCurvature", "material_curves", "moment_curvature"]
@@ -106,7 +104,8 @@ def material_curves(
     >>> [round(float(curve.stress.min()) / 1e6, 1) for curve in (core, cover)]  # confined and unconfined strength [MPa]
     [-52.3, -42.1]
     """
-    sections, values = _sections(column, theta)
+    made, values = make_column(column, check_theta(theta, column.parameters), 1, 2)
+    sections = made.sections
     core_peak = -sections.concrete[0, concrete04.E0]
     crack = 5.0 * values["ft"] / values["Ec"]
     if concrete is None:
@@ -120,8 +119,11 @@ def material_curves(
         concrete04.stress_history(path, constants, stress)
         curves.append(MaterialCurve(name, path, stress))
     path = _path("steel", steel)
-    stress = np.empty_like(path)
-    _bar_stress(path, np.zeros(len(sections.trial)), sections, stress)
+    stress, memory = np.empty_like(path), np.zeros(len(sections.trial))
+    if sections.failure.size:
+        bar_fatigue.stress_history(path, memory, sections.steel, sections.failure, stress)
+    else:
+        reinforcing_steel.stress_history(path, memory, sections.steel, stress)
     return (*curves, MaterialCurve("steel", path, stress))
 
 
@@ -158,128 +160,57 @@ def moment_curvature(
     >>> round(float(curves.moment.max()) / 1e6, 2)  # MN m
     5.49
     """
-    sections, values = _sections(column, theta)
+    made, values = make_column(column, check_theta(theta, column.parameters), 1, 2)
+    sections = made.sections
     curvature = np.array(curvature, dtype=float)
     if curvature.ndim != 1 or curvature.size == 0 or not np.isfinite(curvature).all():
         raise invalid("a vector of finite curvatures [1/m]", curvature, "such as np.linspace(0.0, 0.05, 200)")
     if axial_force is None:
         axial_force = -(column.axial_load if column.axial_load is not None else values["mass"] * G0)
-    section = _Section(sections)
     tolerance = 1e-9 * values["fc"] * float(sections.area.sum())
-    reached = 0.0
     strain, moment = np.empty_like(curvature), np.empty_like(curvature)
-    section.balance(0.0, axial_force, tolerance)
+    reset(sections)
+    axial = _advance(sections, 0.0, 0.0, 0.0, axial_force, tolerance, 0)
     for k, target in enumerate(curvature):
-        while reached != target:
-            reached = section.approach(reached, target, axial_force, tolerance)
-        strain[k], moment[k] = section.axial_strain, section.moment(target)
+        start = curvature[k - 1] if k else 0.0
+        axial = strain[k] = _advance(sections, axial, start, target, axial_force, tolerance, _MAX_HALVINGS)
+        moment[k] = -forces(axial, -target, 0, sections)[1]
     return MomentCurvature(curvature, moment, strain, float(axial_force))
 
 
-class _Section:
-    """Fibers of one section with their memory, virgin at first; positions are in the direction of loading."""
-
-    def __init__(self, sections: Sections) -> None:
-        core, n_bars = sections.core_count, sections.steel_memory.shape[1]
-        self.concrete = [
-            (-sections.y[part], sections.area[part], constants, np.zeros((len(sections.y[part]), 2)))
-            for part, constants in zip((slice(None, core), slice(core, None)), sections.concrete, strict=True)
-        ]
-        self.bar_x, self.bar_area = -sections.bar_y[:n_bars], sections.bar_area[:n_bars]
-        self.sections, self.bars = sections, np.zeros((n_bars, len(sections.trial)))
-        self.axial_strain = 0.0
-
-    def forces(self, axial_strain: float, curvature: float, bars: np.ndarray) -> tuple[float, float]:
-        """Axial force [N] and moment [N m]; advances the memory `bars`, a copy for a trial."""
-        force = moment = 0.0
-        for x, area, constants, memory in self.concrete:
-            stress = np.empty_like(x)
-            concrete04.fiber_stresses(axial_strain - x * curvature, memory, constants, stress)
-            force += float((stress * area).sum())
-            moment -= float((stress * area * x).sum())
-        stress = np.empty(1)
-        for x, area, memory in zip(self.bar_x, self.bar_area, bars, strict=True):
-            _bar_stress(np.array([axial_strain - x * curvature]), memory, self.sections, stress)
-            force += float(stress[0] * area)
-            moment -= float(stress[0] * area * x)
-        return force, moment
-
-    def moment(self, curvature: float) -> float:
-        """Moment [N m] at the last axial strain."""
-        return self.forces(self.axial_strain, curvature, self.bars.copy())[1]
-
-    def balance(self, curvature: float, axial_force: float, tolerance: float) -> None:
-        """Find the axial strain at a curvature and commit the fibers; SimulationFailed if there is none."""
-
-        def excess(strain: float) -> float:
-            return self.forces(strain, curvature, self.bars.copy())[0] - axial_force
-
-        start, width = self.axial_strain, 1e-6
-        sign = -1.0 if excess(start) > 0.0 else 1.0  # the force grows with the strain
-        low, high = start, start + sign * width
-        while sign * excess(high) < 0.0:
-            width *= 2.0
-            low, high = high, start + sign * width
-            if width > _LARGEST_STRAIN:
-                raise _failure(axial_force, curvature)
-        found = brentq(excess, low, high, xtol=1e-16)
-        if not abs(excess(found)) <= tolerance:  # a jump of the stress, such as from crushed cover
-            raise _failure(axial_force, curvature)
-        self.axial_strain = found
-        self.forces(found, curvature, self.bars)
-        for x, _, _, memory in self.concrete:
-            strain = found - x * curvature
-            np.minimum(memory[:, 0], strain, out=memory[:, 0])
-            np.maximum(memory[:, 1], strain, out=memory[:, 1])
-
-    def approach(self, reached: float, target: float, axial_force: float, tolerance: float) -> float:
-        """Go from the curvature `reached` to `target`, or in halved steps towards it; return the curvature."""
-        part = target
-        for _ in range(_MAX_HALVINGS):
-            try:
-                self.balance(part, axial_force, tolerance)
-            except SimulationFailed:
-                part = 0.5 * (reached + part)
-            else:
-                return part
-        raise _failure(axial_force, target)
+def _advance(
+    sections: Sections, axial: float, start: float, end: float, axial_force: float, tolerance: float, halvings: int
+) -> float:
+    """Go from one curvature to another, in halves if need be, and commit the fibers; return the axial strain there."""
+    found = _balance(sections, axial, end, axial_force, tolerance)
+    if found is None and not halvings:
+        raise SimulationFailed(
+            f"the section cannot carry the axial force {axial_force:.4g} N at the curvature {end:.4g} 1/m"
+        )
+    if found is None:
+        middle = 0.5 * (start + end)
+        axial = _advance(sections, axial, start, middle, axial_force, tolerance, halvings - 1)
+        return _advance(sections, axial, middle, end, axial_force, tolerance, halvings - 1)
+    commit(found, -end, 0, sections)  # the second axis of the element points against the direction of loading
+    return found
 
 
-def _failure(axial_force: float, curvature: float) -> SimulationFailed:
-    return SimulationFailed(
-        f"the section cannot carry the axial force {axial_force:.4g} N at the curvature {curvature:.4g} 1/m"
-    )
+def _balance(sections: Sections, start: float, curvature: float, axial_force: float, tolerance: float) -> float | None:
+    """Axial strain at a curvature and an axial force, sought from `start`; None if there is no equilibrium."""
 
+    def excess(strain: float) -> float:
+        return forces(strain, -curvature, 0, sections)[0] - axial_force
 
-def _sections(column: RCColumn, theta: np.ndarray) -> tuple[Sections, dict[str, float]]:
-    """Sections of `column` with their materials, and its physical parameters."""
-    values = column.physical_values(check_theta(theta, column.parameters))
-    check_physical_values(values, column.steel)
-    core, cover, bars = column.section.fibers()
-    points, weights = gauss_lobatto(2)
-    sections = allocate(
-        n_elements=1,
-        height=column.height,
-        corotational=False,
-        element_tolerance=column.element_tolerance,
-        points=points,
-        weights=weights,
-        core=core,
-        cover=cover,
-        bars=bars,
-        bars_fail=column.fatigue is not None,
-    ).sections
-    confinement = column.section.confinement(values["fc"])
-    set_materials(sections, values, column.concrete, column.steel, confinement, column.fatigue)
-    return sections, values
-
-
-def _bar_stress(strain: np.ndarray, memory: np.ndarray, sections: Sections, stress: np.ndarray) -> None:
-    """Take one bar through `strain`, write its `stress`, and advance its `memory`."""
-    if sections.failure.size:
-        bar_fatigue.stress_history(strain, memory, sections.steel, sections.failure, stress)
-    else:
-        reinforcing_steel.stress_history(strain, memory, sections.steel, stress)
+    width = 1e-6
+    sign = -1.0 if excess(start) > 0.0 else 1.0  # the force grows with the strain
+    low, high = start, start + sign * width
+    while sign * excess(high) < 0.0:
+        width *= 2.0
+        low, high = high, start + sign * width
+        if width > _LARGEST_STRAIN:
+            return None
+    found = brentq(excess, low, high, xtol=1e-16)
+    return found if abs(excess(found)) <= tolerance else None  # else a jump of the stress, such as from crushed cover
 
 
 def _path(name: str, reversals: Sequence[float]) -> np.ndarray:

@@ -1,27 +1,10 @@
 """Outputs of the reinforced-concrete column: the names of sensors, and how their values follow from a simulation.
 
-An output is named by its quantity and its place, ``quantity@place``, with heights above the base and positions in m:
-
-* ``acceleration``, ``relative_acceleration``, ``velocity``, ``displacement`` and ``force`` of the top;
-* ``displacement@height``, ``velocity@height``, ``relative_acceleration@height`` and ``acceleration@height`` below the
-  top, relative to the base except for the last one;
-* ``base_moment``, ``base_shear`` and ``axial_force`` at the base;
-* ``curvature@height`` of the section at a height;
-* ``strain@height:position`` of the concrete or of a bar at a position in that section, as a strain gauge measures it;
-* ``bar_stress@height:position`` and ``concrete_stress@height:position``, the stress of a fiber there;
-* ``rotation@lower:upper`` of the section at the upper height relative to the section at the lower height, as a pair of
-  displacement transducers over a gauge length measures it.
-
-Positions are measured from the axis of the column in the direction of loading. Curvatures, rotations, moments and shear
-forces are positive where the column bends towards positive displacements; strains and axial forces are positive in
-tension. Plane sections stay plane, so concrete and bars at the same position have the same strain.
-
-Outputs at the integration points are section deformations. In between, axial strain and curvature follow the polynomial
-through the points of the element (Neuenhofer & Filippou 1998). The integral of this polynomial over an element is the
-sum that the element uses, so that the rotation between two nodes is the difference of their rotations. The second
-integral of the curvature is the deflection from the chord of the element. Velocities and accelerations belong to nodes
-with a mass, stresses to the sections, whose fibers have a history.
-``docs/sensors.rst`` describes the outputs.
+`RCColumn` and ``docs/sensors.rst`` list them. Outputs at the integration points are section deformations. In between,
+axial strain and curvature follow the polynomial through the points of the element (Neuenhofer & Filippou 1998). The
+integral of this polynomial over an element is the sum that the element uses, so that the rotation between two nodes is
+the difference of their rotations. The second integral of the curvature is the deflection from the chord of the element.
+Velocities and accelerations belong to nodes with a mass, stresses to the sections, whose fibers have a history.
 
 References
 ----------
@@ -39,29 +22,21 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import find_unit
-from .rc_column_section import ReinforcedSection
+from .circular_section import ReinforcedSection
 from .validation import invalid
 
 __all__ = ["Recording", "Output", "Sections", "check_units", "display_channels", "parse_outputs", "section_heights"]
 
 
-class _Row(NamedTuple):
-    """Output that is a row of a simulation's history, times a sign."""
-
-    quantity: str
-    si_unit: str
-    row: str
-    sign: float
-
-
 _ROWS = {
-    "acceleration": _Row("absolute acceleration", "m/s2", "absolute acceleration", 1.0),
-    "displacement": _Row("relative displacement", "m", "relative displacement", 1.0),
-    "force": _Row("lateral force", "N", "force", 1.0),
-    "base_moment": _Row("base moment", "N m", "base moment", -1.0),
-    "base_shear": _Row("base shear force", "N", "base shear", 1.0),
-    "axial_force": _Row("axial force", "N", "base axial force", 1.0),
+    "acceleration": ("absolute acceleration", "m/s2", "absolute acceleration", 1.0),
+    "displacement": ("relative displacement", "m", "relative displacement", 1.0),
+    "force": ("lateral force", "N", "force", 1.0),
+    "base_moment": ("base moment", "N m", "base moment", -1.0),
+    "base_shear": ("base shear force", "N", "base shear", 1.0),
+    "axial_force": ("axial force", "N", "base axial force", 1.0),
 }
+"""Outputs that are a row of a simulation's history: quantity, SI unit, row, sign."""
 _AT_TOP = ("acceleration", "displacement", "force")
 """Outputs at the top, which depend on the type of loading."""
 _LOCATED = {

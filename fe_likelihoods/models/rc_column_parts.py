@@ -14,9 +14,9 @@ import numpy as np
 
 from ..kernels import reinforcing_steel
 from ..priors.distributions import LogNormal
-from .validation import check_fields, check_integer, invalid
+from .validation import check_fields, invalid
 
-__all__ = ["Bars", "Concrete", "Hoops", "LowCycleFatigue", "Patches", "Steel", "hardening_fault"]
+__all__ = ["Bars", "Concrete", "Hoops", "LowCycleFatigue", "Steel", "hardening_fault"]
 
 _MEDIAN_CF, _LOG_SD_CF = 0.20, 0.34  # of a new column, by study `failing_columns` of docs/results.rst
 
@@ -288,31 +288,3 @@ class Hoops:
     def area_each(self) -> float:
         """Area of one set [m²]."""
         return self.area if self.area is not None else 0.25 * math.pi * self.diameter**2
-
-
-@dataclass(frozen=True)
-class Patches:
-    """Fiber mesh of rings and wedges, as in other finite-element codes; the default strips integrate more accurately.
-
-    Attributes
-    ----------
-    wedges : int
-        Number of wedges.
-    core_rings, cover_rings : int
-        Number of rings in the core and in the cover.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.models.rc_column_parts import Patches
-    >>> RCColumn.lhpost(record, mesh=Patches(wedges=20, core_rings=10)).mesh
-    Patches(wedges=20, core_rings=10, cover_rings=2)
-    """
-
-    wedges: int = 20
-    core_rings: int = 10
-    cover_rings: int = 2
-
-    def __post_init__(self) -> None:
-        check_integer("wedges of Patches", self.wedges, 4, 1000)
-        check_integer("core_rings of Patches", self.core_rings, 1, 1000)
-        check_integer("cover_rings of Patches", self.cover_rings, 1, 1000)

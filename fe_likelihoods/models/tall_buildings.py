@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
 
 from ..simulation.model import SimulationFailed
 from .linear_structure_parts import ShearFrame
@@ -64,16 +63,14 @@ class ModalModel:
     (2, 200)
     """
 
-    channels: tuple[str, ...]
+    channels: Sequence[str]
     n_modes: int
 
     n_supports = 1
 
-    def __init__(self, channels: Sequence[str], n_modes: int) -> None:
-        channels = _names("ModalModel", channels)
-        check_integer("n_modes of a ModalModel", n_modes, 1, _MOST_MODES)
-        object.__setattr__(self, "channels", channels)
-        object.__setattr__(self, "n_modes", int(n_modes))
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", _names("ModalModel", self.channels))
+        check_integer("n_modes of a ModalModel", self.n_modes, 1, _MOST_MODES)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -104,12 +101,11 @@ class ModalModel:
 
 
 @dataclass(frozen=True)
-class GroupedFrame:
-    """Shear frame whose storeys share one stiffness factor per group, with one damping ratio or Rayleigh damping.
+class GroupedFrame(ShearFrame):
+    """Shear frame whose storeys share one stiffness factor per group, with one damping ratio.
 
     The parameters are ``stiffness_1``, ..., the multiples of the nominal stiffnesses of the storeys in each group, and
-    ``damping``, the ratio of critical damping of all modes. With ``rayleigh=(i, j)`` the damping matrix is
-    C = a M + b K, and the parameters are ``damping_i`` and ``damping_j``, the ratios of these two modes.
+    ``damping``, the ratio of critical damping of all modes.
 
     Parameters
     ----------
@@ -118,13 +114,11 @@ class GroupedFrame:
     groups : sequence of int
         Group of each storey, from the lowest one: 1 to the number of groups, each of which has a storey. Groups usually
         end where the section of the columns changes.
-    rayleigh : pair of int, optional
-        Two different modes, counted from 1.
 
     Raises
     ------
     ValueError
-        As `ShearFrame`, and if `groups` or `rayleigh` do not fit.
+        As `ShearFrame`, and if `groups` do not fit.
 
     Examples
     --------
@@ -134,72 +128,24 @@ class GroupedFrame:
     >>> (acceleration,) = LinearStructure(tower, record).simulate([1.1, 0.9, 0.02])
     """
 
-    floors: tuple[tuple[str, int], ...]
-    masses: tuple[float, ...]
-    stiffnesses: tuple[float, ...]
-    groups: tuple[int, ...]
-    rayleigh: tuple[int, int] | None = None
+    groups: Sequence[int]
 
-    n_supports = 1
-
-    def __init__(
-        self, floors, masses: Sequence[float], stiffnesses: Sequence[float], groups: Sequence[int], rayleigh=None
-    ) -> None:
-        frame, groups = ShearFrame(floors, masses, stiffnesses), tuple(groups)
-        n = len(frame.masses)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        groups, n = tuple(self.groups), len(self.masses)
         if len(groups) != n or set(groups) != set(range(1, max(groups, default=0) + 1)):
             raise ValueError(
                 f"GroupedFrame: expected the group of each of {n} storeys, numbers from 1 without gaps; got {groups!r}"
             )
-        if rayleigh is not None:
-            rayleigh = tuple(rayleigh)
-            if len(rayleigh) != 2 or len(set(rayleigh)) != 2 or not set(rayleigh) <= set(range(1, n + 1)):
-                raise ValueError(
-                    f"GroupedFrame: rayleigh must be two different modes from 1 to {n}, or None; got {rayleigh!r}"
-                )
-        for name in ("floors", "masses", "stiffnesses"):
-            object.__setattr__(self, name, getattr(frame, name))
-        object.__setattr__(self, "groups", tuple(int(group) for group in groups))
-        object.__setattr__(self, "rayleigh", rayleigh)
+        object.__setattr__(self, "groups", tuple(map(int, groups)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """``stiffness_1``, ..., one per group, and ``damping``, or ``damping_i`` and ``damping_j``."""
-        damping = ("damping",) if self.rayleigh is None else tuple(f"damping_{mode}" for mode in self.rayleigh)
-        return (*(f"stiffness_{group}" for group in range(1, max(self.groups) + 1)), *damping)
+        """``stiffness_1``, ..., one per group, and ``damping``."""
+        return (*(f"stiffness_{group}" for group in range(1, max(self.groups) + 1)), "damping")
 
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels."""
-        return tuple(name for name, _ in self.floors)
-
-    def assemble(self, theta: np.ndarray) -> LinearSystem:
-        """Compute the matrices at the parameters (n_parameters,).
-
-        Raises
-        ------
-        SimulationFailed
-            If a stiffness or damping is not positive, or a mode has a negative ratio with this Rayleigh damping.
-        """
-        factors = theta[np.array(self.groups) - 1]
-        ratios = theta[max(self.groups) :]
-        if not (theta > 0.0).all():
-            bad = [name for name, value in zip(self.parameter_names, theta, strict=True) if not value > 0.0]
-            raise SimulationFailed(f"stiffnesses and dampings must be positive; not positive: {', '.join(bad)}")
-        frame = ShearFrame(self.floors, self.masses, self.stiffnesses)
-        n = len(self.masses)
-        system = frame.assemble(np.concatenate([factors, np.full(n, ratios[0])]))
-        if self.rayleigh is None:
-            return system
-        frequencies = np.sqrt(eigh(system.stiffness, system.mass, eigvals_only=True))
-        own = frequencies[np.array(self.rayleigh) - 1]
-        mass, stiffness = np.linalg.solve(0.5 * np.stack([1.0 / own, own], axis=1), ratios)
-        if not (mass / frequencies + stiffness * frequencies > 0.0).all():
-            raise SimulationFailed(
-                f"Rayleigh damping with the ratios {_listed(ratios)} of modes {self.rayleigh} makes the damping of "
-                "another mode negative"
-            )
-        return system._replace(damping=mass * system.mass + stiffness * system.stiffness)
+    def _system(self, factors: np.ndarray, ratios: np.ndarray) -> LinearSystem:
+        return super()._system(factors[np.array(self.groups) - 1], np.full(len(self.masses), ratios[-1]))
 
 
 @dataclass(frozen=True)
@@ -232,22 +178,21 @@ class ShearFlexuralBeam:
     (2, 200)
     """
 
-    heights: tuple[tuple[str, float], ...]
+    heights: Mapping[str, float] | Sequence[tuple[str, float]]
     n_modes: int = 5
 
     n_supports = 1
 
-    def __init__(self, heights: Mapping[str, float] | Sequence[tuple[str, float]], n_modes: int = 5) -> None:
-        pairs = tuple(heights.items() if isinstance(heights, Mapping) else heights)
+    def __post_init__(self) -> None:
+        pairs = tuple(self.heights.items() if isinstance(self.heights, Mapping) else self.heights)
         names = _names("ShearFlexuralBeam", [name for name, _ in pairs])
         shares = tuple(float(height) for _, height in pairs)
         if not all(0.0 < share <= 1.0 for share in shares):
             raise ValueError(
                 f"ShearFlexuralBeam: expected heights as shares of that of the building, above 0 to 1; got {shares}"
             )
-        check_integer("n_modes of a ShearFlexuralBeam", n_modes, 1, _MOST_MODES)
+        check_integer("n_modes of a ShearFlexuralBeam", self.n_modes, 1, _MOST_MODES)
         object.__setattr__(self, "heights", tuple(zip(names, shares, strict=True)))
-        object.__setattr__(self, "n_modes", int(n_modes))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

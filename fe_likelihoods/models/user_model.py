@@ -148,21 +148,8 @@ class UserModel(ExternalModel):
     def with_record(self, record: Record) -> UserModel:
         """Return the same model under another record.
 
-        Parameters
-        ----------
-        record : Record
-            The excitation. If the response step is a multiple of the present record's step, it is the same multiple of
-            the new record's step.
-
-        Returns
-        -------
-        UserModel
-            A model of the same class.
-
-        Raises
-        ------
-        ValueError
-            If the model was made without a record, or `record` is not a `Record`.
+        If the response step is a multiple of the present record's step, it is the same multiple of the new record's
+        step. ValueError if the model was made without a record, or `record` is not a `Record`.
         """
         kind = type(self).__name__
         if self.record is None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from ..models.base import History
     from ..models.linear_structure import LinearStructure
     from ..models.rc_column import RCColumn
-    from ..models.rc_column_parts import Patches
 
 __all__ = ["plot_bridge", "plot_hysteresis", "plot_section", "plot_sensors"]
 
@@ -65,10 +63,9 @@ def plot_section(column: RCColumn, axes: Axes | None = None) -> Axes:
         f"core concrete, hoops {from_si(hoops.diameter, unit):.3g} {unit} at {from_si(hoops.spacing, unit):.3g} {unit}"
     )
     core = axes.add_patch(Circle((0.0, 0.0), core_radius, facecolor=_CORE, edgecolor=BLUE, linewidth=2.0, label=ring))
-    kind = f"{column.mesh} strips" if isinstance(column.mesh, Integral) else "rings and wedges"
-    lines = _mesh_lines(column.mesh, radius, core_radius)
+    lines = _mesh_lines(column.mesh, radius)
     axes.add_collection(LineCollection(lines, colors="white", linewidths=0.9))
-    mesh = Patch(facecolor=_CORE, edgecolor="white", hatch="|||", label=kind)
+    mesh = Patch(facecolor=_CORE, edgecolor="white", hatch="|||", label=f"{column.mesh} strips")
     bars = column.bars
     angles = bars.first_angle + 2.0 * np.pi * np.arange(bars.number) / bars.number
     place = float(from_si(column.bar_circle_radius, unit))
@@ -351,14 +348,7 @@ def _length_unit(column: RCColumn) -> str:
     return dict(column.units).get("displacement", "m")
 
 
-def _mesh_lines(mesh: int | Patches, radius: float, core_radius: float) -> list[np.ndarray]:
-    """Return the lines between fibers, each (n, 2): chords for strips, circles and radii for rings and wedges."""
-    if isinstance(mesh, Integral):
-        edges = np.linspace(-radius, radius, mesh + 1)[1:-1]
-        return [np.array([[y, -h], [y, h]]) for y, h in zip(edges, np.sqrt(radius**2 - edges**2), strict=True)]
-    around = np.linspace(0.0, 2.0 * np.pi, 200)
-    rings = [*np.linspace(0.0, core_radius, mesh.core_rings + 1)[1:-1]]
-    rings += [*np.linspace(core_radius, radius, mesh.cover_rings + 1)[1:-1]]
-    lines = [r * np.column_stack([np.cos(around), np.sin(around)]) for r in rings]
-    angles = 2.0 * np.pi * np.arange(mesh.wedges) / mesh.wedges
-    return lines + [np.array([[0.0, 0.0], [radius * np.cos(a), radius * np.sin(a)]]) for a in angles]
+def _mesh_lines(mesh: int, radius: float) -> list[np.ndarray]:
+    """Return the chords between the strips, each (2, 2)."""
+    edges = np.linspace(-radius, radius, mesh + 1)[1:-1]
+    return [np.array([[y, -h], [y, h]]) for y, h in zip(edges, np.sqrt(radius**2 - edges**2), strict=True)]

@@ -98,6 +98,7 @@ class Column(NamedTuple):
     decimals: int  # most digits after the decimal point
     below: str  # unit below the header line, "" without
     kind: str  # "number", "clock", or "text", such as dates and a logger's state, which has no values
+    cells: tuple[str, ...] = ()  # (n_rows,) as printed
 
 
 class Table(NamedTuple):
@@ -454,7 +455,7 @@ def _columns(
             values = [parse_number(cell, where) if cell else math.nan for cell, where in cells]
             decimals = max(map(decimals_of, filled), default=0)
         name, unit = names[k] if names else str(k + 1), below[k] if below else ""
-        columns.append(Column(name, np.array(values), decimals, unit, kind))
+        columns.append(Column(name, np.array(values), decimals, unit, kind, tuple(cell for cell, _ in cells)))
     return tuple(columns), first
 
 

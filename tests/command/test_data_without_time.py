@@ -125,7 +125,7 @@ def test_columns_and_errors_of_modes(tmp_path):
     ("kind", "changes", "text"),
     [
         ("modal", [("[sampler]", '[record]\nfile = "a.csv"\n[sampler]')], "modes and load tests have no"),
-        ("modal", [("[sampler]", "[load_test]\nfile = 'a'\n[sampler]")], "a file describes one data set"),
+        ("modal", [("[sampler]", "[load_test]\nfile = 'a'\n[sampler]")], r"beside other data, \[load_test.model\] is"),
         ("modal", [('"frame"  ', '"column" '), ("floors =", "# floors =")], r"\[model\]"),
         ("modal", [("modes = [1, 2, 3]", "modes = [1, 7]")], r"\[modes\] ModalData has no modes"),
         ("modal", [("[modes]", "[modes]\nn_modes = 3")], "a frame has a mode for each storey"),

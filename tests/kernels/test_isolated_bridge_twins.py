@@ -88,9 +88,9 @@ def test_smooth_law_against_solve_ivp(smooth, name):
     assert SECOND_ORDER[0] < coarse / peak_errors(ours(theta), smooth[name]).mean() < SECOND_ORDER[1]
 
 
-def test_p_delta_and_vertical_motion_against_solve_ivp():
-    reference = solve(Definition(), GROUND, DT, p_delta=True, vertical=VERTICAL).response
-    response = ours(PARAMETERS["nominal"], p_delta=True, vertical=Record("up", DT, VERTICAL))
+def test_vertical_motion_against_solve_ivp():
+    reference = solve(Definition(), GROUND, DT, vertical=VERTICAL).response
+    response = ours(PARAMETERS["nominal"], vertical=Record("up", DT, VERTICAL))
     assert not too_large(by_kind(response, reference), **SMOOTH)
 
 

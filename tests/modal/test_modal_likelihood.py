@@ -20,7 +20,6 @@ from fe_likelihoods import (
     Record,
     ShearFrame,
     SimulationCache,
-    SimulationFailed,
     Uniform,
 )
 from fe_likelihoods.modal.load_cases import LoadTest
@@ -230,23 +229,6 @@ def test_a_guide_finds_the_frame_with_few_simulations(rng):
     assert posterior.likelihood.simulations < 500
 
 
-def test_modes_and_histories_share_a_stiffness(rng):
-    truth = np.array([1.0, 0.8, 1.2, 1.1])
-    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
-    response = model.simulate([*truth, *[0.02] * 4])
-    histories = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.1 * rng.normal(size=(1, 200))))
-    modes = ModalLikelihood(model, identified(truth, [1, 2], rng))
-    joint = JointLikelihood({"modes": modes, "histories": histories})
-    noise = {"frequency_error": HalfNormal(0.02), "shape_error": HalfNormal(0.05), "sigma_roof": HalfNormal(1.0)}
-    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in range(1, 5)}
-    posterior = Posterior(joint, PRIOR | damping | noise)
-    point = dict(zip(PRIOR, truth, strict=True)) | {f"damping_{i}": 0.02 for i in range(1, 5)}
-    point |= {"frequency_error": 0.01, "shape_error": 0.03, "sigma_roof": 0.1}
-    alone = modes([*truth, 0.01, 0.03]) + histories([*truth, *[0.02] * 4, 0.1])
-    assert posterior.log_likelihood(point) == pytest.approx(alone, rel=1e-12)
-    posterior.guide(starts=4)  # histories and modes have one
-
-
 def test_frequencies_alone_are_paired_by_number():
     data = ModalData([2.0, 8.0], frequency_cv=0.01, mode_numbers=[1, 3])
     likelihood = ModalLikelihood(
@@ -255,13 +237,6 @@ def test_frequencies_alone_are_paired_by_number():
     assert likelihood.parameter_names == ("f",)
     assert likelihood([2.02]) == pytest.approx(2 * norm.logpdf(0.01, 0.0, 0.01))
     assert np.isnan(likelihood.predict_modes([[2.0]]).assurance).all()
-
-
-def test_samples_that_cannot_be_simulated_are_left_out(rng):
-    likelihood = ModalLikelihood(FRAME, identified(np.ones(4), [1, 2, 3], rng))
-    assert len(likelihood.predict_modes([np.ones(4), -np.ones(4)]).numbers) == 1
-    with pytest.raises(SimulationFailed, match="none of 1 samples"):
-        likelihood.predict_modes(-np.ones(4))
 
 
 @pytest.mark.parametrize(
@@ -354,18 +329,3 @@ def test_modes_a_load_test_and_histories_of_one_structure_have_a_guide(rng):
     (evidence, mean, deviation), other = found
     assert other[0] == pytest.approx(evidence, abs=0.5)
     assert (abs(other[1] - mean) < 0.4 * deviation).all()
-
-
-@pytest.mark.slow
-def test_processes_give_the_same_bits(rng, shared_pool):
-    def matrices(theta):
-        storeys = 900.0 * theta
-        return np.diag(storeys + [*storeys[1:], 0.0]) - np.diag(storeys[1:], 1) - np.diag(storeys[1:], -1), np.eye(4)
-
-    data = identified(np.ones(4), [1, 2], rng, frequency_cv=0.01, shape_error=0.03)
-    model = FunctionModes(matrices, tuple(PRIOR), {name: floor - 1 for name, floor in FLOORS.items()}, 4)
-    points = rng.uniform(0.8, 1.2, (6, 4))
-    with shared_pool(2) as pool:
-        np.testing.assert_array_equal(
-            ModalLikelihood(model, data, pool=pool)(points), ModalLikelihood(model, data)(points)
-        )

@@ -7,6 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from fe_likelihoods import read_modal_data
+from fe_likelihoods.signals.sdof import respond
 
 SHAPES = np.array([[1.0, 2.0, 3.0], [-2.0, -1.0, 2.0]])
 UNIT = SHAPES / np.linalg.norm(SHAPES, axis=1, keepdims=True)
@@ -34,7 +35,8 @@ def test_other_layouts_of_a_table(tmp_path):
     for lines in (
         ("Mode No.;Natural frequency [Hz];a;b;c", "1;1,0;1;2;3", "2;3,0;-2;-1;2"),
         ("mode,period [s],a,b,c", "1,1.0,1,2,3", f"2,{1 / 3!r},-2,-1,2"),
-        ("f [Hz],a,b,c", "1,1,2,3", "3,-2,-1,2"),
+        ("f [Hz],a,b,c,remark", "1,1,2,3,good", "3,-2,-1,2,poor"),
+        ("omega_rad/s,a,b,c", "6.283185307179586,1,2,3", "18.84955592153876,-2,-1,2"),
         (",mode 1,mode 2", "frequency [Hz],1.0,3.0", "a,1,-2", "b,2,-1", "c,3,2"),
         ("name;first;second", "frequency_rad/s;6.283185307179586;18.84955592153876", "a;1;-2", "b;2;-1", "c;3;2"),
     ):
@@ -58,7 +60,8 @@ def test_units_are_stated_or_given(tmp_path):
     for head, options, text in (
         ("frequency,a,b", {}, "unit='Hz' or unit='rad/s'"),
         ("frequency_Hz,a,b", {"unit": "rad/s"}, "states Hz"),
-        ("omega,a,b", {}, "expected a column of frequencies"),
+        ("omega,a,b", {}, "unit='Hz' or unit='rad/s'"),
+        ("lambda,a,b", {}, "expected a column of frequencies"),
         ("frequency_Hz,a,b", {"sensors": ["c"]}, "the sensors are a, b"),
     ):
         with pytest.raises(ValueError, match=text):
@@ -85,18 +88,47 @@ def test_a_matlab_file(tmp_path):
     for variables in ({}, {"frequencies": "fn"}, {"frequencies": "f", "modes": "Phi"}):
         with pytest.raises(ValueError, match="the file has f, Phi, xi"):
             read_modal_data(path, unit="Hz", variables=variables)
+    savemat(path, {"f": [1.0, 3.0], "Phi": SHAPES})
+    with pytest.raises(ValueError, match="2 modes in the columns of Phi; got the shape .2, 3.: transpose it"):
+        read_modal_data(path, ["a", "b", "c"], unit="Hz", variables={"frequencies": "f", "shapes": "Phi"})
 
 
-def test_a_result_of_an_identification(caplog):
+def test_a_result_of_an_identification():
     turned = SHAPES.T * np.exp([0.4j, -1.0j])
     result = SimpleNamespace(Fn=np.array([1.0, 3.0]), Phi=turned, Xi=[0.01, 0.02], Fn_std=np.array([0.01, 0.06]))
+    result.Phi_std = 0.02 * np.linalg.norm(SHAPES, axis=1) * np.ones((3, 2))
     data = read_modal_data(result, ["a", "b", "c"])
+    np.testing.assert_allclose(data.shape_error, 0.02, rtol=1e-12)
     np.testing.assert_allclose(np.abs((data.shapes[0] * UNIT).sum(axis=1)), 1.0, rtol=1e-12)
     np.testing.assert_allclose(data.frequency_cv, [0.01, 0.02], rtol=1e-12)
-    with caplog.at_level("INFO"):
+    with pytest.warns(UserWarning, match=r"phases of complex mode shapes scatter by 29 degrees \(shape 1\)"):
         read_modal_data(SimpleNamespace(Fn=[1.0], Phi=np.exp(1j * np.array([[0.0], [1.0]]))), ["a", "b"])
-    assert "scatter by [28.6] degrees" in caplog.text
     with pytest.raises(ValueError, match="choose them first"):
         read_modal_data(SimpleNamespace(Fn=None, Phi=None))
     with pytest.raises(ValueError, match="expected a path"):
         read_modal_data(7)
+
+
+@pytest.mark.slow
+def test_modes_that_pyoma2_identifies():
+    """Ambient vibration of a chain of four masses: frequencies and shapes within the errors that pyOMA2 states."""
+    pytest.importorskip("pyoma2")
+    from pyoma2.algorithms import SSI
+    from pyoma2.setup import SingleSetup
+
+    rng, dt = np.random.default_rng(1), 0.02
+    stiffness = 900.0 * (2.0 * np.eye(4) - np.eye(4, k=1) - np.eye(4, k=-1))
+    stiffness[-1, -1] = 900.0
+    squares, shapes = np.linalg.eigh(stiffness)
+    omegas = np.sqrt(squares)
+    modal = shapes.T @ rng.normal(size=(4, 30_000))
+    motion = shapes @ [respond(force, dt, w, 0.01).displacement for force, w in zip(modal, omegas, strict=True)]
+    setup, algorithm = SingleSetup(motion.T, fs=1.0 / dt), SSI(name="ssi", br=20, ordmax=20, calc_unc=True, nb=20)
+    setup.add_algorithms(algorithm)
+    setup.run_by_name("ssi")
+    setup.mpe("ssi", sel_freq=(omegas / (2.0 * np.pi)).tolist(), order_in="find_min")
+    data = read_modal_data(algorithm.result, ["a", "b", "c", "d"])
+    errors = data.frequencies[0] / (omegas / (2.0 * np.pi)) - 1.0
+    assert (np.abs(errors) < 5.0 * data.frequency_cv).all() and (data.frequency_cv < 0.01).all()
+    assert (np.abs((data.shapes[0] * shapes.T).sum(axis=1)) > 1.0 - 50.0 * data.shape_error**2 - 1e-4).all()
+    assert data.damping[0] == pytest.approx(0.01, rel=0.3)

@@ -3,20 +3,14 @@
 import re
 
 import numpy as np
-import pytest
 
 from fe_likelihoods import (
     Channel,
     FELikelihood,
-    HalfNormal,
-    JointLikelihood,
-    LinearStructure,
     LogNormal,
-    Measurements,
     ModalData,
     ModalLikelihood,
     Posterior,
-    Record,
     ShearFrame,
     check_result,
     propagate,
@@ -78,22 +72,3 @@ def test_load_cases_are_bars_and_nothing_is_said_of_time(rng, tmp_path):
     assert judgement.status == "use" and not judgement.findings
     assert "roof [mm], 2 values (load case)" in text and "Measured and computed values" in text
     assert "Predicted values" in text and not OF_TIME.findall(text)
-
-
-@pytest.mark.slow
-def test_modes_a_load_test_and_histories_are_in_one_report(rng, tmp_path):
-    model = LinearStructure(FRAME, Record("motion", 0.02, rng.normal(size=200)), outputs=("roof",))
-    response = model.simulate([*TRUTH, 0.02, 0.02])
-    shaking = FELikelihood(model, Measurements(model.channels, 0.02, response + 0.3 * rng.normal(size=(1, 200))))
-    static, known = static_likelihood(rng)
-    parts = {"modes": modal_likelihood(rng), "static": static, "shaking": shaking}
-    joint = JointLikelihood(parts, separate=["sigma_roof"])
-    known = {"sigma_roof_static" if name == "sigma_roof" else name: error for name, error in known.items()}
-    damping = {f"damping_{i}": LogNormal(0.02, 0.3) for i in (1, 2)}
-    posterior = Posterior(joint, PRIOR | damping | known | {"sigma_roof_shaking": HalfNormal(1.0)})
-    sampler = SMCSampler(100, posterior.ndim, posterior, guide=posterior.guide(starts=3), seed=1, vectorize=True)
-    sampler.run_mcmc(None, 1)
-    text = report(sampler, posterior, out=tmp_path / "report.html").read_text()
-    for title in ("Measured and computed modes", "Measured and computed values", "Measured and simulated response"):
-        assert title in text
-    assert check_result(sampler).status == "use"

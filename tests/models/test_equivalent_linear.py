@@ -1,7 +1,6 @@
 """Equivalent-linear structures against the linear model, scipy's state-space solver, similarity, and a closed form."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -81,18 +80,6 @@ def test_the_fixed_point_holds_for_the_deck_by_scipy(three, scale):
     np.testing.assert_allclose(response, absolute, rtol=0, atol=1e-9 * np.abs(absolute).max())
 
 
-def test_the_settled_frame_is_the_linear_frame_with_its_stiffness_and_damping(three):
-    parts = EquivalentLinear(FRAME, REFERENCE, "roof")
-    model = LinearStructure(parts, three[0])
-    theta = np.array([*FRAME_THETA, *CHANGE])
-    found = parts.settle(theta, three[0].acceleration[None], DT)
-    assert found.stiffness_factor == pytest.approx((found.level / REFERENCE) ** -0.3, rel=1e-12)
-    assert found.damping_factor == pytest.approx((found.level / REFERENCE) ** 0.4, rel=1e-12)
-    settled = np.array(FRAME_THETA) * np.repeat([found.stiffness_factor, found.damping_factor], 3)
-    linear = LinearStructure(FRAME, three[0]).simulate(settled)
-    np.testing.assert_allclose(model.simulate(theta), linear, rtol=0, atol=1e-11 * np.abs(linear).max())
-
-
 def test_the_level_of_a_long_sine_is_that_of_its_amplitude():
     """Steady state of amplitude A: l = A sqrt(3/4). The amplitude solves A = a / |dynamic stiffness(A)|."""
     forcing, strength, (p, q) = 5.0 * math.pi, 0.5, (0.2, 0.3)  # 80 samples per period
@@ -118,38 +105,6 @@ def test_the_level_of_a_long_sine_is_that_of_its_amplitude():
     assert abs(math.log(expected / REFERENCE)) > 0.3, "control"
 
 
-@pytest.mark.parametrize("name", ["deck", "frame"])
-@pytest.mark.parametrize("factor", [1e-3, 40.0])
-def test_a_scaled_record_with_a_scaled_reference_gives_a_scaled_response(cases, name, factor):
-    parts, supports, theta, channel = cases[name]
-    theta = [*theta, *CHANGE]
-    expected = LinearStructure(EquivalentLinear(parts, REFERENCE, channel), supports).simulate(theta)
-    scaled = LinearStructure(
-        EquivalentLinear(parts, factor * REFERENCE, channel), [record.scale(factor) for record in supports]
-    )
-    np.testing.assert_allclose(
-        scaled.simulate(theta), factor * expected, rtol=0, atol=1e-10 * factor * np.abs(expected).max()
-    )
-
-
-def test_stronger_motion_lowers_the_frequency_and_raises_the_damping(three):
-    parts = EquivalentLinear(BridgeDeck("m"), REFERENCE)
-    acceleration = np.stack([record.acceleration for record in three])
-    theta = np.array([*DECK_THETA, *CHANGE])
-    found = [parts.settle(theta, factor * acceleration, DT) for factor in (0.01, 0.1, 1.0, 10.0)]
-    for each, change in (("level", 1), ("stiffness_factor", -1), ("damping_factor", 1)):
-        assert (change * np.diff([getattr(settled, each) for settled in found]) > 0.0).all(), each
-
-
-def test_quiet_seconds_do_not_change_the_level(three):
-    parts = EquivalentLinear(BridgeDeck("m"), REFERENCE)
-    acceleration, theta = np.stack([record.acceleration for record in three]), np.array([*DECK_THETA, *CHANGE])
-    acceleration[:, 0] = 0.0
-    expected = parts.settle(theta, acceleration, DT).level
-    padded = np.pad(acceleration, ((0, 0), (100, 0)))
-    assert parts.settle(theta, padded, DT).level == pytest.approx(expected, rel=1e-10)
-
-
 def test_the_log_likelihood_is_smooth(three):
     """Central differences of halved steps agree in second order, down to steps where only round-off is left."""
     model = LinearStructure(EquivalentLinear(BridgeDeck("m"), REFERENCE), three)
@@ -169,25 +124,6 @@ def test_the_log_likelihood_is_smooth(three):
         tiny = 1e-6 * theta[i]
         slope = (value(theta + tiny * unit) - value(theta - tiny * unit)) / (2 * tiny)
         assert slope == pytest.approx(slopes[-1], rel=1e-3), name
-
-
-def test_all_fixed_points_of_a_resonance(rng):
-    """A narrow-band motion beside a soft structure: the level can be low off resonance and high in it."""
-    time = 0.01 * np.arange(4000)
-    record = Record("sine", 0.01, 0.4 * np.sin(8.0 * time) * np.minimum(time / 5.0, 1.0))
-    parts = EquivalentLinear(ShearFrame({"top": 1}, [1.0], [1.0]), 0.01)
-    theta = np.array([140.0, 0.01, 0.6, 0.0])
-    levels = parts.fixed_points(theta, record.acceleration[None], 0.01)
-    assert len(levels) == 3 and (np.diff(levels) > 0.0).all()
-    for each in levels:
-        stiffness = 140.0 * (each / 0.01) ** -0.6
-        matrices = [[0, 1], [-stiffness, -2 * 0.01 * math.sqrt(stiffness)]], [[0], [-1]], [[1, 0]], [[0]]
-        _, displacement, _ = signal.lsim(matrices, record.acceleration, time)
-        assert level(displacement) == pytest.approx(each, rel=1e-8)
-    assert parts.settle(theta, record.acceleration[None], 0.01).level == pytest.approx(levels[0], rel=1e-10)
-    soft = theta * [1.0, 20.0, 0.2, 1.0]
-    (single,) = parts.fixed_points(soft, record.acceleration[None], 0.01)
-    assert parts.settle(soft, record.acceleration[None], 0.01).level == pytest.approx(single, rel=1e-10)
 
 
 def test_impossible_parameters_fail_with_reasons_in_their_rows_only(three):
@@ -229,18 +165,6 @@ def test_other_records_and_parts_of_records(three):
         propagate(model, [theta], record=weak, from_state="end", progress=False)
     predicted = propagate(model, [theta], record=weak, quantity=peak("m"), progress=False)
     assert predicted.values[0] == np.abs(other.simulate(theta)).max()
-
-
-def test_repr_fingerprint_and_pickle(three):
-    parts = EquivalentLinear(FRAME, REFERENCE, "roof")
-    assert repr(parts) == f"EquivalentLinear(parts={FRAME!r}, reference=0.004, channel='roof')"
-    model = LinearStructure(parts, three[0])
-    others = [EquivalentLinear(FRAME, 0.005, "roof"), EquivalentLinear(FRAME, REFERENCE, "middle"), FRAME]
-    assert len({model.fingerprint, *(LinearStructure(other, three[0]).fingerprint for other in others)}) == 4
-    twin = pickle.loads(pickle.dumps(model))
-    theta = [*FRAME_THETA, *CHANGE]
-    assert twin.fingerprint == model.fingerprint
-    np.testing.assert_array_equal(twin.simulate(theta), model.simulate(theta))
 
 
 @pytest.mark.parametrize(

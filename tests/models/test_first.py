@@ -14,7 +14,6 @@ from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.noise.autoregressive import AutoregressiveNoise
 from fe_likelihoods.problems import bridge_column, isolated_bridge
 from fe_likelihoods.signals.channels import Channel, Measurements
-from fe_likelihoods.signals.durations import growing_durations
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 from fe_likelihoods.simulation.local_pool import LocalPool
 
@@ -126,13 +125,6 @@ def test_a_model_that_cannot_be_shortened():
     likelihood = FELikelihood(model, Measurements(model.channels, 0.1, np.ones((1, 10))))
     with pytest.raises(ValueError, match=r"FunctionModel cannot be shortened: it needs a method first\(seconds\)"):
         likelihood.first(0.5)
-
-
-def test_the_parts_of_the_record_of_the_column():
-    record = bridge_column().likelihood.model.loading
-    durations = growing_durations(record.acceleration, record.dt)
-    np.testing.assert_allclose(durations, [7.6, 14.2, 20.8, 33.0, 50.0], atol=0.1)
-    assert durations[-1] == record.duration
 
 
 # functions that take the number of samples --------------------------------------------------------------------

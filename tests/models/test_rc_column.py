@@ -9,44 +9,32 @@ from dataclasses import fields, replace
 import numba
 import numpy as np
 import pytest
-from scipy import optimize, stats
 
 from fe_likelihoods import (
     Bars,
     Concrete,
     DisplacementHistory,
-    FELikelihood,
-    HalfNormal,
     Hoops,
     LowCycleFatigue,
-    Measurements,
-    Posterior,
     RCColumn,
     Record,
     SimulationFailed,
     Steel,
-    TruncatedNormal,
     rrmse,
     to_si,
 )
-from fe_likelihoods.kernels import concrete04, reinforcing_steel
-from fe_likelihoods.kernels.frame import allocate, recorder
-from fe_likelihoods.kernels.newmark import HISTORY_ROWS, Dynamics, newmark
-from fe_likelihoods.kernels.static import Iteration
-from fe_likelihoods.models.circular_section import gauss_lobatto
 from fe_likelihoods.models.rc_column import PARAMETERS
-from fe_likelihoods.models.rc_column_parts import Patches
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.simulation.model import misfit_batch
 from fe_likelihoods.units import G0
-from tests.opensees_column import CORE, COVER, INCH, KIP, KSI, STEEL, peer_of
+from tests.opensees_column import INCH, KIP, KSI
 
 NOMINAL = np.ones(5)
 PAPER = np.array(list(BRIDGE_COLUMN_MEANS.values()))
 PUSHED = ("Ec", "Es", "ft")  # parameters that act under imposed displacement
 REFERENCE_THETA = np.array([3320.0, 28400.0, 0.737, 0.0002016, 0.306])  # ksi, 1/s, s
-TIGHT = dict(tolerance=1e-11, element_tolerance=1e-12 * KIP * INCH)
+TIGHT = dict(tolerance=1e-11)
 
 
 @pytest.fixture(scope="module")
@@ -144,9 +132,7 @@ SENSITIVITY = {  # changes, and the RRMSE that they cause in the nominal acceler
     "strength 7 ksi": (dict(fc=7.0 * KSI), 0.15),
     "five points": (dict(n_points=5), 0.11),
     "one element": (dict(n_points=5, n_elements=1), 0.16),
-    "no vertical mass": (dict(vertical_mass=False), 0.028),
     "hoops of 54.8 ksi": (dict(fyh=54.8), 0.006),
-    "patches": (dict(mesh=Patches(20, 10, 2)), 0.17),
 }
 
 
@@ -166,36 +152,6 @@ def test_modelling_choices_change_the_response_as_in_opensees(reference_response
 
 
 # --- units, integration and energy -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("theta", [NOMINAL, PAPER], ids=["nominal", "paper"])
-def test_the_system_of_units_does_not_matter(strong, theta):
-    """The kernels in kip and inch, with separately computed materials, against the model in SI."""
-    model = RCColumn.lhpost(strong, **TIGHT)
-    peer = peer_of(model, theta)
-    points, weights = gauss_lobatto(peer.n_points)
-    core, cover, bars = (peer.fibers[:2, peer.fibers[2] == material].T for material in (CORE, COVER, STEEL))
-    kernels = allocate(
-        n_elements=peer.n_elements,
-        height=peer.height,
-        corotational=True,
-        element_tolerance=1e-12,
-        points=points,
-        weights=weights,
-        core=core,
-        cover=cover,
-        bars=bars,
-    )
-    concrete04.constants(*peer.core, kernels.sections.concrete[0])
-    concrete04.constants(*peer.cover, kernels.sections.concrete[1])
-    reinforcing_steel.constants(*peer.steel, kernels.sections.steel)
-    gravity = np.array([0.0, 0.0, 0.0, 0.0, -peer.axial_load, 0.0])
-    mass = np.array([0.0, 0.0, 0.0, *peer.mass])
-    history = np.zeros((len(HISTORY_ROWS), strong.n_steps))
-    ground = strong.acceleration / INCH
-    dynamics = Dynamics(gravity, mass, peer.a0, peer.a1, 0.0)
-    newmark(kernels, dynamics, ground, strong.dt, 1, Iteration(1e-10, 20, 10), history, recorder(kernels))
-    assert rrmse(history[1::-1] * INCH, model.simulate(theta)).max() < 1e-8
 
 
 def test_substeps_equal_a_finer_record(strong, column):
@@ -223,125 +179,53 @@ def test_energy_is_balanced(strong, changes, scale):
     assert kinetic.min() >= 0.0
 
 
-def test_history_contains_the_response(column):
-    history = column.history(PAPER)
-    response = column.simulate(PAPER)
-    np.testing.assert_array_equal(response, [history["absolute acceleration"], history["relative displacement"]])
-    np.testing.assert_allclose(response[:, 0], [column.loading.acceleration[0], 0.0], rtol=0, atol=1e-15)
-    assert isinstance(history.retries, int)
-
-
 def test_forces_in_the_history_are_in_equilibrium(strong):
-    """Without damping and vertical inertia, F = -m a at the top, and F and the weight give the moment at the base."""
-    tight = dict(TIGHT, a0=0.0, a1=0.0, vertical_mass=False, parameters=("Ec",))
-    model = RCColumn.lhpost(strong.trim(0.0, 2.0), **tight)
+    """Without damping, F = -m a at the top."""
+    model = RCColumn.lhpost(strong.trim(0.0, 2.0), **TIGHT, a0=0.0, a1=0.0, parameters=("Ec",))
     history = model.history([0.6])
-    force, weight = history["force"], model.mass * G0
+    force = history["force"]
     np.testing.assert_allclose(force, -model.mass * history["absolute acceleration"], rtol=0, atol=1e-6 * np.ptp(force))
-    moment = force * (model.height + history["vertical displacement"]) + weight * history["relative displacement"]
-    np.testing.assert_allclose(-history["base moment"], moment, rtol=0, atol=1e-6 * np.ptp(moment))
-    np.testing.assert_allclose(history["base axial force"], -weight, rtol=1e-3)  # the column leans by one hundredth
     assert np.corrcoef(history["base curvature"], history["base moment"])[0, 1] > 0.9
 
 
 # --- arguments and parameters ----------------------------------------------------------------------------------------
 
-CHANGED = dict(  # another value of every argument; `loading`, `units` and `outputs` have separate tests
-    diameter=1.3,
-    height=7.0,
-    collapse_drift=0.3,
-    cover=0.06,
-    concrete=[
-        dict(fc=40e6),
-        dict(ec=24e9),
-        dict(ft=2.2e6),
-        dict(peak_strain=0.003),
-        dict(ultimate_strain=0.008),
-        dict(softening_strain=0.002),
-        dict(softening_ratio=0.2),
-    ],
-    steel=[
-        dict(fy=500e6),
-        dict(fu=720e6),
-        dict(es=200e9),
-        dict(esh=4e9),
-        dict(hardening_strain=0.012),
-        dict(ultimate_strain=0.13),
-    ],
-    bars=[dict(number=16), dict(diameter=0.03), dict(area=0.0011), dict(area=None), dict(first_angle=0.1)],
-    hoops=[
-        dict(diameter=0.012),
-        dict(spacing=0.1),
-        dict(fy=420e6),
-        dict(area=0.0003),
-        dict(area=None),
-        dict(ultimate_strain=0.1),
-        dict(spiral=True),
-    ],
-    mass=2.2e5,
+OTHERS = dict(  # values of arguments that are not numbers, or that are None or zero by default
     axial_load=2.2e6,
     rotational_inertia=1e5,
     fatigue=LowCycleFatigue(),
     column_mass=2e4,
-    vertical_mass=False,
-    a0=0.8,
-    a1=0.0003,
-    parameters=("Es", "Ec", "a0", "a1", "ft"),
-    n_elements=3,
-    n_points=4,
-    mesh=42,
     geometry="linear",
-    substeps=2,
-    max_increment=0.003,
-    tolerance=1e-7,
-    element_tolerance=1e-9,
-    max_iterations=30,
-    halvings=8,
     penetration=0.3,
-)
-NUMERICAL = {"max_increment", "tolerance", "element_tolerance", "max_iterations", "halvings"}
-ONE_LOADING = {
-    "mass",
-    "rotational_inertia",
-    "vertical_mass",
-    "a0",
-    "a1",
-    "substeps",
-}  # act under base acceleration only
-
-
-VARIANTS = [
-    pytest.param(name, change, id=f"{name}-{change}")
-    for name, value in CHANGED.items()
-    for change in (value if isinstance(value, list) else [value])
-]
+    peak_strain=0.003,
+    first_angle=0.1,
+    spiral=True,
+    mesh=42,
+    area=None,
+) | {"hoops.ultimate_strain": 0.1}
+PARTS = {"concrete": Concrete, "steel": Steel, "bars": Bars, "hoops": Hoops}
+# without effect on one simulation, or too small a one: names, limits and tolerances
+IDLE = {"loading", "units", "outputs", "parameters", "collapse_drift", "max_increment", "tolerance"}
+ONE_LOADING = {"mass", "rotational_inertia", "a0", "a1", "substeps"}  # act under base acceleration only
+VARIED = [(each.name, "") for each in fields(RCColumn) if each.name not in IDLE | {*PARTS}]
+VARIED += [(name, each.name) for name, kind in PARTS.items() for each in fields(kind)]
 
 
 def varied(model, name, value):
     return replace(model, **{name: replace(getattr(model, name), **value) if isinstance(value, dict) else value})
 
 
-def test_every_argument_is_varied_here():
-    names = {f.name for f in fields(RCColumn)} - {"loading", "units", "outputs"}
-    assert names == set(CHANGED)
-    for name, kind in (("concrete", Concrete), ("steel", Steel), ("bars", Bars), ("hoops", Hoops)):
-        assert {key for change in CHANGED[name] for key in change} == {f.name for f in fields(kind)}
-
-
-@pytest.mark.parametrize(("name", "value"), VARIANTS)
-def test_every_argument_changes_the_fingerprint(column, name, value):
-    assert varied(column, name, value).fingerprint != column.fingerprint
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [v for v in VARIANTS if v.values[0] not in NUMERICAL | {"parameters", "collapse_drift"}]
-)
-def test_every_argument_changes_the_response(strong, pushed, name, value):
-    shaken = RCColumn.lhpost(strong.scale(3.0))
-    models = [shaken] if name in ONE_LOADING else [shaken, pushed]
-    thetas = [np.ones(len(model.parameters)) for model in models]
-    pairs = [(varied(m, name, value).simulate(t), m.simulate(t)) for m, t in zip(models, thetas, strict=True)]
-    assert any(rrmse(one, other).max() > 1e-6 for one, other in pairs)
+@pytest.mark.parametrize(("name", "key"), VARIED)
+def test_every_argument_changes_the_response_and_the_fingerprint(strong, pushed, name, key):
+    shaken, found = RCColumn.lhpost(strong.scale(3.0)), []
+    for model in [shaken] if name in ONE_LOADING else [shaken, pushed]:
+        present = getattr(getattr(model, name), key) if key else getattr(model, name)
+        usual = present + 1 if isinstance(present, int) else 1.05 * present if isinstance(present, float) else None
+        value = OTHERS.get(f"{name}.{key}", OTHERS.get(key or name, usual))
+        other, theta = varied(model, name, {key: value} if key else value), np.ones(len(model.parameters))
+        found.append(rrmse(other.simulate(theta), model.simulate(theta)).max() > 1e-6)
+        assert other.fingerprint != model.fingerprint
+    assert any(found)
 
 
 def test_fingerprint_of_loading_units_and_outputs(strong, column, pushed):
@@ -349,7 +233,6 @@ def test_fingerprint_of_loading_units_and_outputs(strong, column, pushed):
     assert replace(column, loading=strong.trim(0.0, 4.0)).fingerprint != column.fingerprint
     assert replace(column, loading=Record("r", 0.004, strong.acceleration)).fingerprint != column.fingerprint
     assert replace(column, outputs=("displacement",)).fingerprint != column.fingerprint
-    assert replace(column, mesh=Patches()).fingerprint != replace(column, mesh=Patches(24)).fingerprint
     assert pushed.fingerprint != replace(pushed, loading=cycles(0.02)).fingerprint
     # display units and names of records do not change a response, hence not the fingerprint
     assert replace(column, units=(("acceleration", "m/s2"),)).fingerprint == column.fingerprint
@@ -380,14 +263,6 @@ def test_parameters_are_multiples_of_nominal_values(strong, pushed, name):
     np.testing.assert_array_equal(free.simulate([factor]), other.simulate(np.ones(len(other.parameters))))
     assert rrmse(free.simulate([factor]), free.simulate([1.0])).max() > 1e-6
     assert free.nominal[name] == base.nominal[name] > 0.0
-
-
-def test_parameters_in_any_order(column):
-    order = [4, 0, 3, 1, 2]
-    shuffled = replace(column, parameters=[column.parameters[i] for i in order])
-    assert shuffled.parameter_names == ("ft", "Ec", "a1", "Es", "a0")
-    np.testing.assert_array_equal(shuffled.simulate(PAPER[order]), column.simulate(PAPER))
-    assert rrmse(shuffled.simulate(PAPER), column.simulate(PAPER)).max() > 0.1
 
 
 def test_outputs_are_chosen_and_ordered(column):
@@ -514,31 +389,6 @@ def test_penetration_changes_what_cycles_dissipate_but_not_the_strength(pushed):
     np.testing.assert_array_equal(replace(model, penetration=0.0).simulate(np.ones(3))[0], rigid["force"])
 
 
-def test_a_cyclic_test_is_updated_end_to_end(rng):
-    """For a synthetic force with noise, the most probable parameters are where linear theory predicts them."""
-    model = RCColumn.lhpost(cycles(0.01, 0.03, 0.06), parameters=PUSHED, outputs=("force",))
-    truth, sigma = np.array([0.8, 1.1, 1.5]), 5e3
-    force = model.simulate(truth)
-    measurements = Measurements(model.channels, model.dt, force + sigma * rng.standard_normal(force.shape))
-    prior = {name: TruncatedNormal(1.0, 0.4) for name in PUSHED} | {"sigma_force": HalfNormal(2e4)}
-    posterior = Posterior(FELikelihood(model, measurements), prior)
-    assert posterior.parameter_names == [*PUSHED, "sigma_force"]
-
-    best = optimize.minimize(
-        lambda x: -posterior(np.append(x, sigma)), truth, method="Nelder-Mead", options=dict(xatol=1e-4, fatol=1e-3)
-    )
-    step = 1e-3
-    slopes = np.array([(model.simulate(truth + step * e) - model.simulate(truth - step * e))[0] for e in np.eye(3)])
-    information = slopes @ slopes.T / (2 * step * sigma) ** 2 + np.eye(3) / 0.4**2
-    away = best.x - truth
-    assert best.success and away @ information @ away < stats.chi2.ppf(1 - 1e-5, 3)
-    sd = np.sqrt(np.diag(np.linalg.inv(information)))
-    for shift in np.diag(6 * sd):
-        assert posterior(np.append(best.x, sigma)) > posterior(np.append(best.x + shift, sigma)) + 5
-    report = posterior.report()
-    assert report["failure_count"] == 0 and report["simulations"] > 50
-
-
 # --- failures --------------------------------------------------------------------------------------------------------
 
 
@@ -624,22 +474,6 @@ def test_a_load_beyond_all_capacity_fails(column, load):
         replace(column, axial_load=load).simulate(NOMINAL)
 
 
-def test_a_step_that_does_not_converge_is_reported(column):
-    hasty = replace(column, loading=column.loading.scale(20.0), max_iterations=2, halvings=0)
-    with pytest.raises(SimulationFailed, match=r"step \d+ of \d+ \(t = .* s\) did not converge, halved 0 times"):
-        hasty.simulate(NOMINAL)
-    patient = replace(hasty, halvings=10, max_iterations=20)
-    assert np.isfinite(patient.simulate(NOMINAL)).all()
-
-
-def test_retries_are_counted(column):
-    hasty = replace(column, loading=column.loading.scale(4.0), max_iterations=3)
-    history = hasty.history(PAPER)
-    assert history.retries > 0
-    usual = replace(hasty, max_iterations=20).simulate(PAPER)
-    assert rrmse(history["relative displacement"], usual[1]) < 0.05
-
-
 # --- wrong arguments -------------------------------------------------------------------------------------------------
 
 WRONG = [
@@ -661,14 +495,10 @@ WRONG = [
     (dict(n_points=8), "n_points between 2 and 7"),
     (dict(mesh=41), "even number"),
     (dict(mesh="strips"), "even number"),
-    (dict(mesh=(2,)), "Patches"),
-    (dict(mesh=(20, 0)), "Patches"),
     (dict(geometry="corotationnal"), "geometry"),
     (dict(substeps=0), "substeps"),
     (dict(max_increment=0.0), "max_increment"),
     (dict(penetration=-0.1), "penetration"),
-    (dict(max_iterations=0), "max_iterations"),
-    (dict(halvings=-1), "halvings"),
     (dict(tolerance=0.0), "tolerance"),
     (dict(parameters=("Ec", "Young")), "Young"),
     (dict(parameters=("Ec", "Ec")), "once"),
@@ -716,16 +546,8 @@ def test_displacements_in_millimetres_are_rejected(pushed):
 def test_wrong_arguments_are_rejected(column, change, words):
     ((name, value),) = change.items()
     with pytest.raises(ValueError, match="expected .*; got .*; .*") as error:
-        if name == "mesh" and isinstance(value, tuple):
-            change = dict(mesh=Patches(*value))
         varied(column, name, value) if name in ("concrete", "steel", "bars", "hoops") else replace(column, **change)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize("group", ["concrete", "steel", "bars", "hoops"])
-def test_parts_of_the_wrong_type_are_rejected(column, group):
-    with pytest.raises(ValueError, match=group.capitalize()):
-        replace(column, **{group: None})
 
 
 def test_damping_is_no_parameter_under_imposed_displacement():
@@ -747,7 +569,7 @@ def test_batches_of_the_wrong_shape(column, thetas):
 
 def test_limits_of_the_arguments_are_accepted(column):
     """Control: arguments at the limits of their ranges are accepted."""
-    for changes in (dict(cover=0.0), dict(mesh=4), dict(mesh=Patches(4, 1, 1)), dict(n_points=2), dict(n_points=7)):
+    for changes in (dict(cover=0.0), dict(mesh=4), dict(n_points=2), dict(n_points=7)):
         assert np.isfinite(replace(column, **changes).simulate(NOMINAL)).all()
     assert to_si(24.0, "ft").item() == pytest.approx(column.height)
 
@@ -763,8 +585,3 @@ def test_a_jump_of_the_steel_law_is_crossed(shared):
     finer = RCColumn.lhpost(record, substeps=2).history(theta).values[:2]
     error = np.sqrt(np.sum((response - finer) ** 2, axis=1) / np.sum(finer**2, axis=1))
     assert np.all(error < 0.02), error
-
-
-def test_docstring_lists_every_parameter_and_channel():
-    for name in (*PARAMETERS, *("acceleration", "displacement", "force")):
-        assert f"``{name}``" in RCColumn.__doc__ or f'``"{name}"``' in RCColumn.__doc__, name

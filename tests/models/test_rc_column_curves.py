@@ -20,9 +20,7 @@ REVERSALS = (0.05, -0.05, 0.1, -0.08)  # [m]; beyond, crushing cover has two sta
 def column():
     corners = np.array([0.0, *REVERSALS])
     history = np.interp(np.linspace(0.0, 4.0, 161), np.arange(5), corners)
-    arguments = dict(
-        parameters=("Ec", "Es", "ft"), geometry="linear", max_increment=1.0, tolerance=1e-11, element_tolerance=1e-13
-    )
+    arguments = dict(parameters=("Ec", "Es", "ft"), geometry="linear", max_increment=1.0, tolerance=1e-11)
     return RCColumn.lhpost(DisplacementHistory("cycles", history), **arguments)
 
 

@@ -14,17 +14,12 @@ from fe_likelihoods import (
     FELikelihood,
     Measurements,
     RCColumn,
-    TruncatedNormal,
     material_curves,
-    peak,
-    propagate,
-    rank_sensors,
-    read_columns,
 )
 from fe_likelihoods.models.circular_section import gauss_lobatto
+from fe_likelihoods.models.rc_column_analysis import PreparedColumn, run_column
 from fe_likelihoods.models.rc_column_outputs import Output, Sections, parse_outputs
-from fe_likelihoods.models.rc_column_parts import LowCycleFatigue, Patches
-from fe_likelihoods.models.rc_column_run import prepare_column, run_column
+from fe_likelihoods.models.rc_column_parts import LowCycleFatigue
 from fe_likelihoods.problems import bridge_column, bridge_column_data
 from fe_likelihoods.units import G0
 
@@ -164,7 +159,7 @@ def test_the_weight_of_the_column_acts():
     assert column.simulate([1.0])[0, 0] == pytest.approx(-1e6 - 2.5e4 * G0, rel=1e-9)  # half an element is at the base
 
 
-@pytest.mark.parametrize("changes", [{}, dict(fatigue=LowCycleFatigue(), mesh=Patches())])
+@pytest.mark.parametrize("changes", [{}, dict(fatigue=LowCycleFatigue())])
 def test_stresses_balance_the_forces_of_the_section(changes):
     """The stresses of all fibers of the base add up to axial force and moment: elastic, cracked and yielding."""
     column = pushed(*np.linspace(0.0, 0.2, 30), *np.linspace(0.2, -0.1, 30), axial_load=2e6, **changes)
@@ -172,9 +167,9 @@ def test_stresses_balance_the_forces_of_the_section(changes):
     fibers = np.concatenate([core, cover, bars])
     numbers = [*range(len(core) + len(cover)), *(-1 - k for k in range(len(bars)))]
     outputs = tuple(Output(str(k), "stress", "Pa", None, fiber=(0, k)) for k in numbers)
-    run = run_column(column, prepare_column(column, outputs), np.ones(1))
-    forces = np.array([run.outputs[str(k)] for k in numbers]) * fibers[:, 1:]
-    force, moment = run.history["base axial force"], run.history["base moment"]
+    history, found = run_column(column, PreparedColumn.of(column, outputs), np.ones(1))
+    forces = np.array([found[str(k)] for k in numbers]) * fibers[:, 1:]
+    force, moment = history["base axial force"], history["base moment"]
     np.testing.assert_allclose(forces.sum(axis=0), force, rtol=1e-9)
     np.testing.assert_allclose(-(forces * fibers[:, :1]).sum(axis=0), moment, atol=1e-9 * np.abs(moment).max())
     assert np.abs(moment).max() > 3e6, "control: bars yield"
@@ -196,23 +191,6 @@ def test_stresses_are_of_the_nearest_fiber():
         if name.endswith(str(-bar)):
             assert strain[2] > 2.0 * column.steel.fy / column.steel.es
             assert stress[2] == pytest.approx(column.steel.fy, rel=0.05)
-
-
-def test_new_sensors_are_data_predictions_and_candidates(rng):
-    record = bridge_column_data().record.trim(6.0, 8.0)
-    bar = RCColumn.lhpost(record).bar_circle_radius
-    places = ("displacement@1.8", "velocity@3.66", "acceleration@3.66", f"bar_stress@0:{bar:.3f}")
-    column = RCColumn.lhpost(record, outputs=places, column_mass=2e4, substeps=4)
-    truth = Measurements(column.channels, column.dt, column.simulate(np.ones(5)))
-    likelihood = FELikelihood(column, truth)
-    sigmas, theta = truth.values.std(axis=1) * 0.05, 1.0 + 0.1 * rng.standard_normal(5)
-    assert likelihood(np.append(np.ones(5), sigmas)) > likelihood(np.append(theta, sigmas)) + 1.0
-    samples = 1.0 + 0.05 * rng.standard_normal((6, 5))
-    drift = propagate(column, samples, quantity=peak("displacement@1.8"), noise=False, progress=False)
-    peaks = [np.abs(column.simulate(each)[0]).max() for each in samples]
-    np.testing.assert_allclose(drift.sd, np.std(peaks, ddof=0), rtol=0.2)
-    ranking = rank_sensors(column, {name: TruncatedNormal(1.0, 0.2) for name in column.parameter_names}, draws=2)
-    assert set(ranking.chosen) == set(places) and (ranking.alone > 0.0).all()
 
 
 def test_gravity_is_part_of_strains_and_axial_force():
@@ -244,11 +222,6 @@ def test_rotation_over_an_element_is_the_sum_of_the_element(n):
     np.testing.assert_allclose(halves, sections.integral(0.0, 6.0), atol=1e-12)
 
 
-def test_sensors_of_any_mesh_agree():
-    values = [pushed(0.0, 0.03, mesh=mesh, outputs=SENSORS).simulate([1.0])[:, 1] for mesh in (40, Patches())]
-    np.testing.assert_allclose(*values, rtol=0.02, atol=1.0)
-
-
 def test_sensors_are_data_and_predictions(shaken, rng):
     """A likelihood of strains and rotations, and bands of a curvature that was not measured."""
     thetas = 1.0 + 0.1 * rng.standard_normal((4, 5))
@@ -258,20 +231,6 @@ def test_sensors_are_data_and_predictions(shaken, rng):
     sigmas = truth.values.std(axis=1) * 0.05
     at_truth, elsewhere = (likelihood(np.append(theta, sigmas)) for theta in (np.ones(5), thetas[0]))
     assert at_truth > elsewhere + 1.0
-
-
-def test_sensors_are_read_from_a_table_with_their_units(shaken, tmp_path):
-    names = ("base_moment", "strain@0.3:-0.55", "curvature@0.3", "rotation@0:0.6")
-    units, factors = ("kN m", "microstrain", "1/km", "mrad"), (1e3, 1e-6, 1e-3, 1e-3)
-    column = replace(shaken, outputs=names)
-    response = column.simulate(np.ones(5))
-    table = np.vstack([shaken.dt * np.arange(shaken.n_steps), response / np.array(factors)[:, None]])
-    headers = [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
-    file = tmp_path / "sensors.csv"
-    np.savetxt(file, table.T, delimiter=",", header=",".join(["time [s]", *headers]), comments="", fmt="%.17g")
-    measured = read_columns(file, column.channels, headers, units)
-    np.testing.assert_allclose(measured.values, response, rtol=1e-12, atol=1e-18)
-    assert FELikelihood(column, measured).parameter_names[-1] == "sigma_rotation@0:0.6"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.models.isolated_bridge import IsolatedBridge
 from fe_likelihoods.models.isolated_bridge_channels import CHANNELS
-from fe_likelihoods.models.rc_column import Patches, RCColumn
+from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.plots.structures import plot_bridge
 from fe_likelihoods.problems import bridge_column_data, isolated_bridge_data
 from fe_likelihoods.signals.records import DisplacementHistory
@@ -67,9 +67,8 @@ def test_the_response_to_an_imposed_displacement_is_drawn_over_steps():
     np.testing.assert_allclose(top.lines[2].get_xdata(), history.displacement, atol=1e-12)
 
 
-@pytest.mark.parametrize("mesh", [40, Patches(20, 10, 2)])
-def test_section(record, mesh):
-    column = RCColumn.lhpost(record, mesh=mesh)
+def test_section(record):
+    column = RCColumn.lhpost(record)
     axes = plot_section(column)
     cover, core = axes.patches
     assert 2 * cover.radius == pytest.approx(48.0) and 2 * core.radius == pytest.approx(48.0 - 4.0 - 0.625)
@@ -78,13 +77,10 @@ def test_section(record, mesh):
     centers = np.array([path.get_extents().get_points().mean(axis=0) for path in bars.get_paths()])
     assert len(centers) == 18
     np.testing.assert_allclose(np.unique(np.round(centers[:, 0], 9)), np.unique(np.round(steel[:, 0] / 0.0254, 9)))
-    if mesh == 40:
-        edges = np.array([segment[0, 0] for segment in lines.get_segments()])
-        assert len(edges) == 39
-        inside = np.searchsorted(edges, concrete[:, 0] / 0.0254)
-        assert np.all(np.bincount(inside, minlength=40) <= 1), "no strip has two fibers of the core"
-    else:
-        assert len(lines.get_segments()) == 9 + 1 + 20
+    edges = np.array([segment[0, 0] for segment in lines.get_segments()])
+    assert len(edges) == 39
+    inside = np.searchsorted(edges, concrete[:, 0] / 0.0254)
+    assert np.all(np.bincount(inside, minlength=40) <= 1), "no strip has two fibers of the core"
     for low, high in (axes.get_xlim(), axes.get_ylim()):
         assert low < -cover.radius < cover.radius < high
     assert axes.get_xlabel() == "position in the direction of loading [in]"
