@@ -14,7 +14,7 @@ from fe_likelihoods.models.rc_column import RCColumn
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import misfit_batch
-from tests.opensees_column import INCH, KIP, peer_of, shake
+from tests.opensees_column import INCH, peer_of, shake
 
 from .rows import Row
 
@@ -41,7 +41,7 @@ def simulation(repeats: int) -> list[Row]:
     for case, (theta, scale) in CASES.items():
         record = bridge_column_data().record.scale(scale)
         usual = RCColumn.lhpost(record)
-        model = RCColumn.lhpost(record, tolerance=TOLERANCE * INCH, element_tolerance=1e-12 * KIP * INCH)
+        model = RCColumn.lhpost(record, tolerance=TOLERANCE * INCH)
         fibers = sum(map(len, model.section.fibers()))
         peer = peer_of(model, theta)
         response = model.simulate(theta)  # compile before the measurement

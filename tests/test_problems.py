@@ -59,14 +59,6 @@ def test_the_data_have_the_features_of_the_paper(data):
     assert abs(velocity[-1]) < 0.02 * np.abs(velocity).max()
 
 
-def test_the_data_say_that_they_are_synthetic(data):
-    assert "SYNTHETIC" in data.record.source
-    assert data.measurements.description.startswith("SYNTHETIC")
-    assert "NOT measured" in data.attributes["title"]
-    expected = dict(BRIDGE_COLUMN_MEANS) | {f"sigma_{name}": sigma for name, sigma in BRIDGE_COLUMN_NOISE.items()}
-    assert data.attributes["truth"] == pytest.approx(expected)
-
-
 def test_the_base_motion_can_be_made_again(data):
     record = make_bridge_column_eq1.base_motion()
     # Within round-off: logarithms and exponentials differ in the last digit from machine to machine.

@@ -229,7 +229,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         Key(
             "file",
             "text",
-            "Identified modes, instead of [measurements]: CSV, Excel or MATLAB (`read_modal_data`)",
+            "Identified modes, alone or beside other data: CSV, Excel or MATLAB (`read_modal_data`)",
             True,
         ),
         Key("unit", "text", 'Unit of the frequencies, if the file does not state it: "Hz" or "rad/s"'),
@@ -262,7 +262,7 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
         ),
     ),
     "load_test": (
-        Key("file", "text", "Load test, instead of [measurements]: CSV or Excel with a line for each load case", True),
+        Key("file", "text", "Load test, alone or beside other data: CSV or Excel with a line for each load case", True),
         Key("columns", "table of texts", "Channel = name of its column; by default the column of this name"),
         Key("units", "table of texts", "Channel = unit, if the file does not state it"),
         Key("cases", "text", "Column with the names of the load cases, or with positions; by default the first one"),
