@@ -76,6 +76,12 @@ _FREE = 2.0  # curvatures of the Hessian below this are the prior's, which is 1,
 _LONGEST = 4  # such directions along which steps are simulated
 _FAR = 2.0  # standard deviations that are simulated along such directions
 _DIP = 3.0  # depth of a valley in log-density that separates modes
+_SHARPEST = 1e18  # curvature at which a step of a standard deviation, 1e-9 of the prior's, is lost in rounding
+_EXACT = (
+    "the model reproduces the measurements exactly at {}, so the likelihood grows without bound as the standard "
+    "deviation of the noise goes to zero, and there is no posterior: add noise to synthetic measurements, or give the "
+    "standard deviation a prior that excludes zero (such as LogNormal), or a number"
+)
 
 
 class Derivatives(NamedTuple):
@@ -309,6 +315,8 @@ class _Climb:
         forms = self._target.archive.forms(self._target.archive.weights([*slopes, here.run]))
         gradient = 2.0 * forms[:-1, -1] @ weights - (here.coords - self._centre)
         hessian = _at_least_one(-2.0 * forms[:-1, :-1] @ weights + np.eye(len(slopes)))
+        if not np.abs(hessian).max() < _SHARPEST:
+            raise ValueError(_EXACT.format(self._target.at_median_noise(here.coords[None])[0, : len(slopes)]))
         self._known[self._number] = Ascent(*here, slopes, weights, gradient, hessian)
         return self._known[self._number]
 

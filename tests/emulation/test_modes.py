@@ -33,7 +33,7 @@ from fe_likelihoods.emulation.target import ResponseTarget
 from samplers import SamplingWarning, SMCSampler
 from samplers.judgement.guides import DOUBTED_SHARE
 
-from .problems import acts_late, free_vibration, misleading, symmetric, vibration
+from .problems import acts_late, free_vibration, misleading, noisy, symmetric, vibration
 
 
 def _log_density(posterior, coords):
@@ -315,6 +315,16 @@ def test_an_end_that_fits_only_the_first_part_worse_is_kept():
     """The model is not exact in its first part: there another region fits better, which the rest excludes."""
     search = find_modes(misleading(), seed=1)
     assert search.modes[0].parameters[0] == pytest.approx(0.8, abs=0.05)
+
+
+@pytest.mark.parametrize("noise", ["white", "marginal"])
+def test_measurements_without_noise_have_no_posterior(noise):
+    """The likelihood of a half-normal error grows without bound at the truth."""
+    posterior = vibration(noise)
+    likelihood = posterior.likelihood
+    exact = noisy(likelihood.model, sd=np.zeros(2))
+    with pytest.raises(ValueError, match="exactly at .*LogNormal"):
+        find_modes(Posterior(FELikelihood(likelihood.model, exact, likelihood.noise), posterior.prior), seed=1)
 
 
 def test_starts_must_be_a_whole_number():
