@@ -19,7 +19,7 @@ from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, dr
 from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
 from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal_faults import check_modes
-from .slow_motion import find_slow_faults
+from .slow_motion import find_slow_faults, supports_apart
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
 
@@ -43,7 +43,6 @@ FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
 # RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of one that is not (half of it)
 LARGE_ERROR, USELESS_ERROR = 0.5, 0.5**0.5
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
-LARGE_RATIO = 5.0  # of root mean squares; up to 2.5 between supports of two bridges, and 9.8 between m/s² and g
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
 # Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
@@ -120,18 +119,21 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
 
 
 def check_supports(model: Any) -> list[Finding]:
-    """Motions of the supports of one structure whose sizes differ as units do."""
+    """Supports of one structure whose slow motion has another sign or size than that of the others."""
     motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
-    levels = np.sqrt([np.square(each.acceleration).mean() for each in motions])
-    moving = [k for k, level in enumerate(levels) if level]
-    middle = float(np.median(levels[moving])) if moving else 0.0
-    far = [k for k in moving if not middle / LARGE_RATIO < levels[k] < middle * LARGE_RATIO]
-    if not far:
+    if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
-    shown = listed([f"{motions[k].name} ({levels[k] / middle:.2g} times)" for k in far])
-    text = f"The motion of a support is far larger or smaller than the motions of most supports: {shown}."
-    action = "Check the unit and the gain of its file."
-    return [Finding("A unit may be wrong", WRONG, text, action, {motions[k].name: levels[k] / middle for k in far})]
+    found = []
+    for k, gain in supports_apart([each.acceleration for each in motions], motions[0].dt).items():
+        unit = describe_unit(abs(gain), "acceleration")
+        kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
+        text = (
+            f"Where it is slow, the motion of {motions[k].name} is {gain:.2g} times the motion of the other supports"
+            f"{f', about the ratio of {unit}' if unit and gain > 0.0 else ''}; slow motions of one site are equal."
+        )
+        action = "Check sign, unit and gain of its file. If supports move so: nothing."
+        found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}))
+    return found
 
 
 def _where(names: Sequence[str], compared: Compared | Fit) -> str:
