@@ -6,8 +6,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import DIMENSIONS, to_si
-from .finding import CARE, WRONG, Finding
-from .steps import NOTHING, UNREAD
+from .finding import CARE, Finding
 
 __all__ = [
     "check_bandwidth",
@@ -16,7 +15,6 @@ __all__ = [
     "check_final_values",
     "check_interval_samples",
     "check_peaks",
-    "check_same_response",
     "check_scores",
     "check_unit_of_threshold",
     "note_assumed_noise",
@@ -95,18 +93,6 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
         "mean over whole periods, final_value(channel, samples=...) or damage_measures(settle=...)."
     )
     return [Finding("A final value still moves", CARE, text, action, numbers)]
-
-
-def check_same_response(difference: float | None) -> list[Finding]:
-    """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
-    if difference is None or difference > NOTHING:
-        return []
-    text = (
-        "The response equals the response to the motion of the calibration, so that the prediction repeats the "
-        "calibration."
-    )
-    action = f"{UNREAD} `check_model`, or `fe-likelihoods check`, finds this before a run."
-    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
 
 
 def note_assumed_noise(of_quantity: Mapping[Sequence[str], Sequence[str]]) -> list[Finding]:
