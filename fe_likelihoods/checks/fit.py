@@ -17,7 +17,7 @@ from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
 from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
-from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
 from .modal_faults import check_modes
 from .slow_motion import find_slow_faults, supports_apart
 from .steps import motions_to_replace
@@ -41,12 +41,10 @@ SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: 
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
 FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
 # RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of one that is not (half of it)
-LARGE_ERROR, USELESS_ERROR = 0.5, 0.5**0.5
+LARGE_ERROR, USELESS_ERROR = HALF, HALF**0.5
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
-# Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
-OFFSET = 0.5
 REVERSED = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
 CLOCKS = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
 
@@ -186,7 +184,7 @@ def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[flo
 
 
 def _check_offset(compared: Compared) -> list[Finding]:
-    """Channels whose residuals are mostly a constant, a slope or a parabola."""
+    """Channels whose residuals are mostly a constant, a slope or a parabola: 3 / n of n independent samples."""
     shares = {}
     for channel, measured, response in zip(
         compared.measurements.channels, compared.measurements.values, compared.responses[0], strict=True
@@ -195,7 +193,7 @@ def _check_offset(compared: Compared) -> list[Finding]:
         if len(residuals) >= FEWEST and residuals.any():
             smooth = np.polynomial.Legendre.fit(np.arange(len(residuals)), residuals, 2)(np.arange(len(residuals)))
             shares[channel.name] = float(np.square(smooth).sum() / np.square(residuals).sum())
-    large = {name: share for name, share in shares.items() if share > OFFSET}
+    large = {name: share for name, share in shares.items() if share > HALF}
     if not large:
         return []
     text = (

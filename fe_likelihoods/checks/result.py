@@ -12,7 +12,7 @@ from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, fit_data_sets
 from .failed_simulations import Failures, failures
-from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
+from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
 from .fit import (
     check_damping,
     check_other_events,
@@ -38,7 +38,6 @@ from .table import ParameterRow, parameter_rows
 __all__ = ["JudgedRun", "check_result", "check_run", "judge_run"]
 
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
-LARGE_FAILURE_SHARE = 0.05  # as much as a tail of a 90 % interval
 LARGEST_TEST, TEST_SECONDS = 0.05, 10.0  # of step and mesh: share of the simulations of the run, below which it is made
 
 
@@ -212,10 +211,6 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
         return [Finding("No verdict", CARE, text, "Run it again with this version.")]
     found, more = list(run.verdict.findings), run.verdict.more_simulations
-    if run.verdict.status != "converged" and not found:  # stored by version 0.2
-        text = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
-        severity = WRONG if run.verdict.status == "not usable" else CARE
-        found = [Finding("The sampling has limits", severity, text)]
     if found and more is None:
         action = "Compare with a second run of another seed and more walkers before you use the numbers."
         found.append(Finding("More simulations", NOTE, "How many more simulations are needed is not known.", action))
@@ -283,7 +278,7 @@ def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
         "not, a narrower prior saves these simulations."
     )
     largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
-    severity = CARE if largest > LARGE_FAILURE_SHARE else NOTE
+    severity = CARE if largest > TAIL else NOTE
     found = [Finding("Simulations failed", severity, text, action, {"share": largest})]
     said = run.verdict is not None and run.verdict.near_failures is not None
     return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)

@@ -11,7 +11,7 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
-from .finding import CARE, NOTE, Finding, by_severity
+from .finding import CARE, NOTE, TAIL, Finding, by_severity
 from .sensor_faults import SensorFault, find_sensor_faults
 
 __all__ = [
@@ -31,7 +31,6 @@ LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacemen
 SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
-LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
 def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
@@ -217,7 +216,7 @@ def _note_synthetic(description: str) -> list[Finding]:
 def check_gaps(noise: Any) -> list[Finding]:
     """Gaps in the measurements of a noise whose shares refer to the level of the measured part of a motion."""
     shares = noise.gap_shares() if hasattr(noise, "gap_shares") else {}
-    large = {name: share for name, share in shares.items() if share > LARGEST_GAP}
+    large = {name: share for name, share in shares.items() if share > TAIL}
     if not large:
         return []
     text = (

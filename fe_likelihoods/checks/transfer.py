@@ -6,7 +6,7 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import DIMENSIONS, to_si
-from .finding import CARE, Finding
+from .finding import CARE, HALF, Finding
 
 __all__ = [
     "check_bandwidth",
@@ -25,9 +25,6 @@ PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
 NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
-# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands
-HALF = 0.5
-FAR = 10.0  # factor beyond all values: no reader asks for a probability so close to 0 or 1
 
 
 def check_peaks(
@@ -148,14 +145,13 @@ def check_scores(texts: Iterable[str]) -> list[Finding]:
 
 
 def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
-    """Thresholds that are far from all values [SI], and among them in the unit of the channel."""
-    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
-    low, high = np.abs(values).min() / FAR, np.abs(values).max() * FAR
-    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
-    if not np.all(inside & outside):
+    """Thresholds that are beside all values [SI], and among them in the unit of the channel."""
+    shown, values = np.asarray(to_si(limits, channel.unit, channel.dimension)), np.abs(values)
+    inside = (shown >= values.min()) & (shown <= values.max())
+    if not np.all(inside & ((limits < values.min()) | (limits > values.max()))):
         return []
     text = (
-        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all predicted "
-        f"values (up to {np.abs(values).max():.3g}): is it in {channel.unit}?"
+        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and beside all predicted "
+        f"values (up to {values.max():.3g}): is it in {channel.unit}?"
     )
     return [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]
