@@ -67,8 +67,12 @@ class Compared:
     @cached_property
     def slow(self) -> dict[str, SlowMotion]:
         """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
-        is_history = not self.modal and self.measurements.is_history
-        return slow_motions(self.measurements, self.responses[self.draws]) if is_history else {}
+        return slow_motions(self.measurements, self.responses[self.draws]) if self.is_history else {}
+
+    @property
+    def is_history(self) -> bool:
+        """Whether there are samples along time, of which clocks, offsets and slow motions can be judged."""
+        return not self.modal and self.measurements.is_history
 
 
 class ModalFit(NamedTuple):

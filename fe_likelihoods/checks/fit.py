@@ -112,7 +112,7 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
             found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
     unexplained = all(each.severity != WRONG for each in found)
     for each in compared:
-        found += _check_offset(each) if each.fitted and each.measurements.is_history else []
+        found += _check_offset(each) if each.fitted and each.is_history else []
     return found + _check_errors(compared, unexplained) + [fault for each in modal for fault in check_modes(each)]
 
 

@@ -28,7 +28,6 @@ from .steps import (
     check_same_response,
     check_stronger_motion,
     halve_steps,
-    has_steps,
     motions_to_replace,
     not_tested,
     relative_difference,
@@ -232,17 +231,17 @@ class _BestFit(NamedTuple):
 
 def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _BestFit:
     """The error of step and mesh at the best fit, where a search for it takes a minute at most."""
-    n, test = len(posterior.likelihood.model.parameter_names), StepTest([], {})
+    n = len(posterior.likelihood.model.parameter_names)
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
     if limit < 10 * (n + 1):
         why = f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"
-        return _BestFit(not_tested(why) if has_steps(posterior.likelihood) else test)
+        return _BestFit(not_tested(posterior.likelihood, why))
     try:
         target, mode, searched = _search(stage, posterior, limit)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return _BestFit(not_tested(f"no fit was found: {error}") if has_steps(posterior.likelihood) else test)
+        return _BestFit(not_tested(posterior.likelihood, f"no fit was found: {error}"))
     if mode is None:
-        return _BestFit(not_tested("no fit was found") if has_steps(posterior.likelihood) else test, searched)
+        return _BestFit(not_tested(posterior.likelihood, "no fit was found"), searched)
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
     test = halve_steps(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)

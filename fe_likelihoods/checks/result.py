@@ -135,8 +135,8 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
     responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
-    slow, unknown = [], []
-    for each in (each for each in fits.compared if not each.modal and each.measurements.is_history):
+    slow, unknown, timed = [], [], has_steps(run.likelihood)
+    for each in (each for each in fits.compared if each.is_history):
         known = each.slow
         for channel in each.measurements.channels:
             where = f"{channel.name} ({each.title})" if each.title else channel.name
@@ -151,10 +151,10 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
         (
-            "Units, signs, clocks, swapped channels" if has_steps(run.likelihood) else "Units, signs, swapped channels",
+            f"Units, signs, {'clocks, ' if timed else ''}swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
-        *([slow_band] if has_steps(run.likelihood) else []),
+        *([slow_band] if timed else []),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 
@@ -186,7 +186,7 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
             found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
             unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
     test = StepTest([], {})
-    if not unread and not run.is_inconclusive and has_steps(run.likelihood):
+    if not unread and not run.is_inconclusive:
         test = _test_steps(run, simulate)
     test = StepTest(unread + test.findings, {"Motion": motion} | test.tests if has_steps(run.likelihood) else {})
     return test, run.likelihood.simulations - before + others
@@ -195,11 +195,11 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
 def _test_steps(run: FinishedRun, simulate: Any) -> StepTest:
     """The error of step and mesh, or why it was not tested."""
     if run.n_modes > 1:
-        return not_tested("the samples have several modes, which have no common standard deviation")
+        return not_tested(run.likelihood, "the samples have several modes, which have no common standard deviation")
     needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
     seconds = report["seconds"] / max(report["simulations"], 1)
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        return not_tested(f"the test takes {needed} simulations of {seconds:.2g} s")
+        return not_tested(run.likelihood, f"the test takes {needed} simulations of {seconds:.2g} s")
     return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
 

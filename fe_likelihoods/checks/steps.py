@@ -53,9 +53,9 @@ class StepTest(NamedTuple):
     tests: dict[str, str]
 
 
-def not_tested(why: str) -> StepTest:
-    """No test of step and mesh, and the reason."""
-    return StepTest([], {STEP: f"not tested: {why}"})
+def not_tested(likelihood: Any, why: str) -> StepTest:
+    """No test of step and mesh, and the reason; nothing where the data have no steps."""
+    return StepTest([], {STEP: f"not tested: {why}"} if has_steps(likelihood) else {})
 
 
 def has_steps(likelihood: Any) -> bool:
@@ -78,7 +78,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
         theta, at = point[columns], columns[:n]
         batch = simulate(likelihood.model, theta[:n] + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return not_tested(f"a simulation failed ({reason})")
+            return not_tested(posterior.likelihood, f"a simulation failed ({reason})")
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
         residuals = likelihood.residuals_of(response)
         parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.signals.records import DisplacementHistory, Record
 
 
@@ -123,7 +123,7 @@ class TestResample:
         assert record.resample(0.01) is record
 
     def test_real_record_keeps_its_spectrum(self, shared):
-        record = read_csv(shared / "records/loma_prieta_1989_apeel2_redwood_city_43.csv")
+        record = read_record(shared / "records/loma_prieta_1989_apeel2_redwood_city_43.csv")
         coarse = record.resample(0.02)
 
         def spectrum(each, frequency):
