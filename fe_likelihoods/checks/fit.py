@@ -16,8 +16,8 @@ from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
-from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
-from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
+from .data_faults import BETTER, EXPLAINED, Fault, describe_unit, find_faults
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
 from .modal_faults import check_modes
 from .slow_motion import find_slow_faults, supports_apart
 from .steps import motions_to_replace
@@ -39,9 +39,7 @@ __all__ = [
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
-FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
-# RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of one that is not (half of it)
-LARGE_ERROR, USELESS_ERROR = HALF, HALF**0.5
+LARGE_ERROR = HALF  # RRMSE of a channel that is hardly reproduced: a quarter of its power is left
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
@@ -97,7 +95,7 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     found, compared = [], list(compared)
     modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
-        faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
+        faults = find_faults(each.measurements, each.responses, each.parts)
         slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each.slow)}
         if any(fault.kind == "input lag" for fault in faults):  # of which the outputs' lags are a consequence
             slow = {key: fault for key, fault in slow.items() if key[0] != "lag"}
@@ -212,7 +210,7 @@ def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Findi
         errors = np.nan_to_num(relative_errors(each.measurements.values - each.responses, each.measurements.values))
         levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
         closest = int(np.argmin(levels))
-        if each.fitted and levels[closest] < BETTER_THAN_A_FIT * levels[0] and (errors[0] > LARGE_ERROR).any():
+        if each.fitted and levels[closest] < BETTER * levels[0] and (errors[0] > LARGE_ERROR).any():
             text = (
                 f"Another response that was simulated fits much better{f' ({each.title})' if each.title else ''}: its "
                 f"error (RRMSE) is {percent(levels[closest])}, and {percent(levels[0])} at the fit (geometric means "
@@ -226,8 +224,8 @@ def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Findi
                 far |= {place: error} if error > EXPLAINED else {}
             elif error > LARGE_ERROR:
                 noise = _is_noise(each.measurements.values[[row]] - each.responses[0, [row]])
-                useless |= {place: error} if error > USELESS_ERROR and not noise else {}
-                poor |= {place: error} if (error > USELESS_ERROR) == noise else {}
+                useless |= {place: error} if error**2 > HALF and not noise else {}
+                poor |= {place: error} if (error**2 > HALF) == noise else {}
 
     def shown(errors: dict[str, float]) -> str:
         return listed([f"{place} ({percent(error)})" for place, error in errors.items()])
@@ -328,10 +326,10 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
     far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
-    far = {name: distance for name, distance in far.items() if abs(distance) > FAR_FROM_PRIOR}
+    far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
     if far:
         text = (
-            f"The posterior mean of {listed(list(far))} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the "
+            f"The posterior mean of {listed(list(far))} is more than {SURE:.2g} standard deviations of the "
             "prior away from the mean of the prior: prior and data disagree."
         )
         action = (

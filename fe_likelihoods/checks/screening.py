@@ -28,7 +28,6 @@ __all__ = [
 
 # No horizontal ground acceleration above 2.8 g was recorded (Tsukidate 2011); responses leave room for impacts.
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
-SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
 
@@ -185,7 +184,7 @@ def _check_size(name: str, kind: str, peak: float) -> list[Finding]:
     """A peak [SI] whose size is not plausible; `kind` is "motion" or the dimension of a channel."""
     largest, unit = LARGEST_PEAKS.get(kind, (np.inf, ""))
     shown = from_si(peak, unit).item() if unit else 0.0
-    if shown <= largest and not (kind == "motion" and shown < SMALLEST_MOTION):
+    if shown <= largest:
         return []
     text = f"The peak of {name} is {shown:.3g} {unit}."
     action = "Check the unit of its file. A number without a unit is in SI units (m, m/s²)."

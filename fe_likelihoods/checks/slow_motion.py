@@ -13,14 +13,13 @@ no band is found, or measurement and response are not coherent there, nothing is
 
 from collections.abc import Mapping, Sequence
 from itertools import permutations
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
 from ..signals.channels import Measurements
 from .data_faults import FACTOR, Fault
-from .finding import SMALL_PROBABILITY
+from .finding import SURE
 from .sensor_faults import runs_of
 
 __all__ = ["FEWEST_DRAWS", "SlowMotion", "compare_slow_motion", "find_slow_faults", "slow_motions", "supports_apart"]
@@ -31,8 +30,9 @@ SMOOTH = 7  # lines of the spectrum over which powers are averaged, and fewest l
 TAPER = 0.05  # share of the record at either end
 FINE = 8  # lags per step
 LONGEST_LAG = 0.2  # share of the record
-COHERENT = 0.95  # from which gain and lag are looked at; 0.985 or more in 45 right fits of nine real structures
-ALIKE = 0.9  # coherence of two supports; in 14 lines at most, gains of 103 of 109 right pairs are then 0.74 to 1.36
+# Coherence from which gain and lag are looked at: 0.985 or more in 45 right fits of nine real structures. Two supports
+# have it in a band for 103 of 109 right pairs, with gains of 0.74 to 1.36 in its lowest 14 lines.
+COHERENT = 0.9
 LARGE_LAG = 0.025  # [s]; right fits have at most 0.02
 
 
@@ -54,8 +54,7 @@ class SlowMotion(NamedTuple):
         found = {"sign": np.nan} if self.gain < 0.0 else {}
         if abs(np.log(abs(self.gain))) > np.log(FACTOR):
             found["factor"] = abs(self.gain)
-        sure = NormalDist().inv_cdf(1.0 - 0.5 * SMALL_PROBABILITY)  # standard deviations
-        if abs(self.lag) > max(LARGE_LAG, 1.5 * self.step, sure * self.lag_error):
+        if abs(self.lag) > max(LARGE_LAG, 1.5 * self.step, SURE * self.lag_error):
             found["lag"] = self.lag
         return found
 
@@ -150,7 +149,7 @@ def supports_apart(motions: Sequence[np.ndarray], step: float) -> dict[int, floa
     for k, other in permutations(moving, 2):
         own, reference = (_smooth(np.abs(spectra[i]) ** 2) for i in (k, other))
         cross = np.abs(_smooth(spectra[k] * spectra[other].conj())) ** 2
-        band = _lowest_band(cross > ALIKE * own * reference, int(np.argmax(reference)))
+        band = _lowest_band(cross > COHERENT * own * reference, int(np.argmax(reference)))
         if band is not None:
             band = slice(band.start, min(band.stop, band.start + 2 * SMOOTH))
             gains[k].append(_in_band(spectra[k], spectra[other], band, n, step).gain)
