@@ -167,19 +167,13 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
     except NotImplementedError:  # a prior without draws
         return np.empty((0, posterior.ndim))
-    if seconds is None:
+    if seconds is None and posterior.report()["simulations"]:
         report = posterior.report()
-        cached = all(
-            part.simulator.are_stored(draws[:, columns][:, : part.simulator.n_structural]).all()
-            for part, columns in posterior.likelihood.parts()
-        )
-        if cached or report["simulations"]:
-            seconds = 0.0 if cached else report["seconds"] / report["simulations"]
-        else:
-            for row in draws[:2]:  # the first one may compile
-                start = time.perf_counter()
-                posterior.likelihood.log_likelihood(row)
-                seconds = time.perf_counter() - start
+        seconds = report["seconds"] / report["simulations"]
+    for row in draws[:2] if seconds is None else ():  # the first one may compile
+        start = time.perf_counter()
+        posterior.likelihood.log_likelihood(row)
+        seconds = time.perf_counter() - start
     return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 

@@ -211,10 +211,7 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
         return [Finding("No verdict", CARE, text, "Run it again with this version.")]
     found, more = list(run.verdict.findings), run.verdict.more_simulations
-    if found and more is None:
-        action = "Compare with a second run of another seed and more walkers before you use the numbers."
-        found.append(Finding("More simulations", NOTE, "How many more simulations are needed is not known.", action))
-    elif found and more > 0.0:
+    if found and more:
         text = f"At least about {more:.0f} more simulations are needed, possibly several times as many."
         found.append(Finding("More simulations", NOTE, text, "Raise max_simulations and run again."))
     return found
@@ -255,10 +252,6 @@ def _check_markov_chain(run: FinishedRun) -> list[Finding]:
         )
         action = "Continue it, or use SMCSampler for the same posterior."
         found.append(Finding("The chain is short", WRONG, text, action))
-    if run.discard == 0:
-        text = "All iterations are used, the first ones included, which depend on where the walkers started."
-        action = "Give report(..., discard=n) the number of iterations of the burn-in, if there was one."
-        found.append(Finding("No burn-in was left out", CARE, text, action))
     return found
 
 

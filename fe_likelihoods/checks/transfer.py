@@ -33,15 +33,13 @@ def check_peaks(
     """Peaks [SI] beyond the calibrated events' by a factor of two; `alone`: the parameters belong to one likelihood."""
     far, numbers = [], {}
     for name, value in predicted.items():
-        measured = [event[name] for event in calibrated if name in event]
-        if not measured or not max(measured) > 0.0:
-            continue
-        if value > PEAK_RATIO * max(measured):
-            numbers[name] = value / max(measured)
-            far.append(f"{name} ({numbers[name]:.2g} times the largest calibrated one)")
-        elif value < min(measured) / PEAK_RATIO:
-            numbers[name] = value / min(measured)
-            far.append(f"{name} ({numbers[name]:.2g} times the smallest calibrated one)")
+        measured = [event[name] for event in calibrated if event.get(name, 0.0) > 0.0]
+        nearest = min(max(value, min(measured)), max(measured)) if measured else value
+        if nearest and not 1.0 / PEAK_RATIO <= value / nearest <= PEAK_RATIO:
+            numbers[name] = value / nearest
+            far.append(
+                f"{name} ({numbers[name]:.2g} times the {'largest' if value > nearest else 'smallest'} calibrated one)"
+            )
     if not far:
         return []
     text = (
