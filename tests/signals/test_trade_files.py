@@ -107,13 +107,6 @@ def test_what_editors_and_transfers_do_changes_no_bit(tmp_path, form):
     assert not wrong
 
 
-def test_an_original_file_after_edits(shared, tmp_path):
-    content = (shared / "records/formats/0111a.smc").read_text(encoding="latin-1")
-    expected = read_record(shared / "records/formats/0111a.smc")
-    for edit in ("CRLF", "UTF-16 BE", "^Z", "zeros", "*** End Data ***"):
-        assert same(read(tmp_path, "a.smc", EDITS[edit](content)), expected), edit
-
-
 @pytest.mark.parametrize(
     "form", ["AT2", "SMC", "GeoNet", "K-NET", "ESM", "V2", "V2c", "V1", "AFAD", "eqsig", "RSPMatch"]
 )
