@@ -119,8 +119,9 @@ def check_supports(model: Any) -> list[Finding]:
     motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
     if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
-    found = []
-    for k, gain in supports_apart([each.acceleration for each in motions], motions[0].dt).items():
+    found, unknown = [], getattr(model, "inputs", ())  # whose gains are parameters of a `SensedModel`
+    apart = supports_apart([each.acceleration for each in motions], motions[0].dt)
+    for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
         unit = describe_unit(abs(gain), "acceleration")
         kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
         text = (

@@ -11,9 +11,12 @@ from fe_likelihoods import (
     HalfNormal,
     LinearOscillator,
     LinearStructure,
+    LogNormal,
     Measurements,
     Posterior,
     Record,
+    SensedModel,
+    Sensor,
     ShearFrame,
     Uniform,
     check_fit,
@@ -152,6 +155,8 @@ def test_a_support_with_another_gain_or_sign_is_named():
         (each,) = found(factor)
         assert (each.kind, each.severity) == (kind, "wrong"), factor
         assert each.numbers == {second.name: pytest.approx(factor, rel=0.2)}
+    halved = LinearStructure(BridgeDeck("deck"), [first, second.scale(0.5), third])
+    assert check_supports(SensedModel(halved, inputs={1: Sensor(gain=LogNormal(1.0, 0.5))})) == []
     other = motions(np.random.default_rng(8))[0]  # of another site: nothing is known
     assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other, other.scale(2.0)])) != []
     assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other.scale(2.0), third])) == []
