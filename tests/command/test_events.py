@@ -228,7 +228,7 @@ def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkey
         ('measured = "weaker.csv"', 'measured = "waker.csv"', "[events.weaker] measured: there is no file waker.csv"),
         ('measured = "weaker.csv"', 'zero = "1 s"', "[events.weaker] zero: this key has no effect without measured"),
         ("scale = 0.5", "factor = 0.5", "[events.weaker] factor: unknown key"),
-        ("[events.weaker]\nfile", "[events.weaker]\nformat", "[events.weaker] file: this key is missing"),
+        ("[events.weaker]\nfile", "[events.weaker]\ncolumn", "[events.weaker] file: this key is missing"),
         ("[events.weaker]", '[events."a/b"]', "[events.a/b]: expected a name of letters"),
     ],
 )
