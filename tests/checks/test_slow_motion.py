@@ -51,9 +51,9 @@ def later(values, steps):
     return np.concatenate([np.zeros(steps), values[: len(values) - steps]])
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    ("gain", "steps"), [(1.0, 0), (0.5, 0), (2.0, 0), (-1.0, 0), (9.80665, 0), (1.0, 5), (0.5, 40)]
+    ("seed", "gain", "steps"),
+    [(0, 1.0, 0), (1, 0.5, 0), (2, 2.0, 0), (3, -1.0, 0), (4, 9.80665, 0), (5, 1.0, 5), (6, 0.5, 40)],
 )
 def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps):
     rng = np.random.default_rng(seed)
