@@ -38,7 +38,7 @@ def spoil(values, fault):
             y[first : first + 50] = level[fault]
             return y, (first, first + 49)
         case "faint":  # noise that is large beside VANISHED, and white
-            y[first : first + 150] = 5e-3 * peak * np.random.default_rng(0).normal(size=150)
+            y[first : first + 150] = 1e-2 * peak * np.random.default_rng(0).normal(size=150)
             return y, (first, first + 149)
         case "spikes":
             y[[first, first + 300]] += [0.7 * peak, -1.5 * peak]
