@@ -11,6 +11,7 @@ from .finding import CARE, HALF, Finding
 __all__ = [
     "check_bandwidth",
     "check_coverage",
+    "check_emulator",
     "check_failed_samples",
     "check_final_values",
     "check_interval_samples",
@@ -117,6 +118,14 @@ def check_coverage(shares: Mapping[str, float], level: float) -> list[Finding]:
         "the response; and look for what the model lacks."
     )
     return [Finding("The measurements are outside of the band", CARE, text, action, missed)]
+
+
+def check_emulator(unexplained: float) -> list[Finding]:
+    """Whether an emulator leaves most of the variance of a number unexplained."""
+    if not unexplained > HALF:
+        return []
+    text = f"The emulator leaves {unexplained:.0%} of the variance unexplained."
+    return [Finding("The emulator is rough", CARE, text, "Use more simulations.", {"unexplained": unexplained})]
 
 
 def check_interval_samples(n_samples: int, needed: int, level: float) -> list[Finding]:
