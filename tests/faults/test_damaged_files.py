@@ -95,8 +95,8 @@ def test_tables(text, match, tmp_path):
 @pytest.mark.parametrize(
     ("header", "match"),
     [
-        ("NPTS=1 " * 30_000, "expected"),
-        ("1 1" + " " * 100_000 + "x", "expected"),
+        ("DT " + "NPTS=1 " * 30_000, "expected a header line"),
+        ("NPTS, DT\n1 1" + " " * 100_000 + "x", "expected a header line"),
         ("NPTS= " + "9" * 5000 + ", DT= .01", "a number with 5000 digits"),
         ("NPTS= 2, DT= 0" + "1" * 100_000 + "e999999", "positive|finite"),
     ],
