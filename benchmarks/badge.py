@@ -281,7 +281,7 @@ _FAULTS: dict[str, tuple[set[str], Callable[[_Event], _Event | None]]] = {
         _output(lambda y, _: np.clip(y, -0.4 * np.abs(y).max(), 0.4 * np.abs(y).max())),
     ),
     "dead half a second": (_STUCK, _output(lambda y, event: _held(y, event, 0.0))),
-    "stuck half a second": (_STUCK, _output(lambda y, event: _held(y, event, None))),
+    "stuck half a second": (_STUCK | {"A sensor is clipped"}, _output(lambda y, event: _held(y, event, None))),
     "motions 0.05 s early": (_CLOCK, _input(lambda a, dt: _later(a, -round(0.05 / dt)), all_supports=True)),
     "one end 0.1 s late": (_CLOCK, _input(lambda a, dt: _later(a, round(0.1 / dt)))),
     "one end, g read as m/s²": (_UNIT, _input(lambda a, _: a / 9.80665)),

@@ -21,7 +21,7 @@ from fe_likelihoods.problems import (
 )
 from fe_likelihoods.signals.channels import Channel, Measurements
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.units import G0, to_si
 from samplers import SMCSampler
 
@@ -226,7 +226,7 @@ def test_strong_shaking_does_not_fail(strong, rng):
 @pytest.mark.parametrize(("which", "n", "allowed"), [("prior", 400, 2), ("posterior", 400, 0)])
 def test_simulations_do_not_fail_on_the_real_record(shared, rng, which, n, allowed):
     """Simulations that fail inside the bulk of the posterior would bias it."""
-    record = read_csv(shared / "records" / REAL_RECORD).scale(0.85)
+    record = read_record(shared / "records" / REAL_RECORD).scale(0.85)
     model = RCColumn.lhpost(record)
     draws = bridge_column_prior().rvs(n, rng)[:, :5] if which == "prior" else draws_of_the_papers_posterior(n, rng)
     failed = [reason for part in np.split(draws, range(100, n, 100)) for reason in failures(model, part)]

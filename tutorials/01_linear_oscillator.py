@@ -68,8 +68,8 @@ def save(figure, name: str) -> None:
 # 1. The record
 # -------------
 #
-# A ``Record`` has a name, a time step and acceleration samples in m/s². The functions ``read_at2``, ``read_v2`` and
-# ``read_csv`` read your own records. Here we use the first 25 seconds of the bundled synthetic motion, resampled to
+# A ``Record`` has a name, a time step and acceleration samples in m/s². The function
+# ``read_record`` reads your own records. Here we use the first 25 seconds of the bundled synthetic motion, resampled to
 # 32 Hz; ``resample`` applies a low-pass filter before it increases the step. The response spectrum shows at which
 # periods the motion is strong: at one second, the period of our oscillator, it is 0.16 g for 5 % damping.
 

@@ -67,8 +67,12 @@ class Compared:
     @cached_property
     def slow(self) -> dict[str, SlowMotion]:
         """Channels that follow the draws of the prior where no parameter changes the response, see `slow_motions`."""
-        is_history = not self.modal and self.measurements.is_history
-        return slow_motions(self.measurements, self.responses[self.draws]) if is_history else {}
+        return slow_motions(self.measurements, self.responses[self.draws]) if self.is_history else {}
+
+    @property
+    def is_history(self) -> bool:
+        """Whether there are samples along time, of which clocks, offsets and slow motions can be judged."""
+        return not self.modal and self.measurements.is_history
 
 
 class ModalFit(NamedTuple):
@@ -163,15 +167,13 @@ def draws_to_compare(posterior: Posterior, seconds: float | None = None) -> np.n
         draws = posterior.sample_prior(MOST_DRAWS, np.random.RandomState(1))
     except NotImplementedError:  # a prior without draws
         return np.empty((0, posterior.ndim))
-    if seconds is None:
+    if seconds is None and posterior.report()["simulations"]:
         report = posterior.report()
-        if report["simulations"]:
-            seconds = report["seconds"] / report["simulations"]
-        else:
-            for row in draws[:2]:  # the first one may compile
-                start = time.perf_counter()
-                posterior.likelihood.log_likelihood(row)
-                seconds = time.perf_counter() - start
+        seconds = report["seconds"] / report["simulations"]
+    for row in draws[:2] if seconds is None else ():  # the first one may compile
+        start = time.perf_counter()
+        posterior.likelihood.log_likelihood(row)
+        seconds = time.perf_counter() - start
     return draws[: int(np.clip(SECONDS / max(seconds, 1e-6), FEWEST_DRAWS, MOST_DRAWS))]
 
 

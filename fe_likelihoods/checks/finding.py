@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable
+from statistics import NormalDist
 from typing import NamedTuple
 
 from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
@@ -9,8 +10,11 @@ from samplers.finding import CARE, NOTE, WRONG, Finding, by_severity
 __all__ = [
     "CARE",
     "CORRELATED",
+    "HALF",
     "NOTE",
     "SMALL_PROBABILITY",
+    "SURE",
+    "TAIL",
     "WRONG",
     "Finding",
     "Judgement",
@@ -22,6 +26,9 @@ __all__ = [
 ]
 
 SMALL_PROBABILITY = 0.01  # that chance explains what was found; of 100 independent tests of right results, one fails
+SURE = NormalDist().inv_cdf(1.0 - 0.5 * SMALL_PROBABILITY)  # standard deviations of a normal distribution
+TAIL = 0.05  # share of samples or draws that is as much as a tail of a 90 % interval
+HALF = 0.5  # of a power, or of what is inside a band: the other half is missed
 CORRELATED = "The errors are correlated"
 STATUS = {WRONG: "do not use", CARE: "use with care", NOTE: "use"}
 

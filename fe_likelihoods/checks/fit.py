@@ -16,10 +16,10 @@ from ..signals.error_measures import relative_errors
 from ..simulation.model import simulate_batch
 from ..text_tables import listed
 from .compared import ChannelFit, Compared, Fit, Fits, compare, data_sets_of, draws_to_compare
-from .data_faults import BETTER_THAN_A_FIT, EXPLAINED, Fault, describe_unit, find_faults
-from .finding import CARE, CORRELATED, NOTE, SMALL_PROBABILITY, WRONG, Finding, percent
+from .data_faults import BETTER, EXPLAINED, Fault, describe_unit, find_faults
+from .finding import CARE, CORRELATED, HALF, NOTE, SMALL_PROBABILITY, SURE, WRONG, Finding, percent
 from .modal_faults import check_modes
-from .slow_motion import find_slow_faults
+from .slow_motion import find_slow_faults, supports_apart
 from .steps import motions_to_replace
 from .table import Moments, ParameterRow, rows_of
 
@@ -39,15 +39,10 @@ __all__ = [
 
 SAME_AS_PRIOR = 0.9  # ratio of the standard deviations of posterior and prior: a fifth of the variance is gone
 NEAR_BOUND = 0.1  # distance of the 5 % or 95 % quantile from a bound, in 90 % intervals and in prior deviations
-FAR_FROM_PRIOR = 3.0  # standard deviations of the prior
-# RRMSE of a channel that is hardly reproduced (a quarter of its power is left), and of one that is not (half of it)
-LARGE_ERROR, USELESS_ERROR = 0.5, 0.5**0.5
+LARGE_ERROR = HALF  # RRMSE of a channel that is hardly reproduced: a quarter of its power is left
 LARGE_DAMPING = 0.3  # in 9 of 37 right fits of decks on abutments, and in 5 of 8 with a gain of one half
-LARGE_RATIO = 5.0  # of root mean squares; up to 2.5 between supports of two bridges, and 9.8 between m/s² and g
 WEAK = 0.2  # lag-one correlation that hardly changes intervals: (1 + 0.2^2) / (1 - 0.2^2) = 1.08 in the variance
 FEWEST = 10  # samples that the tests of correlation and distribution need
-# Share of the power of residuals in a constant, a slope and a parabola: 3 / n for n independent samples.
-OFFSET = 0.5
 REVERSED = "Where the sensor counts the other way, name it in `reversed` of [measurements], or change its sign."
 CLOCKS = "Check the time at which the base motion begins (zero in [measurements]) and the clocks; see `align`."
 
@@ -100,7 +95,7 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
     found, compared = [], list(compared)
     modal, compared = [each.modal for each in compared if each.modal], [each for each in compared if not each.modal]
     for each in compared:
-        faults = find_faults(each.measurements, each.responses, each.parts, fitted=each.fitted)
+        faults = find_faults(each.measurements, each.responses, each.parts)
         slow = {(fault.kind, *fault.names): (fault, band) for fault, band in find_slow_faults(each.slow)}
         if any(fault.kind == "input lag" for fault in faults):  # of which the outputs' lags are a consequence
             slow = {key: fault for key, fault in slow.items() if key[0] != "lag"}
@@ -115,23 +110,27 @@ def check_responses(compared: Iterable[Compared]) -> list[Finding]:
             found += [_of_a_fault(each, fault, CARE) for fault in before if fault.kind not in known]
     unexplained = all(each.severity != WRONG for each in found)
     for each in compared:
-        found += _check_offset(each) if each.fitted and each.measurements.is_history else []
+        found += _check_offset(each) if each.fitted and each.is_history else []
     return found + _check_errors(compared, unexplained) + [fault for each in modal for fault in check_modes(each)]
 
 
 def check_supports(model: Any) -> list[Finding]:
-    """Motions of the supports of one structure whose sizes differ as units do."""
+    """Supports of one structure whose slow motion has another sign or size than that of the others."""
     motions = motions_to_replace(model) if getattr(model, "supports", ()) else ()
-    levels = np.sqrt([np.square(each.acceleration).mean() for each in motions])
-    moving = [k for k, level in enumerate(levels) if level]
-    middle = float(np.median(levels[moving])) if moving else 0.0
-    far = [k for k in moving if not middle / LARGE_RATIO < levels[k] < middle * LARGE_RATIO]
-    if not far:
+    if len({(each.n_steps, each.dt) for each in motions}) != 1:
         return []
-    shown = listed([f"{motions[k].name} ({levels[k] / middle:.2g} times)" for k in far])
-    text = f"The motion of a support is far larger or smaller than the motions of most supports: {shown}."
-    action = "Check the unit and the gain of its file."
-    return [Finding("A unit may be wrong", WRONG, text, action, {motions[k].name: levels[k] / middle for k in far})]
+    found, unknown = [], getattr(model, "inputs", ())  # whose gains are parameters of a `SensedModel`
+    apart = supports_apart([each.acceleration for each in motions], motions[0].dt)
+    for k, gain in ((k, gain) for k, gain in apart.items() if k not in unknown):
+        unit = describe_unit(abs(gain), "acceleration")
+        kind = "A sign may be wrong" if gain < 0.0 else "A unit may be wrong" if unit else "A gain may be wrong"
+        text = (
+            f"Where it is slow, the motion of {motions[k].name} is {gain:.2g} times the motion of the other supports"
+            f"{f', about the ratio of {unit}' if unit and gain > 0.0 else ''}; slow motions of one site are equal."
+        )
+        action = "Check sign, unit and gain of its file. If supports move so: nothing."
+        found.append(Finding(kind, WRONG, text, action, {motions[k].name: gain}))
+    return found
 
 
 def _where(names: Sequence[str], compared: Compared | Fit) -> str:
@@ -184,7 +183,7 @@ def _of_a_fault(compared: Compared, fault: Fault, severity: str, band: tuple[flo
 
 
 def _check_offset(compared: Compared) -> list[Finding]:
-    """Channels whose residuals are mostly a constant, a slope or a parabola."""
+    """Channels whose residuals are mostly a constant, a slope or a parabola: 3 / n of n independent samples."""
     shares = {}
     for channel, measured, response in zip(
         compared.measurements.channels, compared.measurements.values, compared.responses[0], strict=True
@@ -193,7 +192,7 @@ def _check_offset(compared: Compared) -> list[Finding]:
         if len(residuals) >= FEWEST and residuals.any():
             smooth = np.polynomial.Legendre.fit(np.arange(len(residuals)), residuals, 2)(np.arange(len(residuals)))
             shares[channel.name] = float(np.square(smooth).sum() / np.square(residuals).sum())
-    large = {name: share for name, share in shares.items() if share > OFFSET}
+    large = {name: share for name, share in shares.items() if share > HALF}
     if not large:
         return []
     text = (
@@ -212,7 +211,7 @@ def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Findi
         errors = np.nan_to_num(relative_errors(each.measurements.values - each.responses, each.measurements.values))
         levels = np.exp(np.log(np.maximum(errors, 1e-3)).mean(axis=1))
         closest = int(np.argmin(levels))
-        if each.fitted and levels[closest] < BETTER_THAN_A_FIT * levels[0] and (errors[0] > LARGE_ERROR).any():
+        if each.fitted and levels[closest] < BETTER * levels[0] and (errors[0] > LARGE_ERROR).any():
             text = (
                 f"Another response that was simulated fits much better{f' ({each.title})' if each.title else ''}: its "
                 f"error (RRMSE) is {percent(levels[closest])}, and {percent(levels[0])} at the fit (geometric means "
@@ -226,8 +225,8 @@ def _check_errors(compared: Sequence[Compared], unexplained: bool) -> list[Findi
                 far |= {place: error} if error > EXPLAINED else {}
             elif error > LARGE_ERROR:
                 noise = _is_noise(each.measurements.values[[row]] - each.responses[0, [row]])
-                useless |= {place: error} if error > USELESS_ERROR and not noise else {}
-                poor |= {place: error} if (error > USELESS_ERROR) == noise else {}
+                useless |= {place: error} if error**2 > HALF and not noise else {}
+                poor |= {place: error} if (error**2 > HALF) == noise else {}
 
     def shown(errors: dict[str, float]) -> str:
         return listed([f"{place} ({percent(error)})" for place, error in errors.items()])
@@ -328,10 +327,10 @@ def check_parameters(rows: Sequence[ParameterRow], limits: Container[str] = ()) 
         action = "Do not report it as identified. A stronger excitation or another sensor may inform it."
         found.append(Finding("Not informed by the data", NOTE, text, action))
     far = {row.label: (row.mean - row.prior_mean) / row.prior_sd for row in rows}
-    far = {name: distance for name, distance in far.items() if abs(distance) > FAR_FROM_PRIOR}
+    far = {name: distance for name, distance in far.items() if abs(distance) > SURE}
     if far:
         text = (
-            f"The posterior mean of {listed(list(far))} is more than {FAR_FROM_PRIOR:.0f} standard deviations of the "
+            f"The posterior mean of {listed(list(far))} is more than {SURE:.2g} standard deviations of the "
             "prior away from the mean of the prior: prior and data disagree."
         )
         action = (

@@ -12,12 +12,11 @@ from scipy.stats import chi2
 
 from ..text_tables import listed
 from .data_faults import FACTOR, SAME_UNITS
-from .finding import CARE, SMALL_PROBABILITY, WRONG, Finding
+from .finding import CARE, SMALL_PROBABILITY, TAIL, WRONG, Finding
 
 __all__ = ["check_modes"]
 
 RESEMBLES = 0.5  # MAC; one shape cannot have more than this with two orthogonal ones
-CHANGES = 0.05  # share of the samples with another pairing that is reported, as much as a tail of a 90 % interval
 # Mean MAC of the best draw that asks for a fault of a sensor, and the share of 1 - MAC that is left without it: in
 # 0 of 120 right and 231 of 240 wrong cases (shear frames, shape errors of 0.02 and 0.1).
 POOR, MENDED = 0.97, 0.4
@@ -153,7 +152,7 @@ def _check_pairs(modes: Any) -> list[Finding]:
     found = []
     for k, numbers in enumerate(modes.numbers.T):
         values, counts = np.unique(numbers, return_counts=True)
-        if len(values) > 1 and counts.max() < (1.0 - CHANGES) * len(numbers):
+        if len(values) > 1 and counts.max() < (1.0 - TAIL) * len(numbers):
             shares = ", ".join(f"{v} ({c / len(numbers):.0%})" for v, c in zip(values, counts, strict=True))
             text = f"The measured mode {_number(modes, k)} is paired with different computed modes: {shares}."
             action = "The posterior may have several regions; more sensors tell the shapes apart."

@@ -18,28 +18,23 @@ from ..likelihood.likelihood import FELikelihood
 from ..likelihood.posterior import Posterior
 from ..noise.gaussian import GaussianNoise
 from ..priors.distributions import HalfNormal
-from ..signals.events import Events
-from ..signals.records import Record
 from ..simulation.model import SimulationBatch, simulate_batch
 from .finding import CARE, WRONG, Finding, by_severity
 from .fit import check_responses, check_supports, compare, draws_to_compare
 from .screening import check_data, check_gaps
 from .steps import (
     NOTHING,
-    UNREAD,
     StepTest,
+    check_same_response,
     check_stronger_motion,
     halve_steps,
-    has_steps,
     motions_to_replace,
     not_tested,
     relative_difference,
-    under,
 )
 
 __all__ = ["ModelCheck", "check_model", "refuse_chance"]
 
-LATE_SHARE = 0.05  # of a motion, by which it is shifted
 SECONDS = 60.0  # of the search for the best fit
 MOST_SEARCHED = 150  # simulations of this search
 
@@ -78,10 +73,9 @@ class _Stage:
 def check_model(posterior: Posterior, events: Mapping[str, Any] | None = None, *, progress: bool = False) -> ModelCheck:
     """Try the model and the data of a posterior before a run.
 
-    It simulates the mean of the prior twice, under twice the motion, a later motion and the motions of other events,
-    and draws of the prior, which are compared with the measurements as in `fe_likelihoods.check_fit`. Where time
-    permits (a minute), it searches for the best fit, and halves step and mesh there. `fe_likelihoods.check_data` looks
-    at the data.
+    It simulates the mean of the prior twice, under twice the motion and the motion of another event, and draws of the
+    prior, which are compared with the measurements as in `fe_likelihoods.check_fit`. Where time permits (a minute), it
+    searches for the best fit, and halves step and mesh there. `fe_likelihoods.check_data` looks at the data.
 
     Parameters
     ----------
@@ -206,48 +200,24 @@ def _check_failures(posterior: Posterior) -> list[Finding]:
     return [Finding("Simulations failed", CARE, text, action, {"count": report["failure_count"]})]
 
 
-def _later(record: Record, steps: int) -> Record:
-    """The record after a number of zeros, with its length."""
-    zeros = np.zeros(steps)
-    return Record(record.name, record.dt, np.concatenate([zeros, record.acceleration[:-steps]]), record.source)
-
-
 def _check_motions(
     stage: _Stage, model: Any, theta: np.ndarray, response: np.ndarray, events: Mapping[str, Any]
 ) -> list[Finding]:
-    """Whether the response follows the motion: twice the motion, a later motion, and other events."""
-    motions = motions_to_replace(model)
+    """Whether the response follows the motion: twice the motion, and one other event; all are read in the same way."""
     found = check_stronger_motion(model, theta, response, stage.simulate)
-    if not motions or any(each.severity == WRONG for each in found):
+    if not motions_to_replace(model) or any(each.severity == WRONG for each in found):
         return found
-    dt = motions[0].dt
-    every = max(1, round(model.dt / dt))
-    steps = every * max(1, round(LATE_SHARE * motions[0].n_steps / every))
-    if not isinstance(motions[0], Events) and steps < motions[0].n_steps // 2:
-        later = stage.simulate(under(model, lambda each: _later(each, steps)), theta[None])
-        late, k = later.response[0], steps // every
-        if not later.reasons[0] and late.shape == response.shape and k < response.shape[1]:
-            moved = relative_difference(late[:, k:] - response[:, :-k], response[:, :-k])
-            stayed = relative_difference(late - response, response)
-            if moved > stayed:
-                text = (
-                    f"Under a motion that begins {steps * dt:.3g} s later, the response does not move with it "
-                    f"(difference {100.0 * moved:.2g} %, and {100.0 * stayed:.2g} % to the response that stays)."
-                )
-                found.append(Finding("The response does not follow the motion", WRONG, text, UNREAD))
-    for name, record in events.items():
+    for name, record in list(events.items())[:1]:
         other = model.with_record(record)
         batch = stage.simulate(other, theta[None])
         if batch.reasons[0]:
             text = f"Event {name}: the simulation at the mean of the prior fails: {batch.reasons[0]}."
             found.append(Finding("An event fails", CARE, text, "Check its motion and the steps of the model."))
-            continue
-        n = min(batch.response.shape[2], response.shape[1])
-        same = relative_difference(batch.response[0][:, :n] - response[:, :n], response[:, :n]) <= NOTHING
-        if same and other.fingerprint != model.fingerprint:
-            text = f"Event {name} gives the same response as the motion of the calibration."
-            found.append(Finding("An event changes nothing", WRONG, text, UNREAD))
-        break  # one event suffices: they are all read in the same way
+        elif other.fingerprint != model.fingerprint:
+            n = min(batch.response.shape[2], response.shape[1])
+            found += check_same_response(
+                relative_difference(batch.response[0][:, :n] - response[:, :n], response[:, :n]), name
+            )
     return found
 
 
@@ -261,17 +231,17 @@ class _BestFit(NamedTuple):
 
 def _check_best_fit(stage: _Stage, posterior: Posterior, seconds: float) -> _BestFit:
     """The error of step and mesh at the best fit, where a search for it takes a minute at most."""
-    n, test = len(posterior.likelihood.model.parameter_names), StepTest([], {})
+    n = len(posterior.likelihood.model.parameter_names)
     limit = min(MOST_SEARCHED, SECONDS / max(seconds, 1e-6))
     if limit < 10 * (n + 1):
         why = f"the test takes about {15 * (n + 1)} simulations of {seconds:.2g} s, in the run"
-        return _BestFit(not_tested(why) if has_steps(posterior.likelihood) else test)
+        return _BestFit(not_tested(posterior.likelihood, why))
     try:
         target, mode, searched = _search(stage, posterior, limit)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return _BestFit(not_tested(f"no fit was found: {error}") if has_steps(posterior.likelihood) else test)
+        return _BestFit(not_tested(posterior.likelihood, f"no fit was found: {error}"))
     if mode is None:
-        return _BestFit(not_tested("no fit was found") if has_steps(posterior.likelihood) else test, searched)
+        return _BestFit(not_tested(posterior.likelihood, "no fit was found"), searched)
     factor = np.linalg.cholesky(mode.covariance)
     around = target.parameters(mode.coords + np.random.default_rng(1).standard_normal((400, len(factor))) @ factor.T)
     test = halve_steps(target.posterior, mode.parameters, around.std(axis=0), stage.simulate)

@@ -12,7 +12,7 @@ from ..signals.events import find_events
 from ..simulation.model import SimulationBatch, simulate_batch
 from .compared import Fits, fit_data_sets
 from .failed_simulations import Failures, failures
-from .finding import CARE, NOTE, WRONG, Finding, Judgement, judge
+from .finding import CARE, NOTE, TAIL, WRONG, Finding, Judgement, judge
 from .fit import (
     check_damping,
     check_other_events,
@@ -38,7 +38,6 @@ from .table import ParameterRow, parameter_rows
 __all__ = ["JudgedRun", "check_result", "check_run", "judge_run"]
 
 FEW_SAMPLES = 80.0  # effective, below which the ends of a 90 % interval rest on fewer than four samples each
-LARGE_FAILURE_SHARE = 0.05  # as much as a tail of a 90 % interval
 LARGEST_TEST, TEST_SECONDS = 0.05, 10.0  # of step and mesh: share of the simulations of the run, below which it is made
 
 
@@ -136,8 +135,8 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
     checked = [each for fit in fits.fits for each in fit.channels if each.checks is not None]
     sampling = "by the sampler" if run.tempered else "the length of the chain alone: a Markov chain gives no verdict"
     responses = max((len(each.modal.points if each.modal else each.responses) for each in fits.compared), default=0)
-    slow, unknown = [], []
-    for each in (each for each in fits.compared if not each.modal and each.measurements.is_history):
+    slow, unknown, timed = [], [], has_steps(run.likelihood)
+    for each in (each for each in fits.compared if each.is_history):
         known = each.slow
         for channel in each.measurements.channels:
             where = f"{channel.name} ({each.title})" if each.title else channel.name
@@ -152,10 +151,10 @@ def _tests(run: FinishedRun, fits: Fits, failed: Failures) -> list[tuple[str, st
         ("Sampling", sampling),
         ("Failed simulations", f"not tested: {failed.unknown}" if failed.unknown else f"{failed.attempts} simulations"),
         (
-            "Units, signs, clocks, swapped channels" if has_steps(run.likelihood) else "Units, signs, swapped channels",
+            f"Units, signs, {'clocks, ' if timed else ''}swapped channels",
             f"{responses} responses were compared" if responses else "not tested: there is no response to compare",
         ),
-        *([slow_band] if has_steps(run.likelihood) else []),
+        *([slow_band] if timed else []),
         ("Residuals", f"channels: {len(checked)}" if checked else "not tested: there are none"),
     ]
 
@@ -187,7 +186,7 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
             found = check_stronger_motion(likelihood.model, theta, batch.response[0], simulate)
             unread += [each for each in found if each.severity == WRONG]  # failures are said where they are predicted
     test = StepTest([], {})
-    if not unread and not run.is_inconclusive and has_steps(run.likelihood):
+    if not unread and not run.is_inconclusive:
         test = _test_steps(run, simulate)
     test = StepTest(unread + test.findings, {"Motion": motion} | test.tests if has_steps(run.likelihood) else {})
     return test, run.likelihood.simulations - before + others
@@ -196,11 +195,11 @@ def _check_model(run: FinishedRun) -> tuple[StepTest, int]:
 def _test_steps(run: FinishedRun, simulate: Any) -> StepTest:
     """The error of step and mesh, or why it was not tested."""
     if run.n_modes > 1:
-        return not_tested("the samples have several modes, which have no common standard deviation")
+        return not_tested(run.likelihood, "the samples have several modes, which have no common standard deviation")
     needed, report = simulations_of_the_test(run.posterior), run.posterior.report()
     seconds = report["seconds"] / max(report["simulations"], 1)
     if needed > LARGEST_TEST * report["simulations"] and needed * seconds > TEST_SECONDS:
-        return not_tested(f"the test takes {needed} simulations of {seconds:.2g} s")
+        return not_tested(run.likelihood, f"the test takes {needed} simulations of {seconds:.2g} s")
     return halve_steps(run.posterior, run.centre, run.samples.std(axis=0), simulate)
 
 
@@ -212,14 +211,7 @@ def _check_sampling(run: FinishedRun) -> list[Finding]:
         text = "The file of this run holds no verdict, so nothing is known about its convergence."
         return [Finding("No verdict", CARE, text, "Run it again with this version.")]
     found, more = list(run.verdict.findings), run.verdict.more_simulations
-    if run.verdict.status != "converged" and not found:  # stored by version 0.2
-        text = " ".join(f"{reason[0].upper()}{reason[1:]}." for reason in run.verdict.reasons)
-        severity = WRONG if run.verdict.status == "not usable" else CARE
-        found = [Finding("The sampling has limits", severity, text)]
-    if found and more is None:
-        action = "Compare with a second run of another seed and more walkers before you use the numbers."
-        found.append(Finding("More simulations", NOTE, "How many more simulations are needed is not known.", action))
-    elif found and more > 0.0:
+    if found and more:
         text = f"At least about {more:.0f} more simulations are needed, possibly several times as many."
         found.append(Finding("More simulations", NOTE, text, "Raise max_simulations and run again."))
     return found
@@ -260,10 +252,6 @@ def _check_markov_chain(run: FinishedRun) -> list[Finding]:
         )
         action = "Continue it, or use SMCSampler for the same posterior."
         found.append(Finding("The chain is short", WRONG, text, action))
-    if run.discard == 0:
-        text = "All iterations are used, the first ones included, which depend on where the walkers started."
-        action = "Give report(..., discard=n) the number of iterations of the burn-in, if there was one."
-        found.append(Finding("No burn-in was left out", CARE, text, action))
     return found
 
 
@@ -283,7 +271,7 @@ def _check_failures(run: FinishedRun, failed: Failures) -> list[Finding]:
         "not, a narrower prior saves these simulations."
     )
     largest = max(share, failed.prior_failed / max(failed.prior_draws, 1))
-    severity = CARE if largest > LARGE_FAILURE_SHARE else NOTE
+    severity = CARE if largest > TAIL else NOTE
     found = [Finding("Simulations failed", severity, text, action, {"share": largest})]
     said = run.verdict is not None and run.verdict.near_failures is not None
     return found if said or (run.is_inconclusive and not run.tempered) else found + check_failed_region(failed.near)

@@ -11,7 +11,7 @@ import numpy as np
 from ..signals.channels import Measurements
 from ..signals.records import Record
 from ..units import from_si
-from .finding import CARE, NOTE, Finding, by_severity
+from .finding import CARE, NOTE, TAIL, Finding, by_severity
 from .sensor_faults import SensorFault, find_sensor_faults
 
 __all__ = [
@@ -29,11 +29,9 @@ __all__ = [
 
 # No horizontal ground acceleration above 2.8 g was recorded (Tsukidate 2011); responses leave room for impacts.
 LARGEST_PEAKS = {"motion": (3.0, "g"), "acceleration": (20.0, "g"), "displacement": (10.0, "m")}
-SMALLEST_MOTION = 1e-6  # [g], the noise of an accelerometer
 SHORT_STEP = 1e-3  # [s]: accelerations below the top are then right to about 4 %
 MOST_PLACES = 3  # that a finding lists; the line for the TOML file has all
 REAL_PHASES = 10.0  # [deg]: the modal assurance of a complex shape and its real part is the squared cosine, 0.97
-LARGEST_GAP = 0.05  # share of the samples that may be missing within a motion whose level a noise follows
 
 
 def check_data(measurements: Measurements, record: Record | Sequence[Record] | None = None) -> tuple[Finding, ...]:
@@ -188,7 +186,7 @@ def _check_size(name: str, kind: str, peak: float) -> list[Finding]:
     """A peak [SI] whose size is not plausible; `kind` is "motion" or the dimension of a channel."""
     largest, unit = LARGEST_PEAKS.get(kind, (np.inf, ""))
     shown = from_si(peak, unit).item() if unit else 0.0
-    if shown <= largest and not (kind == "motion" and shown < SMALLEST_MOTION):
+    if shown <= largest:
         return []
     text = f"The peak of {name} is {shown:.3g} {unit}."
     action = "Check the unit of its file. A number without a unit is in SI units (m, m/s²)."
@@ -219,7 +217,7 @@ def _note_synthetic(description: str) -> list[Finding]:
 def check_gaps(noise: Any) -> list[Finding]:
     """Gaps in the measurements of a noise whose shares refer to the level of the measured part of a motion."""
     shares = noise.gap_shares() if hasattr(noise, "gap_shares") else {}
-    large = {name: share for name, share in shares.items() if share > LARGEST_GAP}
+    large = {name: share for name, share in shares.items() if share > TAIL}
     if not large:
         return []
     text = (

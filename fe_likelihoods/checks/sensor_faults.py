@@ -17,6 +17,7 @@ STILL = 5  # steps for which an extremum may stand still, and steps beside it; r
 ACTIVE, DIGITS = 0.02, 3.0  # the steps beside, in usual and in smallest steps; right: 0.02 (8 smallest), 0.11 (4)
 CLIPPED = 3  # equal samples at the largest or smallest value; right channels: 2
 LONG, VANISHED = 1.5, 10.0  # for so many periods a signal is never so much smaller than beside; right: 5.8
+FAINT = 4.0  # the same for white noise; right: 2.5
 SPIKE = 18.0  # ratio to the errors of interpolation around it; right channels: 15.9
 LEVEL = 0.02  # smallest mean of a tenth of a channel, or change of such means, in peaks; right channels: 0.012
 SMOOTH = 0.9  # share of the variance of these means in a polynomial; right channels: 0.8
@@ -124,13 +125,14 @@ def _stuck(x: np.ndarray) -> tuple[tuple[int, int], ...]:
     if len(x) > 2 * (length + beside):
         quiet, sides = _moving_deviation(x, length), _moving_deviation(x, beside)
         for least in MATTERS * 2.0 ** np.arange(4):
-            for start, stop in runs_of(quiet <= least * level / VANISHED):
-                first, after = start, stop - 1 + length
-                if first >= beside and after + beside <= len(x):
+            for ratio in (VANISHED, FAINT):
+                for start, stop in runs_of(quiet <= least * level / ratio):
+                    first, after = start, stop - 1 + length
+                    if first < beside or after + beside > len(x) or still[start:stop].any():
+                        continue
                     found = np.minimum(sides[first - beside], sides[after])
-                    still[first:after] |= bool(
-                        np.isfinite(found) and found >= least * level and not still[start:stop].any()
-                    )
+                    noisy = ratio == VANISHED or _correlation(x[first:after]) < WHITE
+                    still[first:after] |= bool(np.isfinite(found) and found >= least * level and noisy)
     return tuple((first, stop - 1) for first, stop in runs_of(still))
 
 
@@ -205,4 +207,4 @@ def _baseline(x: np.ndarray, dimension: str) -> tuple[float, ...]:
 def _correlation(x: np.ndarray) -> float:
     """Largest autocorrelation at the first lags, without sign."""
     x = np.where(np.isfinite(x), x - np.nanmean(x), 0.0)
-    return max(abs(float(x[k:] @ x[:-k])) for k in range(1, 7)) / float(x @ x)
+    return max(abs(float(x[k:] @ x[:-k])) for k in range(1, 7)) / max(float(x @ x), 1e-300)

@@ -23,8 +23,8 @@ from .finding import CARE, WRONG, Finding
 
 __all__ = [
     "NOTHING",
-    "UNREAD",
     "StepTest",
+    "check_same_response",
     "check_stronger_motion",
     "has_steps",
     "motions_to_replace",
@@ -40,7 +40,6 @@ __all__ = [
 SHIFT, LARGE_SHIFT = 0.5, 2.0
 LARGE_SHARE = 0.1  # of the prior's standard deviation: no shift that is smaller makes a result wrong
 NOTHING = 1e-6  # difference of two responses, relative to their norm, well above the round-off of a long response
-UNREAD = "Check that the model reads the motion that it is given, and not one file that is always the same."
 STEP, MESH = "Time step", "Mesh"
 
 Simulate = Callable[[Any, np.ndarray], SimulationBatch]
@@ -54,9 +53,9 @@ class StepTest(NamedTuple):
     tests: dict[str, str]
 
 
-def not_tested(why: str) -> StepTest:
-    """No test of step and mesh, and the reason."""
-    return StepTest([], {STEP: f"not tested: {why}"})
+def not_tested(likelihood: Any, why: str) -> StepTest:
+    """No test of step and mesh, and the reason; nothing where the data have no steps."""
+    return StepTest([], {STEP: f"not tested: {why}"} if has_steps(likelihood) else {})
 
 
 def has_steps(likelihood: Any) -> bool:
@@ -79,7 +78,7 @@ def halve_steps(posterior: Posterior, point: np.ndarray, sd: np.ndarray, simulat
         theta, at = point[columns], columns[:n]
         batch = simulate(likelihood.model, theta[:n] + np.vstack([np.zeros(n), np.diag(sd[at])]))
         if reason := next(filter(None, batch.reasons), ""):
-            return not_tested(f"a simulation failed ({reason})")
+            return not_tested(posterior.likelihood, f"a simulation failed ({reason})")
         response, slopes = batch.response[0], batch.response[1:] - batch.response[0]
         residuals = likelihood.residuals_of(response)
         parts.append((at, response, slopes, np.sqrt(np.nanmean(np.square(residuals), axis=1))))
@@ -111,10 +110,19 @@ def check_stronger_motion(model: Any, theta: np.ndarray, response: np.ndarray, s
     if batch.reasons[0]:
         text = f"Under twice the base motion the simulation fails: {batch.reasons[0]}."
         return [Finding("A stronger motion fails", CARE, text, "Predictions of stronger events may fail as well.")]
-    if relative_difference(batch.response[0] - response, response) > NOTHING:
+    return check_same_response(relative_difference(batch.response[0] - response, response), "twice the motion")
+
+
+def check_same_response(difference: float | None, motion: str = "this motion") -> list[Finding]:
+    """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
+    if difference is None or difference > NOTHING:
         return []
-    text = "Twice the base motion gives the same response: the model does not use the motion that it is given."
-    return [Finding("The motion changes nothing", WRONG, f"{text} Predictions of other events repeat it.", UNREAD)]
+    text = (
+        f"The response to {motion} equals the response to the motion of the calibration: the model does not use the "
+        "motion that it is given, and predictions of other events repeat the calibration."
+    )
+    action = "Check that the model reads the motion that it is given, and not one file that is always the same."
+    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
 
 
 def relative_difference(difference: np.ndarray, reference: np.ndarray) -> float:

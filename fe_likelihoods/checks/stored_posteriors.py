@@ -5,15 +5,13 @@ from typing import Protocol
 
 import numpy as np
 
-from .finding import CARE, Finding
+from .finding import CARE, SMALL_PROBABILITY, Finding
 
 __all__ = ["check_equal_ratios", "check_impossible_draws", "check_new_test", "check_reweighting"]
 
 # Limits with study `hierarchy_warnings` of docs/results.rst, where the exact result is known.
 LARGEST_SHAPE = 0.8  # Pareto shape; up to here, right results have it as well
 HARMLESS_ERROR = 0.15  # of the means [posterior sd], up to which uneven weights and mixtures do no harm
-FEWEST_EFFECTIVE = 20.0  # samples of a test, by its weights
-OUTSIDE = 0.01  # of the draws of a new test or event, which may be a fifth of a tail of 5 %
 
 
 class _Reweighted(Protocol):
@@ -36,28 +34,21 @@ def check_reweighting(tests: Mapping[str, _Reweighted], error: float, parameters
             )
             action = f"Sample this test again with a wider prior of {', '.join(parameters)}."
             found.append(Finding("The prior of a test is too narrow", CARE, text, action, numbers))
-        elif each.effective_samples < FEWEST_EFFECTIVE and error > HARMLESS_ERROR:
-            text = (
-                f"test {name!r}: the population is narrower than its posterior, or beside it: the weights have an "
-                f"effective sample size of {each.effective_samples:.0f} (median), and {1.0 - each.sample_share:.0%} of "
-                f"its marginal likelihood is from the fitted mixture. The means have errors of up to {error:.1f} "
-                "posterior standard deviations."
-            )
-            action = "Give more samples of this test, or draw fresh samples with the population as its prior."
-            found.append(Finding("Too few samples of a test", CARE, text, action, numbers))
     if not found and error > HARMLESS_ERROR:
         worst = max(tests, key=lambda name: tests[name].shift)
         text = (
-            f"test {worst!r}: its finite samples are most of the errors of the means, of up to {error:.1f} posterior "
-            "standard deviations."
+            f"test {worst!r}: the means have errors of up to {error:.1f} posterior standard deviations. Few of its "
+            f"samples are where the population is: their weights have an effective size of "
+            f"{tests[worst].effective_samples:.0f} (median)."
         )
-        found.append(Finding("Too few samples of a test", CARE, text, "Give more samples.", {"error": error}))
+        action = "Give more samples of this test, or draw fresh samples with the population as its prior."
+        found.append(Finding("Too few samples of a test", CARE, text, action, {"error": error}))
     return found
 
 
 def check_new_test(outside: Mapping[str, float], share: float) -> list[Finding]:
     """Draws of a new test outside of the bounds of the tests' priors, by parameter, and the share of all such draws."""
-    if share <= OUTSIDE:
+    if share <= SMALL_PROBABILITY:
         return []
     named = ", ".join(f"{name} {each:.1%}" for name, each in outside.items() if each > 0.0)
     text = f"{share:.0%} of the draws of a new test are outside the bounds of the priors of the tests ({named})."
@@ -82,7 +73,7 @@ def check_equal_ratios(n_events: int, spread: float, resolution: float) -> list[
 def check_impossible_draws(possible: np.ndarray) -> list[Finding]:
     """Draws (n,) bool of a new event whose noise is impossible, and which are left out."""
     share = 1.0 - float(np.mean(possible))
-    if share <= OUTSIDE:
+    if share <= SMALL_PROBABILITY:
         return []
     text = (
         f"{share:.0%} of the draws have an impossible noise, such as a share of the measured signal of 1 or more, and "

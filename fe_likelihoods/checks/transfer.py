@@ -6,17 +6,16 @@ import numpy as np
 
 from ..signals.channels import Channel
 from ..units import DIMENSIONS, to_si
-from .finding import CARE, WRONG, Finding
-from .steps import NOTHING, UNREAD
+from .finding import CARE, HALF, Finding
 
 __all__ = [
     "check_bandwidth",
     "check_coverage",
+    "check_emulator",
     "check_failed_samples",
     "check_final_values",
     "check_interval_samples",
     "check_peaks",
-    "check_same_response",
     "check_scores",
     "check_unit_of_threshold",
     "note_assumed_noise",
@@ -27,9 +26,6 @@ PEAK_RATIO = 2.0
 NARROW = 0.2  # bandwidth of a motion by that of the calibration; earthquakes of one structure differ by 0.38 or more
 UNSETTLED = 0.1  # half the range in the last two seconds by the final value, which is then known to 10 % at best
 NO_MOTION = 0.01  # half the range there by the largest response: a motion that does not matter
-# of a strong part in a 90 % band: of 20 independent samples, fewer are within in 1 of 1e8 right bands
-HALF = 0.5
-FAR = 10.0  # factor beyond all values: no reader asks for a probability so close to 0 or 1
 
 
 def check_peaks(
@@ -38,15 +34,13 @@ def check_peaks(
     """Peaks [SI] beyond the calibrated events' by a factor of two; `alone`: the parameters belong to one likelihood."""
     far, numbers = [], {}
     for name, value in predicted.items():
-        measured = [event[name] for event in calibrated if name in event]
-        if not measured or not max(measured) > 0.0:
-            continue
-        if value > PEAK_RATIO * max(measured):
-            numbers[name] = value / max(measured)
-            far.append(f"{name} ({numbers[name]:.2g} times the largest calibrated one)")
-        elif value < min(measured) / PEAK_RATIO:
-            numbers[name] = value / min(measured)
-            far.append(f"{name} ({numbers[name]:.2g} times the smallest calibrated one)")
+        measured = [event[name] for event in calibrated if event.get(name, 0.0) > 0.0]
+        nearest = min(max(value, min(measured)), max(measured)) if measured else value
+        if nearest and not 1.0 / PEAK_RATIO <= value / nearest <= PEAK_RATIO:
+            numbers[name] = value / nearest
+            far.append(
+                f"{name} ({numbers[name]:.2g} times the {'largest' if value > nearest else 'smallest'} calibrated one)"
+            )
     if not far:
         return []
     text = (
@@ -97,18 +91,6 @@ def check_final_values(ends: Mapping[str, Sequence[float]]) -> list[Finding]:
     return [Finding("A final value still moves", CARE, text, action, numbers)]
 
 
-def check_same_response(difference: float | None) -> list[Finding]:
-    """Whether another motion gives the response of the calibration; `difference` is relative to this response."""
-    if difference is None or difference > NOTHING:
-        return []
-    text = (
-        "The response equals the response to the motion of the calibration, so that the prediction repeats the "
-        "calibration."
-    )
-    action = f"{UNREAD} `check_model`, or `fe-likelihoods check`, finds this before a run."
-    return [Finding("The motion changes nothing", WRONG, text, action, {"difference": difference})]
-
-
 def note_assumed_noise(of_quantity: Mapping[Sequence[str], Sequence[str]]) -> list[Finding]:
     """Channels that were not measured have the mean noise of others, the keys."""
     if not of_quantity:
@@ -138,6 +120,14 @@ def check_coverage(shares: Mapping[str, float], level: float) -> list[Finding]:
     return [Finding("The measurements are outside of the band", CARE, text, action, missed)]
 
 
+def check_emulator(unexplained: float) -> list[Finding]:
+    """Whether an emulator leaves most of the variance of a number unexplained."""
+    if not unexplained > HALF:
+        return []
+    text = f"The emulator leaves {unexplained:.0%} of the variance unexplained."
+    return [Finding("The emulator is rough", CARE, text, "Use more simulations.", {"unexplained": unexplained})]
+
+
 def check_interval_samples(n_samples: int, needed: int, level: float) -> list[Finding]:
     """Whether the ends of intervals with this probability are beyond all samples."""
     if n_samples >= needed:
@@ -162,14 +152,13 @@ def check_scores(texts: Iterable[str]) -> list[Finding]:
 
 
 def check_unit_of_threshold(limits: np.ndarray, values: np.ndarray, channel: Channel) -> list[Finding]:
-    """Thresholds that are far from all values [SI], and among them in the unit of the channel."""
-    shown = np.asarray(to_si(limits, channel.unit, channel.dimension))
-    low, high = np.abs(values).min() / FAR, np.abs(values).max() * FAR
-    inside, outside = (shown >= low) & (shown <= high), (limits < low) | (limits > high)
-    if not np.all(inside & outside):
+    """Thresholds that are beside all values [SI], and among them in the unit of the channel."""
+    shown, values = np.asarray(to_si(limits, channel.unit, channel.dimension)), np.abs(values)
+    inside = (shown >= values.min()) & (shown <= values.max())
+    if not np.all(inside & ((limits < values.min()) | (limits > values.max()))):
         return []
     text = (
-        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and far from all predicted "
-        f"values (up to {np.abs(values).max():.3g}): is it in {channel.unit}?"
+        f"The threshold {limits.flat[0]:g} is in SI units, {DIMENSIONS[channel.dimension]}, and beside all predicted "
+        f"values (up to {values.max():.3g}): is it in {channel.unit}?"
     )
     return [Finding("A threshold may have another unit", CARE, text, f'Then pass unit="{channel.unit}".')]

@@ -9,18 +9,7 @@ import numpy as np
 
 from ..signals.channels import Channel, Measurements
 from ..signals.datasets import Dataset, read_dataset
-from ..signals.read import (
-    read_at2,
-    read_columns,
-    read_csv,
-    read_esm,
-    read_geonet,
-    read_knet,
-    read_obspy,
-    read_record,
-    read_smc,
-    read_v2,
-)
+from ..signals.read import read_columns, read_record
 from ..signals.records import Record
 from .job import Job
 from .schema import did_you_mean, read_quantity
@@ -45,17 +34,6 @@ BUNDLED = {
 }
 """Bundled synthetic data sets: function in `fe_likelihoods.problems`, and its arguments."""
 
-_FORMATS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
-    "at2": (read_at2, ("units",)),
-    "v2": (read_v2, ("channel", "resample")),
-    "smc": (read_smc, ("resample",)),
-    "geonet": (read_geonet, ("column",)),
-    "knet": (read_knet, ()),
-    "esm": (read_esm, ()),
-    "obspy": (read_obspy, ("units", "column")),
-    "csv": (read_csv, ("units", "dt", "column", "time", "time_unit", "skip", "resample")),
-    "dataset": (read_dataset, ()),
-}
 _TABLE_KEYS = ("dt", "time", "time_unit", "skip")
 _HDF5 = (".h5", ".hdf5")
 
@@ -126,22 +104,10 @@ def read_supports(job: Job) -> list[Record]:
 
 def _read_record(job: Job, path: Path) -> Record:
     given = job.record
-    name = given.get("format", "dataset" if path.suffix.lower() in _HDF5 else None)
-    if name is None:
-        keys = ("channel", "column", "units", "resample", *_TABLE_KEYS)
-        return read_record(path, **{key: given[key] for key in keys if key in given})
-    if name not in _FORMATS:
-        raise ValueError(f"format: unknown format {name!r}; {did_you_mean(name, tuple(_FORMATS))}")
-    reader, names = _FORMATS[name]
-    options = {
-        key: given[key] for key in (*names, "channel", "column", "units", "resample", *_TABLE_KEYS) if key in given
-    }
-    if unused := sorted(set(options) - set(names)):
-        raise ValueError(f"{unused[0]}: a file of format {name} has no such choice; leave it out")
-    if name in ("geonet", "obspy") and "column" in options:
-        options["component" if name == "geonet" else "channel"] = options.pop("column")
-    found = reader(path, **options)
-    return found.record if isinstance(found, Dataset) else found
+    if path.suffix.lower() in _HDF5:
+        return read_dataset(path).record
+    keys = ("channel", "column", "units", "resample", *_TABLE_KEYS)
+    return read_record(path, **{key: given[key] for key in keys if key in given})
 
 
 def read_measured(job: Job, channels: Sequence[Channel], record: Record | None) -> Measurements:

@@ -13,7 +13,7 @@ from ..checks.screening import Screened, check_data, check_sensors, repair_lines
 from ..checks.sensor_faults import find_sensor_faults
 from ..signals.datasets import read_dataset
 from ..signals.header_statements import Statements
-from ..signals.read import read_record, recognise_reader
+from ..signals.read import read_record, recognise_format
 from ..signals.records import Record
 from ..signals.strong_motion import find_v2_channels, parse_geonet, parse_v2
 from ..signals.tables import (
@@ -53,8 +53,8 @@ def describe_data(path: Path) -> str:
     if path.suffix.lower() in (".h5", ".hdf5"):
         found = _dataset(path)
     else:
-        reader = recognise_reader(path)
-        describe = {None: _table, "read_v2": _v2, "read_geonet": _geonet}.get(reader, _single)
+        form = recognise_format(path)
+        describe = {None: _table, "v2": _v2, "geonet": _geonet}.get(form, _single)
         found = describe(path)
     lines = [f"{path}: {found.text[0]}", *found.text[1:], "", "# lines for the TOML file"]
     for section, given in (("record", found.record), ("measurements", found.measured)):

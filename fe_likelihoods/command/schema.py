@@ -195,11 +195,6 @@ SECTIONS: dict[str, tuple[Key, ...]] = {
             "base of the column, the first end and the second end",
         ),
         Key("bundled", "text", "A bundled synthetic motion, instead of a file"),
-        Key(
-            "format",
-            "text",
-            "One of at2, v2, smc, geonet, knet, esm, obspy, csv and dataset; by default it is recognised",
-        ),
         Key("column", "text", "Column of a CSV file or workbook, component (GeoNet), or file in an archive (V2)"),
         Key("channel", "whole number", "Channel of a V2 file"),
         Key("units", "text", "Unit of the acceleration, if the file does not state it"),

@@ -182,21 +182,10 @@ def compare_covariances(
     """Compare a posterior covariance (n, n) of coordinates of variance 1 with the prior correlation (the identity).
 
     `slopes` and `logarithmic` (n,) are as in `Identifiability`; by default parameters are the coordinates themselves.
-    Raises ValueError if a covariance is not symmetric, finite and positive definite, or has another shape.
     """
     n = len(names)
-    posterior, prior = np.asarray(posterior, dtype=float), np.eye(n) if prior is None else np.asarray(prior, float)
-    for what, matrix in (("posterior", posterior), ("prior", prior)):
-        if matrix.shape != (n, n) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T):
-            raise ValueError(
-                f"expected a finite symmetric {what} covariance of shape ({n}, {n}) for {', '.join(names)}; got shape "
-                f"{matrix.shape}: give the covariance in standard normal coordinates of the prior"
-            )
-    try:
-        values, vectors = eigh(posterior, prior)
-    except np.linalg.LinAlgError as error:
-        raise ValueError(f"expected a positive definite prior covariance of {', '.join(names)}; got {error}") from error
-    if values[0] <= 0.0:
+    values, vectors = eigh(posterior, np.eye(n) if prior is None else prior)
+    if not values[0] > 0.0:
         raise ValueError(
             f"expected a positive definite posterior covariance of {', '.join(names)}; got an eigenvalue of "
             f"{values[0]:.3g}: give more samples that differ"

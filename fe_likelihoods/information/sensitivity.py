@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks.finding import labelled
+from ..checks.transfer import check_emulator
 from ..emulation.gaussian_process import fit_process, left_out_errors, predict_mean
 from ..likelihood.posterior import Posterior
 from ..prediction.quantities import Quantity, evaluator
@@ -30,7 +32,6 @@ from ..text_tables import number, text_table
 __all__ = ["Sensitivity", "sensitivity"]
 
 FOLDS = 8  # of the jackknife
-LARGE_ERROR = 0.1  # share of the variance that the emulator does not explain, above which more runs are advised
 DESIGN, DESIGNS = 2**10, 8  # points of the emulator per scrambled Sobol design, and designs
 
 
@@ -73,9 +74,8 @@ class Sensitivity(NamedTuple):
                 row += [f"{max(self.total[k, i], 0.0):.2f} ± {self.total_error[k, i]:.2f}"]
         shares = ", ".join(f"{number(100.0 * share, 2)} %" for share in self.unexplained)
         lines = [text_table(rows), f"From {self.simulations} simulations; the emulator leaves {shares} unexplained."]
-        if (self.unexplained > LARGE_ERROR).any():
-            lines.append("The emulator is rough: the indices need more simulations.")
-        return "\n".join(lines)
+        found = check_emulator(float(self.unexplained.max()))
+        return "\n".join([*lines, *labelled(found)])
 
     __repr__ = __str__
 

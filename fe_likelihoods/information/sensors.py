@@ -79,8 +79,6 @@ class SensorRanking(NamedTuple):
         Variance of the target before any candidate measures [SI²]; NaN without a target.
     target_left, target_left_errors : (k,) float
         Share of this variance that is left with the first sensors [-]; NaN without a target.
-    target_left_alone, target_left_alone_errors : (n,) float
-        The same with each candidate alone.
     draws, failed, simulations : int
         Draws that were used and draws that were left out because a simulation failed; simulations made.
     precisions : dict of str to (d, d) float
@@ -104,8 +102,6 @@ class SensorRanking(NamedTuple):
     target_variance: float
     target_left: np.ndarray
     target_left_errors: np.ndarray
-    target_left_alone: np.ndarray
-    target_left_alone_errors: np.ndarray
     draws: int
     failed: int
     simulations: int
@@ -434,14 +430,12 @@ def _choose(
     if by_target and not before.mean() > 0.0:
         raise ValueError("expected a target that depends on the parameters; it does not change at any draw")
     precision, rest, chosen = start, list(range(n)), []
-    alone, target_alone = (np.zeros(n), np.zeros(n)), (np.full(n, np.nan), np.full(n, np.nan))
+    alone = np.zeros(n), np.zeros(n)
     gains, together, leads, left_of_target, left = [], [], [], [], []
     for _ in range(n_sensors):
         added = information_of(precision[:, None], products[:, rest])
         variances = variance_of(precision[:, None] + products[:, rest], gradients[:, None])
-        if not chosen:
-            alone = _mean_and_error(added)
-            target_alone = _ratio_and_error(variances, before) if by_target else target_alone
+        alone = _mean_and_error(added) if not chosen else alone
         value = -variances / before.mean() if by_target else added
         order = np.argsort(-value.mean(axis=0), kind="stable")
         best = int(order[0])
@@ -473,8 +467,6 @@ def _choose(
         target_variance=float(before.mean()) if by_target else np.nan,
         target_left=share,
         target_left_errors=share_error,
-        target_left_alone=target_alone[0],
-        target_left_alone_errors=target_alone[1],
         draws=len(products),
         failed=0,
         simulations=0,

@@ -31,7 +31,8 @@ from ..cache.simulation_cache import SimulationCache
 from ..cache.stored_responses import StoredResponses
 from ..checks.finding import warn
 from ..checks.screening import check_gaps
-from ..checks.transfer import check_bandwidth, check_final_values, check_peaks, check_same_response
+from ..checks.steps import check_same_response
+from ..checks.transfer import check_bandwidth, check_final_values, check_peaks
 from ..noise.protocol import noise_under
 from ..signals.channels import Measurements
 from ..signals.records import Record

@@ -13,12 +13,13 @@ from .sampling import check_step
 
 __all__ = ["growing_durations"]
 
+_APART = 1.3  # smallest ratio of successive durations
+
 
 def growing_durations(
     acceleration: np.ndarray,
     dt: float,
     shares: Sequence[float] = (0.35, 0.75, 0.95, 0.999),
-    ratio: float = 1.3,
 ) -> tuple[float, ...]:
     """Durations after which given shares of the Arias intensity have passed, and the full duration.
 
@@ -29,10 +30,8 @@ def growing_durations(
     dt : float
         Time step [s].
     shares : sequence of float
-        Increasing shares of the integrated squared acceleration, between 0 and 1.
-    ratio : float
-        Smallest ratio of successive durations, at least 1. Durations that are too close to the next longer duration are
-        left out.
+        Increasing shares of the integrated squared acceleration, between 0 and 1. Durations that
+        are not 1.3 times shorter than the next one are left out.
 
     Returns
     -------
@@ -66,14 +65,12 @@ def growing_durations(
     shares = np.asarray(shares, dtype=float)
     if shares.ndim != 1 or not ((shares > 0.0) & (shares < 1.0)).all() or not (np.diff(shares) > 0.0).all():
         raise ValueError(f"growing_durations: shares must increase between 0 and 1; got {shares}")
-    if not 1.0 <= ratio < np.inf:
-        raise ValueError(f"growing_durations: ratio must be a number of 1 or more; got {ratio!r}")
     rows = rows[np.abs(rows).max(axis=1) > 0.0]
     rows = rows / np.abs(rows).max(axis=1, keepdims=True)  # so that squares do not overflow
     passed = np.cumsum(rows * rows, axis=1)
     passed = (passed / passed[:, -1:]).mean(axis=0)
     durations = [(rows.shape[1] - 1) * dt]
     for index in np.searchsorted(passed, shares)[::-1]:
-        if index > 0 and index * dt * ratio <= durations[0]:
+        if index > 0 and index * dt * _APART <= durations[0]:
             durations.insert(0, float(index * dt))
     return tuple(durations)

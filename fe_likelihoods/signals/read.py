@@ -1,15 +1,14 @@
 """Readers of ground motions and measured responses: files of strong-motion networks, CSV files, Excel workbooks.
 
-`read_record` and `read_columns` recognise the format; a reader of one format that is given another one names it in its
-error. Everything is converted to SI units. Unit and time step come from the file or the arguments; ValueError is raised
-if neither states them or if they disagree.
+`read_record` and `read_columns` recognise the format. Everything is converted to SI units. Unit and time step come from
+the file or the arguments; ValueError is raised if neither states them or if they disagree.
 """
 
 import io
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +34,10 @@ from .uneven_times import uniform_times
 
 __all__ = [
     "ImposedTest",
-    "read_at2",
     "read_columns",
-    "read_csv",
-    "read_esm",
-    "read_geonet",
     "read_imposed_test",
-    "read_knet",
-    "read_obspy",
     "read_record",
-    "read_smc",
-    "read_v2",
-    "recognise_reader",
+    "recognise_format",
 ]
 
 _TABLES = ("", ".csv", ".txt", ".dat", ".tsv", ".lvm", ".out", *WORKBOOKS)
@@ -139,135 +130,36 @@ def read_record(
     if channel is not None and column is not None:
         raise ValueError(f"{path}: give channel= or column=, not both; they name the same")
     channel = column if channel is None else channel
-    return _read(
-        path, None, units, dt, channel, member, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
-    )
-
-
-def read_csv(
-    path: str | Path,
-    units: str | None = None,
-    dt: float | None = None,
-    column: int | str | None = None,
-    *,
-    time: int | str | None = None,
-    time_unit: str | None = None,
-    skip: int | None = None,
-    missing: Sequence[float] | None = None,
-    resample: float | None = None,
-) -> Record:
-    """Read a ground motion from a table as `read_record` does; files of other formats are refused.
-
-    Examples
-    --------
-    >>> from fe_likelihoods.signals.read import read_csv
-    >>> table = [[0.00, 0.00], [0.01, 0.05], [0.02, -0.02]]
-    >>> np.savetxt("motion.csv", table, delimiter=",", header="time_s,acceleration_g", comments="")
-    >>> read_csv("motion.csv").dt
-    0.01
-    """
-    return _read(
-        path, "read_csv", units, dt, column, None, resample, time=time, time_unit=time_unit, skip=skip, missing=missing
-    )
-
-
-def read_at2(path: str | Path, units: str | None = None) -> Record:
-    """Read a ground motion from a PEER AT2 file as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_at2", units)
-
-
-def read_v2(
-    path: str | Path, channel: int | None = None, member: str | None = None, resample: float | None = None
-) -> Record:
-    """Read a channel of V1 or V2 files as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_v2", channel=channel, member=member, resample=resample)
-
-
-def read_smc(path: str | Path, resample: float | None = None) -> Record:
-    """Read a ground motion from a USGS SMC file as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_smc", resample=resample)
-
-
-def read_geonet(path: str | Path, component: str | None = None) -> Record:
-    """Read one component of a GeoNet V1A or V2A file as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_geonet", channel=component)
-
-
-def read_knet(path: str | Path) -> Record:
-    """Read a ground motion from a K-NET or KiK-net file as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_knet")
-
-
-def read_esm(path: str | Path) -> Record:
-    """Read a ground motion from an ESM or ITACA file as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_esm")
-
-
-def read_obspy(path: str | Path, units: str | None = None, channel: str | None = None) -> Record:
-    """Read a miniSEED, SAC or GSE2 file by obspy as `read_record` does; files of other formats are refused."""
-    return _read(path, "read_obspy", units, channel=channel)
-
-
-def recognise_reader(path: str | Path, expected: str | None = None) -> str | None:
-    """Return the name of the function that reads a file or zip archive; None for a table (CSV, Excel).
-
-    Raises ValueError if the file cannot be read, or has a known format without a reader, or not the `expected` one.
-    """
-    content = read_bytes(path)
-    if zipfile.is_zipfile(io.BytesIO(content)):
-        return None if Path(path).suffix.lower() in WORKBOOKS else "read_v2"
-    name, reader = strong_motion.recognise(content)
-    table = expected == "read_csv" and reader == "read_at2"  # lines such as NPTS=3, DT=0.01 may stand above a table
-    if name and (reader is None or expected not in (None, reader)) and not table:
-        article = "an" if name.startswith(("ESM", "HDF5")) else "a"
-        advice = f": read it with {reader}" if reader else ", which is not read; take a file of another format"
-        raise ValueError(f"{path}: this looks like {article} {name} file{advice}")
-    return reader
-
-
-def _read(
-    path: str | Path,
-    expected: str | None,
-    units: str | None = None,
-    dt: float | None = None,
-    channel: int | str | None = None,
-    member: str | None = None,
-    resample: float | None = None,
-    **table: Any,
-) -> Record:
-    """The record in a file, at the call depth below a public reader that its warnings expect.
-
-    `table` has time, time_unit, skip and missing, the options of tables.
-    """
-    found = recognise_reader(path, expected)
-    reader = expected or found or "read_csv"
-    file, name = str(path), Path(path).name if reader == "read_knet" else Path(path).stem
-    if reader == "read_csv":
+    form, file, name = recognise_format(path), str(path), Path(path).stem
+    table = {"time": time, "time_unit": time_unit, "skip": skip, "missing": missing}
+    if form is None:
         try:
             series, dt = _table_series(path, units, dt, channel, resample, **table), None
         except ValueError as error:
-            if expected or Path(path).suffix.lower() in _TABLES:
+            if Path(path).suffix.lower() in _TABLES:
                 raise
             raise ValueError(
                 f"{error}. The file has no known format of ground motions and was read as a table"
             ) from error
     elif unused := ", ".join(name for name, option in table.items() if option is not None):
-        raise ValueError(f"{path}: a file for {reader} states its times and samples; leave {unused} out")
-    elif reader == "read_v2":
+        raise ValueError(f"{path}: a file of format {form} states its times and samples; leave {unused} out")
+    elif form == "v2":
         block = _v2_channel(path, channel, member)
         series, file = strong_motion.parse_v2(block), block.file
-    elif reader == "read_obspy":
+    elif form == "obspy":
         series = strong_motion.parse_obspy(path, channel)
-    elif reader == "read_geonet":
+    elif form == "geonet":
         series = _geonet_component(path, channel)
     else:
-        series = getattr(strong_motion, reader.replace("read", "parse"))(read_text(path), file)
+        series = getattr(strong_motion, f"parse_{form}")(read_text(path), file)
     unit = agree_on_unit(series.unit, units, "acceleration", file)
     # The source has the file name without its folder, because it is written into data sets that are shared.
     source, step, values = Path(file).name + (f": {series.title}" if series.title else ""), series.dt, series.values
-    if reader in ("read_v2", "read_geonet", "read_obspy"):
+    if form in ("v2", "geonet", "obspy"):
         name = series.title
-    if reader == "read_v2":
+    elif form == "knet":  # the ending is the direction
+        name = Path(path).name
+    if form == "v2":
         source = file.removeprefix(f"{Path(path).parent}/")
     if series.times is not None:
         even = uniform_times(series.times, resample, file)
@@ -275,7 +167,7 @@ def _read(
             raise ValueError(
                 f"{file}: the samples are at uneven times; give their nominal step, resample={even.step:.6g}"
             )
-        source, step, values = f"{source}; {even.note}", resample, even.straight(values, file, stacklevel=3)
+        source, step, values = f"{source}; {even.note}", resample, even.straight(values, file, stacklevel=2)
     elif resample is not None:
         raise ValueError(f"{file}: the samples have a uniform step; leave resample out")
     if dt is not None and not abs(dt - step) <= 1e-6 * step:
@@ -283,6 +175,25 @@ def _read(
             f"{file} states a step of {step:g} s but dt = {dt!r} was given; leave dt out, or correct the file"
         )
     return Record(name, step, to_si(values, unit, "acceleration"), source)
+
+
+def recognise_format(path: str | Path) -> str | None:
+    """Return the format of a file or zip archive, such as "v2" or "at2"; None for a table (CSV, Excel).
+
+    Raises ValueError if the file cannot be read, or has a known format that is not read.
+    """
+    content = read_bytes(path)
+    if Path(path).suffix.lower() in WORKBOOKS:
+        return None
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        return "v2"
+    name, form = strong_motion.recognise(content)
+    if name and form is None:
+        article = "an" if name.startswith("HDF5") else "a"
+        raise ValueError(
+            f"{path}: this looks like {article} {name} file, which is not read; take a file of another format"
+        )
+    return form
 
 
 def _v2_channel(path: str | Path, channel: int | str | None, member: str | None) -> strong_motion.Block:
@@ -329,7 +240,7 @@ def _table_series(
     place = value_column(table, None if rows else column)
     values = column_values(table, place, missing)
     unit = column_unit(table, place, values, units, "acceleration", table.file)
-    warn_if_absent(table, [place], missing, stacklevel=4)
+    warn_if_absent(table, [place], missing, stacklevel=3)
     absent = np.flatnonzero(np.isnan(values))
     if absent.size:
         raise ValueError(
@@ -418,10 +329,10 @@ def read_columns(
     >>> measured.values  # m
     array([[0.    , 0.0015, 0.002 ]])
     """
-    if (reader := recognise_reader(path)) is not None:
+    if (form := recognise_format(path)) is not None:
         if not all(option is None for option in (units, dt, time, time_unit, skip, missing)):
             raise ValueError(
-                f"{path}: a file for {reader} states units and times; leave units, dt, time, time_unit, skip and "
+                f"{path}: a file of format {form} states units and times; leave units, dt, time, time_unit, skip and "
                 "missing out"
             )
         return _recorded(path, channels, columns, description, zero, resample)

@@ -84,17 +84,17 @@ __all__ = [
 ]
 
 _LOOK = 40  # lines in which a format is recognised
-_READERS = {
-    "PEER AT2": "read_at2",
-    "CSMIP or COSMOS V1": "read_v2",
-    "CSMIP or COSMOS V2": "read_v2",
-    "USGS SMC": "read_smc",
-    "GeoNet": "read_geonet",
-    "K-NET or KiK-net": "read_knet",
-    "ESM or ITACA": "read_esm",
-    "miniSEED": "read_obspy",
-    "GSE2": "read_obspy",
-    "SAC": "read_obspy",
+_FORMS = {
+    "PEER AT2": "at2",
+    "CSMIP or COSMOS V1": "v2",
+    "CSMIP or COSMOS V2": "v2",
+    "USGS SMC": "smc",
+    "GeoNet": "geonet",
+    "K-NET or KiK-net": "knet",
+    "ESM or ITACA": "esm",
+    "miniSEED": "obspy",
+    "GSE2": "obspy",
+    "SAC": "obspy",
 }
 
 
@@ -102,7 +102,7 @@ _READERS = {
 
 
 def recognise(content: bytes) -> tuple[str, str | None]:
-    """Return the name of a file's format (empty if unknown), and of the function that reads it (None if not read)."""
+    """Return the name of a file's format (empty if unknown), and its parser (None if it is not read)."""
     start, encoding = content[:8000], "latin-1"  # of binary files, one letter per byte
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
@@ -113,7 +113,7 @@ def recognise(content: bytes) -> tuple[str, str | None]:
     text = start.decode(encoding, errors="replace")
     lines = LINE_END.sub("\n", text).splitlines()
     name = "" if _is_table(lines) else _name_of(lines[:_LOOK], text)
-    return name, _READERS.get(name)
+    return name, _FORMS.get(name)
 
 
 def _is_table(lines: list[str]) -> bool:
@@ -152,13 +152,14 @@ def _name_of(lines: list[str], text: str) -> str:
         ("MATLAB", text.startswith("MATLAB 5.0 MAT-file")),
         ("gzip", text.startswith("\x1f\x8b")),
         ("PDF", text.startswith("%PDF")),
+        ("damaged zip", text.startswith("PK")),
         ("web page (HTML)", begins(r"<(!doctype )?html\b")),
         ("miniSEED", bool(re.match(r"\d{6}[DRQM][ \0]|MS\x03", text))),
         ("GSE2", text.startswith("WID2 ")),
         ("SAC", len(text) > 632 and b"\0\0\0" in (version[1:], version[:3]) and 6 in version[:1] + version[-1:]),
         ("PEER AT2", bool(re.search(r"NPTS\s*(=|,)", head)) and "DT" in head and not first.startswith("#")),
         ("Taiwan CWB or SMART", first.startswith("#StationCode")),
-        ("binary", "\0" in text.rstrip("\0\x1a\r\n ") and not text.startswith("PK")),  # no workbook
+        ("binary", "\0" in text.rstrip("\0\x1a\r\n ")),
     )
     return next((name for name, fits in rules if fits), "")
 
@@ -282,7 +283,7 @@ def parse_at2(text: str, file: str) -> Series:
     if index is None:
         raise ValueError(
             f"{file}: expected a header line 'NPTS=  4096, DT=  .0100 SEC' or '4096  .0100  NPTS, DT', found none in "
-            f"{len(lines)} lines; read plain columns of numbers with read_csv"
+            f"{len(lines)} lines; is it a table of plain columns?"
         )
     units = _UNITS_OF.search("\n".join(lines[:index]))
     rows = [(number, row) for number, row in enumerate(lines[index + 1 :], index + 2) if row.strip()]

@@ -37,6 +37,9 @@ def spoil(values, fault):
             level = {"stuck": y[first], "dead": 0.0, "noisy": 1e-3 * peak * np.random.default_rng(0).normal(size=50)}
             y[first : first + 50] = level[fault]
             return y, (first, first + 49)
+        case "faint":  # noise that is large beside VANISHED, and white
+            y[first : first + 150] = 1e-2 * peak * np.random.default_rng(0).normal(size=150)
+            return y, (first, first + 149)
         case "spikes":
             y[[first, first + 300]] += [0.7 * peak, -1.5 * peak]
             return y, (first, first + 300)
@@ -48,8 +51,8 @@ def spoil(values, fault):
             return y + 3.0 * y.std() * np.random.default_rng(0).normal(size=N), (0, N - 1)
 
 
-KINDS = {"dead": "stuck", "noisy": "stuck"}
-FAULTS = ("clipped", "stuck", "dead", "noisy", "spikes", "offset", "drift", "noise")
+KINDS = {"dead": "stuck", "noisy": "stuck", "faint": "stuck"}
+FAULTS = ("clipped", "stuck", "dead", "noisy", "faint", "spikes", "offset", "drift", "noise")
 
 
 @pytest.mark.parametrize("dimension", ["acceleration", "displacement"])

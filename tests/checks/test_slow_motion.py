@@ -11,9 +11,12 @@ from fe_likelihoods import (
     HalfNormal,
     LinearOscillator,
     LinearStructure,
+    LogNormal,
     Measurements,
     Posterior,
     Record,
+    SensedModel,
+    Sensor,
     ShearFrame,
     Uniform,
     check_fit,
@@ -48,9 +51,9 @@ def later(values, steps):
     return np.concatenate([np.zeros(steps), values[: len(values) - steps]])
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    ("gain", "steps"), [(1.0, 0), (0.5, 0), (2.0, 0), (-1.0, 0), (9.80665, 0), (1.0, 5), (0.5, 40)]
+    ("seed", "gain", "steps"),
+    [(0, 1.0, 0), (1, 0.5, 0), (2, 2.0, 0), (3, -1.0, 0), (4, 9.80665, 0), (5, 1.0, 5), (6, 0.5, 40)],
 )
 def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps):
     rng = np.random.default_rng(seed)
@@ -62,20 +65,20 @@ def test_gain_and_lag_of_a_damped_deck_are_found_without_a_fit(seed, gain, steps
     for values in (measured, gappy):
         found = compare_slow_motion(values, draws, STEP)
         # draws and truth agree to a tenth
-        assert np.sign(found.gain) == np.sign(gain) and abs(np.log(found.gain / gain)) < 0.1 + 4.0 * found.error
+        assert np.sign(found.gain) == np.sign(gain) and abs(np.log(found.gain / gain)) < 0.2
         assert abs(found.lag - STEP * steps) < 0.01 + 4.0 * found.lag_error
         assert found.coherence > (0.95 if values is measured else 0.8) and found.highest < 4.5
 
 
-def test_errors_of_gain_and_lag_are_as_stated():
+def test_the_error_of_a_lag_is_as_stated():
     rng = np.random.default_rng(1)
     model = deck(rng)
     draws, true = draws_of(model, rng), model.simulate([4.5, 0.1, 0.7])[0]
     clean, scores = compare_slow_motion(true, draws, STEP), []
     for _ in range(60):
         noisy = compare_slow_motion(true + 0.5 * true.std() * rng.standard_normal(len(true)), draws, STEP)
-        scores.append([np.log(noisy.gain / clean.gain) / noisy.error, (noisy.lag - clean.lag) / noisy.lag_error])
-    assert (np.mean(np.square(scores), axis=0) < 1.0 + 4.0 * np.sqrt(2.0 / 60)).all()
+        scores.append((noisy.lag - clean.lag) / noisy.lag_error)
+    assert np.mean(np.square(scores)) < 1.0 + 4.0 * np.sqrt(2.0 / 60)
 
 
 def test_nothing_is_known_where_the_draws_disagree_or_are_few():
@@ -135,12 +138,28 @@ def test_a_limit_of_the_model_is_no_edge_of_the_prior():
     assert "At the edge of the prior" in kinds(Uniform(0.5, 4.5))
 
 
-def test_a_support_in_another_unit_is_named():
+def test_a_support_with_another_gain_or_sign_is_named():
+    """Its share in the response makes up for it, so that no fit shows it; the other supports do."""
     first, second, third = motions(np.random.default_rng(7))
-    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(2.5), third])) == []
-    (found,) = check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(1.0 / 9.80665), third]))
-    assert found.severity == "wrong" and 0.08 < found.numbers[second.name] < 0.13
-    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(0.0), third])) == []
+
+    def found(factor):
+        return check_supports(LinearStructure(BridgeDeck("deck"), [first, second.scale(factor), third]))
+
+    assert found(1.0) == found(1.3) == found(0.0) == []
+    for factor, kind in (
+        (1.8, "A gain may be wrong"),
+        (0.6, "A gain may be wrong"),
+        (-1.0, "A sign may be wrong"),
+        (1.0 / 9.80665, "A unit may be wrong"),
+    ):
+        (each,) = found(factor)
+        assert (each.kind, each.severity) == (kind, "wrong"), factor
+        assert each.numbers == {second.name: pytest.approx(factor, rel=0.2)}
+    halved = LinearStructure(BridgeDeck("deck"), [first, second.scale(0.5), third])
+    assert check_supports(SensedModel(halved, inputs={1: Sensor(gain=LogNormal(1.0, 0.5))})) == []
+    other = motions(np.random.default_rng(8))[0]  # of another site: nothing is known
+    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other, other.scale(2.0)])) != []
+    assert check_supports(LinearStructure(BridgeDeck("deck"), [first, other.scale(2.0), third])) == []
     assert check_supports(LinearStructure(ShearFrame({"roof": 1}, [1.0], [900.0]), first)) == []
     assert check_supports(LinearOscillator(first)) == []
 

@@ -14,7 +14,7 @@ from fe_likelihoods.command.job import read_job
 from fe_likelihoods.command.models import make_problem
 from fe_likelihoods.models import linear_oscillator
 from fe_likelihoods.prediction.prediction import Prediction
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from tests.command.test_command import OSCILLATOR, call, folder, write_oscillator  # noqa: F401
 from tests.reporting.report_page import read_page
 
@@ -33,7 +33,7 @@ rest = "1 s"
 
 def write_events(folder):  # noqa: F811
     """Beside the files of the oscillator: measurements of another event, and settings with two events."""
-    record = read_csv(folder / "base.csv")
+    record = read_record(folder / "base.csv")
     response = LinearOscillator(record.scale(0.5), 0.8).simulate([1.1, 0.9]) / [[9.80665], [1e-3]]
     rows = [f"{t!r},{a!r},{d!r}" for t, a, d in zip(record.time.tolist(), *response.tolist(), strict=True)]
     (folder / "weaker.csv").write_text("\n".join(["time_s,top [g],top [mm]", *rows]))
@@ -68,7 +68,7 @@ def test_events_are_predicted_and_scored(finished, run_once):
     assert "event-weaker.txt, event-weaker.csv, event-weaker.png, event-after.txt" in said
     with open("r/event-weaker.csv", newline="") as file:
         rows = {row["channel"]: row for row in csv.DictReader(file)}
-    record = read_csv("base.csv").scale(0.5)
+    record = read_record("base.csv").scale(0.5)
     peaks = np.abs(LinearOscillator(record, 0.8).simulate([1.1, 0.9])).max(axis=1)
     for largest, row in zip(peaks, rows.values(), strict=True):
         peak = from_si(largest, row["unit"])
@@ -128,7 +128,7 @@ class Doubtful(LinearOscillator):
     """An oscillator of a user, which fails in weak motions, and warns in others."""
 
     def simulate(self, theta):
-        if np.abs(self.record.acceleration).max() < 0.9 * np.abs(read_csv("base.csv").acceleration).max():
+        if np.abs(self.record.acceleration).max() < 0.9 * np.abs(read_record("base.csv").acceleration).max():
             raise SimulationFailed("no motion")
         warnings.warn("the oscillator is very soft", UserWarning, stacklevel=1)
         return super().simulate(theta)
@@ -153,7 +153,7 @@ def test_warnings_of_the_model_are_given_and_findings_are_not(events):
 
 @pytest.mark.slow
 def test_an_event_whose_simulations_all_fail_is_named_in_the_report(events, monkeypatch):
-    weak, one = 0.7 * np.abs(read_csv("base.csv").acceleration).max(), LinearOscillator.simulate
+    weak, one = 0.7 * np.abs(read_record("base.csv").acceleration).max(), LinearOscillator.simulate
 
     def simulate(self, theta):
         if np.abs(self.record.acceleration).max() < weak:
@@ -228,7 +228,7 @@ def test_peaks_with_a_noise_in_shares_have_the_error_of_the_model(events, monkey
         ('measured = "weaker.csv"', 'measured = "waker.csv"', "[events.weaker] measured: there is no file waker.csv"),
         ('measured = "weaker.csv"', 'zero = "1 s"', "[events.weaker] zero: this key has no effect without measured"),
         ("scale = 0.5", "factor = 0.5", "[events.weaker] factor: unknown key"),
-        ("[events.weaker]\nfile", "[events.weaker]\nformat", "[events.weaker] file: this key is missing"),
+        ("[events.weaker]\nfile", "[events.weaker]\ncolumn", "[events.weaker] file: this key is missing"),
         ("[events.weaker]", '[events."a/b"]', "[events.a/b]: expected a name of letters"),
     ],
 )
@@ -244,7 +244,7 @@ def test_a_motion_with_another_step_is_resampled_to_that_of_the_model(events, st
     from fe_likelihoods.command.events import read_events
 
     text = (SETTINGS + EVENTS).replace('file = "base.csv"\n[measure', 'file = "base.csv"\nevery = 2\n[measure')
-    record = read_csv("base.csv").resample(step)
+    record = read_record("base.csv").resample(step)
     rows = [f"{t!r},{a!r}" for t, a in zip(record.time.tolist(), record.acceleration.tolist(), strict=True)]
     (events / "other.csv").write_text("\n".join(["time_s,base_m_s2", *rows]))
     (events / "oscillator.toml").write_text(

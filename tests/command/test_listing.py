@@ -141,7 +141,7 @@ def test_channels_of_a_real_structure_in_a_zip_archive(shared):
     [
         ({"channels": [Channel("top", "displacement", "mm")]}, "accelerations are read from files of this format, and"),
         ({"zero": "10:32:07"}, "has no clock times; give zero in seconds"),
-        ({"dt": 0.01}, "a file for read_v2 states units and times; leave units, dt"),
+        ({"dt": 0.01}, "a file of format v2 states units and times; leave units, dt"),
         (
             {"columns": [8]},
             "expected one channel with channel = 8, .*found 0; choose with channel= and member=, or in a TOML file",

@@ -211,9 +211,8 @@ def test_draws_of_a_new_test_beyond_the_bounds_are_a_warning(rng):
 def test_test_beside_the_population_is_a_warning(one):
     """The other tests and a prior of small spread hold the population far from T0."""
     points = np.random.default_rng(1).normal([50.0, 0.3], [0.1, 0.01], (60, 2))
-    with pytest.warns(UserWarning, match="or beside it") as found:
+    with pytest.warns(UserWarning, match="the means have errors of up to"):
         result = Hierarchy(one, points)
-    assert len(found) == len(DATA) and "The means have errors of up to" in str(found[-1].message)
     assert result.checks.tests["T0"].effective_samples < 2.0
     assert np.isfinite(result.draw_test("T0", 1)["a"]).all()
 
@@ -233,7 +232,7 @@ def test_prior_narrower_than_the_population_is_a_warning_that_names_the_test():
 
 @pytest.mark.parametrize(("n", "is_named"), [(40, True), (1000, False)])
 def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, is_named):
-    """The fitted mixture takes over: with 1000 samples its error does no harm, with 40 the tests are named."""
+    """The fitted mixture takes over: with 1000 samples its error does no harm, with 40 a test is named."""
     posterior = HierarchicalPosterior(several(DATA[:, :1], ERRORS[:1, :1], n), {"a": LINEAR})
     points = np.random.default_rng(1).normal([1.1, 0.002], [0.1, 0.0002], (60, 2))
     with warnings.catch_warnings(record=True) as found:
@@ -241,10 +240,7 @@ def test_population_narrower_than_the_samples_is_a_warning_where_it_matters(n, i
         checks = Hierarchy(posterior, points).checks
     assert max(each.effective_samples for each in checks.tests.values()) < 20
     assert checks.tests["T0"].sample_share < 0.1
-    messages = [str(each.message) for each in found]
-    expected = list(checks.tests) if is_named else []
-    assert [text.split("'")[1] for text in messages if "is narrower" in text and "Give more" in text] == expected
-    assert len(messages) == len(expected)
+    assert ["Give more samples of this test" in str(each.message) for each in found] == [True] * is_named
     change = posterior.log_likelihood(points) - [exact(DATA[:, 0], m, 0.04 + s**2) for m, s in points]
     weights = np.exp(change - change.max())
     shift = abs((weights @ points[:, 0] / weights.sum() - points[:, 0].mean()) / points[:, 0].std())

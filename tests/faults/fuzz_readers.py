@@ -29,7 +29,6 @@ import numpy as np
 from fe_likelihoods import Channel, Measurements, Record, read_columns, read_record
 from fe_likelihoods.command.listing import describe_data
 from fe_likelihoods.signals.datasets import read_dataset, write_dataset
-from fe_likelihoods.signals.read import read_at2, read_csv, read_esm, read_geonet, read_knet, read_smc, read_v2
 from fe_likelihoods.units import G0
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, STEP
 from tests.signals.network_files import csmip_v1, esm, geonet, knet, smc
@@ -104,23 +103,23 @@ def cases(folder):
         zipped([("a.v2", v2[0]), ("inner.zip", zipped([("b.V2", "\n".join(cosmos(2, values, 0.005)).encode())]))])
     ]
     networks = (
-        ("smc", read_smc, smc(values, 200.0)),
-        ("V2A", lambda path: read_geonet(path, "Up"), geonet({"N": values, "Up": 2.0 * values}, 0.02)),
-        ("NS", read_knet, knet(np.round(1e4 * values).astype(int), 1)),
-        ("asc", read_esm, esm(values, 0.005)),
+        ("smc", read_record, smc(values, 200.0)),
+        ("V2A", lambda path: read_record(path, "Up"), geonet({"N": values, "Up": 2.0 * values}, 0.02)),
+        ("NS", read_record, knet(np.round(1e4 * values).astype(int), 1)),
+        ("asc", read_record, esm(values, 0.005)),
     )
     return [
-        Case("at2", read_at2, at2),
-        Case("v2", lambda path: read_v2(path, channel=1), v2),
-        Case("zip", lambda path: read_v2(path, channel=1), archives),
+        Case("at2", read_record, at2),
+        Case("v2", lambda path: read_record(path, channel=1), v2),
+        Case("zip", lambda path: read_record(path, channel=1), archives),
         *(Case(name, read, ["\n".join(lines).encode()]) for name, read, lines in networks),
         Case("any", read_record, [*at2, *csv, v2[0], *("\n".join(lines).encode() for _, _, lines in networks)]),
-        Case("csv", read_csv, csv + styles),
+        Case("csv", read_record, csv + styles),
         Case("acc", lambda path: read_record(path, units="g"), [text.encode() for text in (EQSIG, RSPMATCH)]),
         Case("afad", read_record, [afad(("N-S",)).encode()]),
         Case("dat", lambda path: read_record(path, "rows", "g", dt=0.01), ["\n".join(ROWS).encode()]),
-        Case("uneven.csv", lambda path: read_csv(path, resample=0.02), csv + styles),
-        Case("uneven.smc", lambda path: read_smc(path, resample=0.01), [uneven]),
+        Case("uneven.csv", lambda path: read_record(path, resample=0.02), csv + styles),
+        Case("uneven.smc", lambda path: read_record(path, resample=0.01), [uneven]),
         Case("listed", describe_data, [*at2, *csv, *styles, *v2, uneven, archives[0]]),
         Case("columns.csv", lambda path: read_columns(path, [TOP], ["acc_g"]), csv[1:2]),
         Case("h5", read_dataset, [(folder / "valid.h5").read_bytes()]),
@@ -183,7 +182,7 @@ def wrong_in_silence(number, seed, path):
         path.write_text(text, encoding="utf-8")
         column = COLUMNS.get(style)
         try:
-            record = read_csv(path, column=column)
+            record = read_record(path, column=column)
         except ValueError:
             continue
         found = record.acceleration / G0

@@ -79,8 +79,6 @@ def test_variance_of_a_target_has_the_closed_form():
     for k in range(4):
         left = gradient @ closed_form(*ranking.chosen[: k + 1])[1] @ gradient
         np.testing.assert_allclose(ranking.target_left[k], left / (gradient @ gradient), rtol=1e-6)
-    alone = [gradient @ closed_form(name)[1] @ gradient / (gradient @ gradient) for name in NAMES]
-    np.testing.assert_allclose(ranking.target_left_alone, alone, rtol=1e-6)
     assert ranking.chosen[0] == "b"
     assert rank_sensors(LINEAR, PRIOR, noise=NOISE, draws=2, n_sensors=1).chosen != ("b",)
 

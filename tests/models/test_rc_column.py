@@ -25,7 +25,7 @@ from fe_likelihoods import (
 )
 from fe_likelihoods.models.rc_column import PARAMETERS
 from fe_likelihoods.problems import BRIDGE_COLUMN_MEANS, bridge_column_data, bridge_column_prior
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.simulation.model import misfit_batch
 from fe_likelihoods.units import G0
 from tests.opensees_column import INCH, KIP, KSI
@@ -549,7 +549,7 @@ def test_limits_of_the_arguments_are_accepted(column):
 def test_a_jump_of_the_steel_law_is_crossed(shared):
     """The stress of a bar jumps by 35 MPa at zero stress: there is no equilibrium on either side, for any step size."""
     path = shared / "records" / "loma_prieta_1989_apeel2_redwood_city_133.csv"
-    record = read_csv(path).scale(0.85).trim(0.0, 12.0)
+    record = read_record(path).scale(0.85).trim(0.0, 12.0)
     theta = [0.5284587364146686, 1.0214677685625493, 0.32405312400652414, 0.9625611775286573, 1.432206729992988]
     crossed = RCColumn.lhpost(record).history(theta)
     assert crossed.retries == 11  # of the step, its half, ..., its 1024th part; a larger tolerance is never reached

@@ -62,7 +62,7 @@ def test_channels_with_different_clocks_are_named_and_corrected_one_by_one(rng):
     apart = measured(0.1, 0.13)
     found = align(reference, apart)
     assert found.own_lags == pytest.approx({"a": 0.1, "b": 0.13}, abs=0.002)
-    assert "NOT SURE: the channels have different lags, each by itself a 0." in found.statement
+    assert "NOT SURE: parts have other lags, each by itself a 0." in found.statement
     corrected = apart
     for name, lag in found.own_lags.items():
         corrected = corrected.shift(-lag, [name])
@@ -75,40 +75,34 @@ def test_channels_with_different_clocks_are_named_and_corrected_one_by_one(rng):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_standard_error_is_that_of_repetitions(rng, correlation):
-    found = [align(RECORD, late(0.1, rng, 0.7, correlation, missing=0.1), max_lag=1.0) for _ in range(120)]
+    found = [align(RECORD, late(0.1, rng, 0.7, correlation, missing=0.1), max_lag=1.0) for _ in range(60)]
     scores = np.array([(each.lag - 0.1) / each.standard_error for each in found])
     # the estimated error of one series has itself an error of some ten per cent
-    assert 0.75 < scores.std() < 1.35 and abs(scores.mean()) < 4.0 * scores.std() / np.sqrt(120.0)
-    assert 0.87 <= (np.abs(scores) < 1.96).mean() <= 1.0
+    assert 0.75 < scores.std() < 1.35 and abs(scores.mean()) < 4.0 * scores.std() / np.sqrt(60.0)
+    assert (np.abs(scores) < 1.96).mean() > 0.85
 
 
-@pytest.mark.parametrize(("drift", "sure"), [(0.0, True), (0.002, False), (-0.002, False)])
-def test_clocks_of_different_speed(rng, drift, sure):
+@pytest.mark.parametrize("drift", [0.0, 0.002, -0.002])
+def test_clocks_of_different_speed(rng, drift):
     time = 0.01 * np.arange(4000)
     long = np.sum([(1.0 - 0.1 * k) * motion(time - start, k) for k, start in enumerate((0.5, 12.0, 25.0))], axis=0)
     values = np.interp((time - 0.2) / (1.0 + drift), time, long) + 0.2 * long.std() * rng.normal(size=time.size)
     found = align(Record("long", 0.01, long), Measurements((BASE,), 0.01, values[None]), max_lag=1.0)
-    assert found.drift == pytest.approx(drift, abs=4.0 * found.drift_error) and 0.0 < found.drift_error < 0.0004
-    assert ("NOT SURE: the lag changes by" in found.statement) != sure
-    assert sure == (abs(found.lag - 0.2) < 4.0 * found.standard_error)
+    assert ("NOT SURE: parts have other lags" in found.statement) == (drift != 0.0)
+    if drift:
+        assert 0.01 < abs(found.own_lags["second half"] - found.lag) < 0.06
+    else:
+        assert found.lag == pytest.approx(0.2, abs=4.0 * found.standard_error)
 
 
 def test_an_uncertain_lag_says_so(rng):
-    sine = Record("sine", DT, np.sin(2.0 * np.pi * TIME))
-    waves = Measurements((BASE,), DT, (np.sin(2.0 * np.pi * (TIME - 0.2)) + 0.5 * rng.normal(size=N_STEPS))[None])
-    found = align(sine, waves, max_lag=3.0)
-    assert found.probability < 0.99 and "is nearly as good" in found.statement
+    for frequency, late, noise, longest in ((1.0, 0.2, 0.5, 3.0), (2.0, 0.1231, 0.05, None)):  # on and off the grid
+        sine = Record("sine", DT, np.sin(2.0 * np.pi * frequency * TIME))
+        waves = np.sin(2.0 * np.pi * frequency * (TIME - late)) + noise * rng.normal(size=N_STEPS)
+        found = align(sine, Measurements((BASE,), DT, waves[None]), max_lag=longest)
+        assert found.probability < 0.99 and "is nearly as good" in found.statement
     noise = Measurements((BASE,), DT, rng.normal(size=(1, N_STEPS)))
     assert "NOT SURE: base is not a shifted copy" in align(RECORD, noise, max_lag=1.0).statement
-
-
-def test_lag_of_a_sine_is_uncertain_off_the_grid_of_lags(rng):
-    time = 0.005 * np.arange(2000)
-    sine = Record("sine", 0.005, np.sin(4.0 * np.pi * time))
-    for _ in range(3):
-        waves = np.sin(4.0 * np.pi * (time - 0.1231)) + 0.05 * rng.normal(size=time.size)
-        found = align(sine, Measurements((BASE,), 0.005, [waves]))
-        assert found.probability < 0.9 and "is nearly as good" in found.statement
 
 
 def test_channel_that_is_coarser_than_the_record(rng):

@@ -99,21 +99,6 @@ class TestMeasurements:
             with pytest.raises(ValueError, match="factor must be a whole number from 1 to 100"):
                 measurements.decimate(wrong)
 
-    def test_decimation_leaves_white_noise_white(self, rng):
-        noise = Measurements((TOP,), 0.01, rng.normal(size=(1, 40_000))).decimate(4).values[0]
-        # Sample variance and lag-one correlation of n independent normal samples have these standard errors.
-        n = noise.size
-        assert abs(noise.var() - 1) < 4 * np.sqrt(2 / n)
-        assert abs(noise[1:] @ noise[:-1] / n) < 4 / np.sqrt(n)
-
-    def test_decimation_aliases_fast_motion(self):
-        """Control: decimation does not resample a motion. 45 Hz sampled at 50 Hz appears as 5 Hz."""
-        time = np.arange(4000) * 0.005
-        fewer = Measurements((TOP,), 0.005, [np.cos(2 * np.pi * 45 * time)]).decimate(4)
-        np.testing.assert_allclose(fewer.values[0], np.cos(2 * np.pi * 5 * fewer.time), atol=1e-9)
-        resampled = Record("same motion", 0.005, np.cos(2 * np.pi * 45 * time)).resample(0.02)
-        assert np.abs(resampled.acceleration[30:-30]).max() < 3e-3
-
     @pytest.mark.parametrize("form", [lambda rows: rows, list, lambda rows: [rows[0], rows[1, :2]]])
     def test_masked_samples_are_missing(self, form):
         rows = np.ma.array([[1.0, -9999.0, 2.0], [3.0, 4.0, 5.0]], mask=[[0, 1, 0], [0, 0, 0]])

@@ -41,13 +41,6 @@ class TestDataset:
         assert back.record.fingerprint == record.fingerprint
         assert back.measurements.fingerprint == measurements.fingerprint
 
-    def test_file_describes_itself(self, path):
-        with h5py.File(path) as file:
-            samples, values = file["record/acceleration"], file["measurements/values"]
-            assert samples.dtype == values.dtype == np.dtype("<f8")
-            assert (samples.attrs["units"], *values.attrs["units"]) == ("m/s2", "m/s2", "m")
-            assert list(values.attrs["channel_names"]) == ["top", "drift"]
-
     def test_writing_replaces_and_leaves_nothing_behind(self, path, record, measurements):
         before = path.read_bytes()
         write_dataset(path, record, measurements, self.ATTRIBUTES)

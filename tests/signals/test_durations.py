@@ -9,7 +9,7 @@ from fe_likelihoods.signals.durations import growing_durations
 def test_shares_of_a_constant_acceleration():
     # n samples of the same size: the share s has passed at sample ceil(s n) - 1
     acceleration = np.tile([1.0, -1.0], 500)
-    durations = growing_durations(acceleration, 0.01, (0.1, 0.2, 0.45), ratio=1.3)
+    durations = growing_durations(acceleration, 0.01, (0.1, 0.2, 0.45))
     np.testing.assert_allclose(durations, [0.99, 1.99, 4.49, 9.99], rtol=1e-12)
     assert durations == growing_durations(1e200 * acceleration, 0.01, (0.1, 0.2, 0.45))
     assert all(isinstance(seconds, float) for seconds in durations)
@@ -22,8 +22,6 @@ def test_durations_that_are_too_close_are_left_out():
     assert (np.array(durations[1:]) / durations[:-1] >= 1.3).all()
     assert len(durations) > 5
     assert growing_durations(acceleration, 0.01, (0.9, 0.95)) == (durations[-1],)
-    everything = growing_durations(acceleration, 0.01, (0.5, 0.6, 0.7), ratio=1.0)
-    np.testing.assert_allclose(everything, [4.99, 5.99, 6.99, 9.99])
 
 
 def test_a_pulse_and_a_record_without_a_first_part():
@@ -51,7 +49,6 @@ def test_channels_count_alike():
         (np.ones((2, 3, 4)), {}, "n_channels, n_steps"),
         (np.ones(10), {"shares": (0.5, 0.4)}, "increase between 0 and 1"),
         (np.ones(10), {"shares": (0.5, 1.0)}, "increase between 0 and 1"),
-        (np.ones(10), {"ratio": 0.9}, "ratio must be"),
     ],
 )
 def test_invalid_arguments(acceleration, settings, message):

@@ -1,11 +1,9 @@
 """Records that follow each other: joined samples, windows of the events, and a state that is carried through."""
 
-import pickle
-
 import numpy as np
 import pytest
 
-from fe_likelihoods import Events, IsolatedBridge, LinearOscillator, RCColumn, Record
+from fe_likelihoods import Events, LinearOscillator, RCColumn, Record
 from fe_likelihoods.problems import bridge_column_data
 
 
@@ -61,15 +59,6 @@ class TestFollowedBy:
             assert ours.fingerprint == theirs.fingerprint
             assert structure(Events([eq1, eq2])).with_record(long).fingerprint == theirs.fingerprint
 
-    def test_components_of_the_bridge_are_joined_one_by_one(self, eq1, eq2):
-        pairs = [(each.scale(3.0), each.scale(0.5)) for each in (eq1, eq2)]
-        joined = [first.followed_by(second, rest=0.2) for first, second in zip(*pairs, strict=True)]
-        bridge = IsolatedBridge(joined[0], vertical=joined[1])
-        long = IsolatedBridge(
-            Record("", 0.02, 3.0 * by_hand(eq1, 10, eq2)), vertical=Record("", 0.02, 0.5 * by_hand(eq1, 10, eq2))
-        )
-        np.testing.assert_array_equal(bridge.simulate(np.ones(10)), long.simulate(np.ones(10)))
-
 
 class TestEvents:
     def test_windows_keep_the_times_of_the_events(self, eq1, eq2):
@@ -108,11 +97,6 @@ class TestEvents:
         assert fine.window("EQ2").start == pytest.approx(events.window("EQ2").start - 0.01, abs=0.011)
         np.testing.assert_array_equal(fine.split(fine.acceleration)["EQ2"][::2], eq2.acceleration)
         assert type(events.trim(0.0, 0.5)) is Record
-
-    def test_copies_are_equal(self, eq1, eq2):
-        events = Events([eq1, eq2], rest=1.0)
-        other = pickle.loads(pickle.dumps(events))
-        assert other.windows == events.windows and other.fingerprint == events.fingerprint
 
     def test_bad_input_is_refused(self, eq1, eq2):
         cases = {

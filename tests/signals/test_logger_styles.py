@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.units import G0, to_si
 from tests.signals.logger_styles import ACCELERATION, COLUMNS, READ, REFUSED, STEP
 
@@ -16,7 +16,7 @@ def test_styles_that_are_read(tmp_path, style):
     path = tmp_path / "a.txt"
     path.write_text(READ[style], encoding="utf-8")
     column = COLUMNS.get(style)
-    record = read_csv(path, column=column)
+    record = read_record(path, column=column)
     assert record.dt == pytest.approx(STEP, rel=1e-12)
     np.testing.assert_allclose(record.acceleration / G0, ACCELERATION, atol=6e-6)
 
@@ -26,7 +26,7 @@ def test_styles_that_are_refused(tmp_path, style):
     text, message = REFUSED[style]
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(ValueError, match=message):
-        read_csv(tmp_path / "a.txt", column=COLUMNS.get(style))
+        read_record(tmp_path / "a.txt", column=COLUMNS.get(style))
 
 
 def test_zero_as_clock_time_of_unix_times(tmp_path):
@@ -54,7 +54,7 @@ def test_a_unix_time_beside_an_elapsed_one(tmp_path):
 )
 def test_numbers_of_other_countries_and_programs(tmp_path, cell, value):
     (tmp_path / "a.csv").write_text(f"time_s;acc [mm/s2]\n0.0;1\n0.1;{cell}\n")
-    assert read_csv(tmp_path / "a.csv").acceleration[1] == pytest.approx(1e-3 * value, rel=1e-12)
+    assert read_record(tmp_path / "a.csv").acceleration[1] == pytest.approx(1e-3 * value, rel=1e-12)
 
 
 def test_micro_and_milli():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns, read_record
-from fe_likelihoods.signals.read import read_csv
 from fe_likelihoods.signals.tables import unit_in_name
 from fe_likelihoods.units import G0
 
@@ -43,10 +42,10 @@ def test_units_in_names(name, unit):
 
 def test_letters_of_directions_are_no_units(path):
     path.write_text("time_s,acc_N,acc_S\n0.00,1,3\n0.01,2,4\n")
-    north, south = read_csv(path, "g", column="acc_N"), read_csv(path, "g", column="acc_S")
+    north, south = read_record(path, units="g", column="acc_N"), read_record(path, units="g", column="acc_S")
     np.testing.assert_allclose([north.acceleration, south.acceleration], G0 * np.array([[1, 2], [3, 4]]))
     with pytest.raises(ValueError, match="does not state the unit of its acceleration"):
-        read_csv(path, column="acc_N")
+        read_record(path, column="acc_N")
     path.write_text("time_s,base_N\n0.00,1\n0.01,2\n")
     force = Channel("base", "force", "kN")
     assert read_columns(path, (force,), ("base_N",)).values.tolist() == [[1.0, 2.0]]
@@ -58,14 +57,14 @@ def test_letters_of_directions_are_no_units(path):
 def test_line_of_units_with_an_unknown_one(path, units):
     path.write_text(f"Time,Acc\n{units}\n{ROWS}")
     with pytest.raises(ValueError, match="unknown unit 'furlong'; known units: acceleration: m/s2"):
-        read_csv(path, time_unit="s")
+        read_record(path, time_unit="s")
 
 
 def test_unknown_unit_of_a_column_that_is_not_read(path):
     path.write_text("Time,Acc,Status\ns,g,flag\n0.00,1,7\n0.01,2,7\n")
-    np.testing.assert_allclose(read_csv(path, column="Acc").acceleration / G0, [1, 2])
+    np.testing.assert_allclose(read_record(path, column="Acc").acceleration / G0, [1, 2])
     path.write_text("Test,3,A\nTime_s,E,N\n0.00,1,7\n0.01,2,7\n")  # directions, no line of units
-    np.testing.assert_allclose(read_csv(path, "g", column="N").acceleration / G0, [7, 7])
+    np.testing.assert_allclose(read_record(path, units="g", column="N").acceleration / G0, [7, 7])
 
 
 CLOCKS = {
@@ -88,7 +87,7 @@ CLOCKS = {
 @pytest.mark.parametrize("text", CLOCKS.values(), ids=CLOCKS)
 def test_clock_times(path, text):
     path.write_text(text)
-    record = read_csv(path, "g")
+    record = read_record(path, units="g")
     assert record.dt == 0.01
     np.testing.assert_allclose(record.acceleration / G0, [1, 2, 4])
 
@@ -131,13 +130,13 @@ def test_clock_times_begin_at_the_zero_of_the_record(path):
 def test_clock_times_that_are_refused(path, text, message):
     path.write_text("Time,acc_g\n" + text)
     with pytest.raises(ValueError, match=message):
-        read_csv(path)
+        read_record(path)
 
 
 def test_clock_times_are_no_values(path):
     path.write_text("time_s,acc_g\n0.00,12:00:00\n0.01,12:00:01\n")
     with pytest.raises(ValueError, match="expected one column of values"):
-        read_csv(path)
+        read_record(path)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +155,7 @@ def test_text_above_a_table_is_no_other_format(path, preamble, separator):
     np.testing.assert_allclose(read_record(path).acceleration / G0, [1, 2, 4])
     path.write_text(f"{preamble}\ntime_s,acc\n{ROWS}")
     with pytest.raises(ValueError, match="does not state the unit of its acceleration"):  # not: looks like an AT2 file
-        read_csv(path)
+        read_record(path)
 
 
 def test_numbers_for_missing_samples_in_a_record(path):
@@ -175,7 +174,7 @@ def test_numbers_for_missing_samples_in_a_record(path):
 def test_a_number_for_missing_samples_that_does_not_occur(path):
     path.write_text("time_s,acc_g\n0.00,1\n0.01,-9999.9\n0.02,4\n")
     reads = (
-        lambda: read_csv(path, missing=(-9999,)),
+        lambda: read_record(path, missing=(-9999,)),
         lambda: read_record(path, missing=(-9999,)),
         lambda: read_columns(path, (TOP,), ("acc_g",), missing=(-9999,)),
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fe_likelihoods import Channel, read_columns
-from fe_likelihoods.signals.read import read_csv
+from fe_likelihoods.signals.read import read_record
 from fe_likelihoods.signals.uneven_times import uniform_times
 from fe_likelihoods.units import G0
 
@@ -30,8 +30,8 @@ def uneven(lost=()):
 def test_jitter_is_interpolated_within_the_curvature_of_the_motion(tmp_path):
     path = write(tmp_path / "a.csv", uneven())
     with pytest.raises(ValueError, match=r"give resample=0\.01 to interpolate"):
-        read_csv(path)
-    record = read_csv(path, resample=STEP)
+        read_record(path)
+    record = read_record(path, resample=STEP)
     curvature = (2 * np.pi) ** 2 + 0.3 * 7**2
     times = uneven()[0] + record.time
     assert record.dt == STEP and record.n_steps in (299, 300)
@@ -50,7 +50,7 @@ def test_lost_samples_are_missing_in_measurements_and_straight_in_a_record(tmp_p
         measured.description.startswith("top, interpolated") and "with 2 gap(s) of up to 0.0396" in measured.description
     )
     with pytest.warns(UserWarning, match=r"with 2 gap\(s\) of up to 0\.0396.*the gaps are straight lines") as caught:
-        record = read_csv(path, resample=STEP)
+        record = read_record(path, resample=STEP)
     assert [warning.filename for warning in caught] == [__file__]
     assert np.isfinite(record.acceleration).all() and "2 gap(s)" in record.source
     assert np.diff(record.acceleration[100:103], 2) == pytest.approx(0.0, abs=1e-9)
@@ -64,7 +64,7 @@ def test_marks_of_missing_samples_are_not_interpolated(tmp_path):
     assert np.flatnonzero(np.isnan(measured.values[0])).tolist() == [4]
     assert np.nanmax(np.abs(measured.values / G0 - np.arange(10))) < 0.11
     with pytest.raises(ValueError, match="an excitation needs all samples, 1 are missing"):
-        read_csv(path, missing=(-9999,), resample=STEP)
+        read_record(path, missing=(-9999,), resample=STEP)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_marks_of_missing_samples_are_not_interpolated(tmp_path):
 )
 def test_what_cannot_be_resampled_is_refused(tmp_path, times, given, message):
     path = write(tmp_path / "a.csv", np.array(times))
-    for read in (lambda: read_csv(path, **given), lambda: read_columns(path, (TOP,), ("acc_g",), **given)):
+    for read in (lambda: read_record(path, **given), lambda: read_columns(path, (TOP,), ("acc_g",), **given)):
         with pytest.raises(ValueError, match=message):
             read()
 
