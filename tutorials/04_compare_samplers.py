@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fe_likelihoods import LogNormal, Prior
-from samplers import SMCSampler, TMCMCSampler, comparison_table
+from samplers import SMCSampler, TMCMCSampler
 
 plt.style.use("fe_likelihoods.plots.tutorials")
 
@@ -81,12 +81,13 @@ for Sampler in (SMCSampler, TMCMCSampler):
     sampler = Sampler(500, 2, log_probability, log_prior_fn=prior.logpdf, vectorize=True, seed=1)
     sampler.run_mcmc(prior.rvs(500, random_state=1), 4)
     samplers[Sampler.__name__.removesuffix("Sampler")] = sampler
-    print(sampler.verdict.summary)
+    print(f"{Sampler.__name__}: {sampler.evaluations} evaluations. {sampler.verdict.summary}")
 np.random.seed(1)  # noqa: NPY002 - emcee uses NumPy's global generator
 samplers["emcee"] = emcee.EnsembleSampler(32, 2, log_probability, vectorize=True)
 samplers["emcee"].run_mcmc(TRUTH + 0.01 * rng.standard_normal((32, 2)), 3000)
 discard = {"SMC": 0, "TMCMC": 0, "emcee": 1000}
-print(comparison_table(samplers, discard=1000))
+tau = samplers["emcee"].get_autocorr_time(discard=1000).max()
+print(f"emcee: 96000 evaluations, the kept chain is worth {32 * 2000 / tau:.0f} independent samples")
 
 # %%
 # What emcee does not show
