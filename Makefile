@@ -42,8 +42,9 @@ test-slow: $(READY) ## run the slow tests on all cores, in random order
 clients:         ## run every client on one posterior and compare with quadrature (makes an environment)
 	PYTHON=$(PYTHON) .ci/clients
 
-tutorials: $(READY) ## run every tutorial that needs no other data than the bundled ones
-	for t in tutorials/0[1-5]*.py tutorials/1[0-9]*.py; do $(BIN)/python $$t || exit 1; done
+tutorials: $(READY) ## run every tutorial; figures go to results-tutorials/
+	mkdir -p results-tutorials
+	cd results-tutorials && for t in ../tutorials/[0-9]*.py; do MPLBACKEND=Agg ../$(BIN)/python $$t || exit 1; done
 
 bench: $(READY)  ## run all benchmarks: accuracy and speed, many hours; `python -m benchmarks NAME` runs one
 	$(BIN)/python -m benchmarks

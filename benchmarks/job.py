@@ -2,9 +2,9 @@
 
 Seven parameters of the bridge column are updated by the default SMC and by the settings of the paper (1000 particles,
 ten Metropolis steps per stage, literal reading of its ladder) on the same data. Each run has its own process and stores
-its chain in a file, as the tutorial does. The settings of the paper need about 235 000 simulations, so by default the
+its chain in a file, as scripts do. The settings of the paper need about 235 000 simulations, so by default the
 record is reduced to one sample in sixteen. A run that exceeds its time limit is stopped and its row reports the stage
-reached; nothing is extrapolated. ``--every 4`` is the reduced setting of the tutorial, ``--every 1`` the full record.
+reached; nothing is extrapolated. ``--every 4`` is a reduced setting, ``--every 1`` the full record.
 
 One run: ``python -m benchmarks.job SETTING EVERY FILE``.
 """

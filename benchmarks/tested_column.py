@@ -1,7 +1,7 @@
-"""A cyclic test of a reinforced-concrete column, as in ``tutorials/08_cyclic_column.py``.
+"""A cyclic test of a reinforced-concrete column, read by ``tested_columns.py``.
 
 Lehman & Moehle, specimen 415, first half of the history, one sample in two and all turning points; seven parameters.
-The data are those that the tutorial names, in the folder ``measured/rc_column_cyclic`` of the reference material.
+The data are in the folder ``measured/rc_column_cyclic`` of the reference material.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from fe_likelihoods import (
     Uniform,
     to_si,
 )
-from tutorials.tested_columns import PROPERTIES, read_column
+from tests.models.tested_columns import PROPERTIES, read_column
 
 from .targets import SHARED
 
@@ -28,7 +28,7 @@ __all__ = ["autoregressive", "missing", "white"]
 FOLDER = SHARED / "measured" / "rc_column_cyclic"
 HISTORY = "2017_Lehman_415.csv"
 EVERY = 2
-SENSOR = to_si(0.13, "kip").item()  # upper bound of the noise of the force, as the tutorial finds it
+SENSOR = to_si(0.13, "kip").item()  # upper bound of the noise of the force
 SIGMA = to_si(5.0, "kip").item()  # scale of the prior of the error
 PRIOR = {
     "Ec": TruncatedNormal(1.0, 0.3),

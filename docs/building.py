@@ -1,4 +1,4 @@
-"""Parts of the documentation that are made when it is built: links to the reference, and arguments of the tutorials."""
+"""Parts of the documentation that are made when it is built: links to the reference."""
 
 import importlib
 import re
@@ -23,11 +23,6 @@ INSTANCES = {
     "record": "fe_likelihoods.Record",
     "sampler": "samplers.SMCSampler",
 }
-
-
-def tutorial_arguments(gallery_conf: dict, script_vars: dict) -> list[str]:
-    """Command line of a tutorial: its results go into the build folder."""
-    return ["--out", f"../docs/_build/tutorials/{Path(script_vars['src_file']).stem}"]
 
 
 @cache

@@ -2,17 +2,13 @@
 
 The reference has one page per public name, generated from the docstrings (``api.rst``, ``_templates``); names in code
 font link to it (``building.py``).
-Tutorials 01 to 05 and 10 to 13 are executed in their quick setting (``FAST=1``); 06 to 09 need data that readers must
-fetch, and are shown without output. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
+Tutorials are executed. Pages and tutorials are written into folders that git ignores: ``docs/api`` and
 ``docs/tutorials``.
 """
 
-import os
 import sys
 from importlib import metadata
 from pathlib import Path
-
-os.environ["FAST"] = "1"  # quick settings of the tutorials
 
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent / "tutorials")]  # `building`, and the modules that tutorials share
@@ -56,10 +52,9 @@ maximum_signature_line_length = 88  # one argument per line where a signature is
 sphinx_gallery_conf = {
     "examples_dirs": "../tutorials",
     "gallery_dirs": "tutorials",
-    "filename_pattern": r"/(0[1-5]|1[0-9])_",  # executed
-    "ignore_pattern": r"^[a-z_]+\.py$",  # modules that tutorials share
+    "filename_pattern": r"/\d\d_",  # executed
+    "ignore_pattern": r"own_program\.py$",
     "within_subsection_order": "FileNameSortKey",
-    "reset_argv": "building.tutorial_arguments",
     "capture_repr": (),
     "remove_config_comments": True,
     "download_all_examples": False,

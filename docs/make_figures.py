@@ -1,14 +1,11 @@
 """Make the figures of README and documentation (`make figures`): small files in docs/figures, the same on every run.
 
-Tutorial 01 makes those of the oscillator, 02 and 03 those of the updates, 10 those of damage, 12 those of the choice of
-sensors, 13 those of lost stiffness; they take minutes.
-`sampler_figures` compares the samplers and shows what goes wrong. The models draw their section and their hysteresis
-loops.
+Tutorials make most of them. The column with two events takes minutes. Figures of real measurements and of reports are
+kept as they are (``real_*.png``, ``report_*.png``, ``stiffness_loss_reliability.png``).
 """
 
 import os
-import subprocess
-import sys
+import runpy
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,45 +15,51 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import sampler_figures
+from matplotlib.figure import Figure
 from PIL import Image
+from scipy.signal import lfilter
 
 from fe_likelihoods import (
+    AutoregressiveNoise,
+    FELikelihood,
+    GaussianNoise,
+    HalfNormal,
+    LinearOscillator,
     LinearStructure,
+    Measurements,
+    Posterior,
     RCColumn,
     ShearFrame,
     TruncatedNormal,
+    Uniform,
     material_curves,
     moment_curvature,
+    plot_fit,
     plot_hysteresis,
     plot_material,
     plot_moment_curvature,
+    plot_residuals,
     plot_section,
     plot_sensors,
     problems,
     rank_sensors,
 )
+from samplers import SMCSampler, plot_corner
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
-FIGURES_OF_TUTORIALS = {  # script and options: name of its figure, name here
-    "01_linear_oscillator.py": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
-    "02_bridge_column.py --events 2 --guide --walkers 100": {
-        "fig4_pair": "column_pair",
-        "corner": "column_corner",
-        "fig5_response": "column_fit",
-    },
-    "03_isolated_bridge.py --sampler guide --walkers 100 --step 1e-3": {
-        "fig5_parameters_and_fit": "bridge_parameters",
-        "fig6_marginals": "bridge_marginals",
-        "fig7_predictions": "bridge_prediction",
-    },
-    "10_damage.py": {"damage_predicted": "column_damage", "prediction": "damage_prediction"},
-    "12_which_sensors.py": {"column": "sensors_chosen", "predicted_and_obtained": "sensors_predicted"},
-    "13_stiffness_loss.py": {"losses": "stiffness_losses"},
+FIGURES_OF_TUTORIALS = {  # name of the figure: name here
+    "01_first_steps": {name: f"oscillator_{name}" for name in ("record", "corner", "fit", "prediction")},
+    "05_few_simulations": {"marginals": "bridge_marginals"},
+    "06_events_and_prediction": {"new_events": "new_events"},
+    "07_damage_and_decision": {"damage": "column_damage", "prediction": "damage_prediction"},
+    "08_which_sensors": {"column": "sensors_chosen", "motions": "sensors_motions"},
+    "09_stiffness_loss": {"losses": "stiffness_losses"},
 }
 WIDEST = 1100  # pixels
 LARGEST = 145 * 1024  # bytes
+SEED = 1
+CORRELATION_TIME = 0.6  # [s] of the errors: as of model errors, which change more slowly than the samples follow
 
 
 def shrink(source: Path, name: str) -> None:
@@ -130,20 +133,74 @@ def ranked_sensors() -> dict:
     return {"sensors_ranked": figure}
 
 
+def _oscillator(seed: int) -> tuple[Measurements, LinearOscillator, np.ndarray]:
+    """Synthetic measurements with errors that are correlated from sample to sample."""
+    motion = problems.bridge_column_data().record
+    motion = motion.resample(2 * motion.dt).trim(0.0, 25.0)
+    model = LinearOscillator(motion, period=1.0, damping_ratio=0.05)
+    truth, correlation = np.array([1.15, 0.7]), np.exp(-motion.dt / CORRELATION_TIME)
+    clean = model.simulate(truth)
+    errors = np.random.default_rng(seed).standard_normal(clean.shape)
+    errors[:, 1:] *= np.sqrt(1.0 - correlation**2)
+    errors = 0.3 * clean.std(axis=1, keepdims=True) * lfilter([1.0], [1.0, -correlation], errors, axis=1)
+    return Measurements(model.channels, model.dt, clean + errors, "SYNTHETIC: errors with correlation"), model, truth
+
+
+def _sample(
+    measured: Measurements, model: LinearOscillator, correlated: bool, seed: int
+) -> tuple[Posterior, np.ndarray]:
+    """Posterior and samples under white noise or under AR(1) errors."""
+    prior = {"stiffness": TruncatedNormal(1.0, 0.3), "damping": TruncatedNormal(1.0, 0.5)}
+    prior |= {
+        f"sigma_{channel.name}": HalfNormal(scale) for channel, scale in zip(model.channels, (5.0, 0.2), strict=True)
+    }
+    noise = AutoregressiveNoise(model.channels) if correlated else GaussianNoise(model.channels)
+    prior |= {f"rho_{channel.name}": Uniform(0.0, 1.0) for channel in model.channels} if correlated else {}
+    posterior = Posterior(FELikelihood(model, measured, noise), prior)
+    sampler = SMCSampler(300, posterior.ndim, posterior, vectorize=True, seed=seed)
+    sampler.run_mcmc(None, 4)
+    return posterior, sampler.get_chain(flat=True)
+
+
+def correlated_errors() -> dict[str, Figure]:
+    """What white noise does to a posterior when the errors are correlated: intervals too narrow, and how to see it."""
+    measured, model, truth = _oscillator(SEED)
+    runs = {"white noise": _sample(measured, model, False, SEED), "AR(1) noise": _sample(measured, model, True, SEED)}
+    labels = [parameter.label for parameter in runs["white noise"][0].parameters[:2]]
+    samples = {label: x[:, :2] for label, (_, x) in runs.items()}
+    posterior, x = runs["white noise"]
+    residuals = posterior.likelihood.residuals(x.mean(axis=0))
+    return {
+        "wrong_noise": plot_corner(samples, labels=labels, truths=truth, title="Correlated errors (synthetic data)"),
+        "wrong_noise_residuals": plot_residuals(residuals, model.channels, model.dt),
+    }
+
+
+def column_update() -> dict:
+    """The column of the published study, updated with EQ1 and a stronger EQ2."""
+    posterior = problems.bridge_column(data="eq1-eq2")
+    truth = [*problems.BRIDGE_COLUMN_MEANS.values(), *problems.BRIDGE_COLUMN_SENSOR_NOISE.values()]
+    sampler = SMCSampler(100, posterior.ndim, posterior, vectorize=True, seed=SEED, guide=posterior.guide())
+    sampler.run_mcmc(None, 1)
+    print(sampler.verdict)
+    measured, means = posterior.likelihood.measurements, sampler.get_chain(flat=True).mean(axis=0)[:5]
+    points = {"Before updating (reported values)": np.ones(5), "After updating (posterior mean)": means}
+    responses = {title: measured.values - posterior.likelihood.residuals(theta) for title, theta in points.items()}
+    corner = plot_corner(sampler.signed_sample.draw(4000, SEED), posterior, truths=truth)
+    return {"column_corner": corner, "column_fit": plot_fit(measured, responses, title="synthetic data")}
+
+
 if __name__ == "__main__":
     TARGET.mkdir(exist_ok=True)
+    made = model_figures() | ranked_sensors() | correlated_errors() | column_update()
     with tempfile.TemporaryDirectory() as folder:
-        for tutorial, figures in FIGURES_OF_TUTORIALS.items():
-            script, *options = tutorial.split()
-            command = [sys.executable, ROOT / "tutorials" / script, *options, "--out", folder]
-            subprocess.run(command, check=True, env={k: v for k, v in os.environ.items() if k != "FAST"})
-            for name, new_name in figures.items():
-                shrink(Path(folder) / f"{name}.png", new_name)
-        samplers = {"samplers_column": sampler_figures.column(), "samplers_bridge": sampler_figures.bridge()}
-        for name, figure in (
-            model_figures() | ranked_sensors() | samplers | sampler_figures.correlated_errors()
-        ).items():
+        for name, figure in made.items():
             figure.savefig(Path(folder) / f"{name}.png", dpi=85)
             shrink(Path(folder) / f"{name}.png", name)
+        os.chdir(folder)
+        for tutorial, figures in FIGURES_OF_TUTORIALS.items():
+            runpy.run_path(str(ROOT / "tutorials" / f"{tutorial}.py"))
+            for name, new_name in figures.items():
+                shrink(Path(folder) / f"{name}.png", new_name)
     for path in sorted(TARGET.glob("*.png")):
         print(f"{path.relative_to(ROOT)}: {path.stat().st_size / 1024:.0f} kB")

@@ -42,7 +42,7 @@ from .noise.gaussian import GaussianNoise
 from .noise.residuals import effective_samples, residual_checks
 from .plots.damage import plot_damage
 from .plots.fits import plot_fit
-from .plots.histories import plot_histories, plot_record, plot_residuals, plot_response, plot_spectrum
+from .plots.histories import plot_histories, plot_record, plot_residuals, plot_spectrum
 from .plots.materials import plot_material, plot_moment_curvature
 from .plots.predictions import plot_bands, plot_fragility
 from .plots.scores import plot_scores
@@ -158,7 +158,6 @@ __all__ = [
     "plot_ranking",
     "plot_record",
     "plot_residuals",
-    "plot_response",
     "plot_scores",
     "plot_section",
     "plot_sensors",

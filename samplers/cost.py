@@ -106,7 +106,7 @@ def estimate_cost(
     One point is evaluated without timing, because the first evaluation may include a job queue, the start of processes,
     or a compilation. Then `runs` points are timed, one after another. All are draws of the prior. A sampler with the
     same `seed` starts from them, so a posterior with a cache does not repeat them. The range is too low for many
-    posteriors with heavy tails (``docs/accuracy``), and for models that take longer near the posterior.
+    posteriors with heavy tails (``docs/results``), and for models that take longer near the posterior.
 
     Parameters
     ----------

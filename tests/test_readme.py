@@ -147,7 +147,7 @@ def test_links_to_files_lead_somewhere():
 
 
 def test_files_named_in_the_text_exist():
-    """Paths such as ``benchmarks`` or ``fe_likelihoods/models/steel_coupon.py`` in running text."""
+    """Paths such as ``benchmarks`` or ``fe_likelihoods/models/rc_column.py`` in running text."""
     pattern = re.compile(r"(?<!:doc:)`((?:fe_likelihoods|samplers|tutorials|tests|data|docs)/[\w./]*\w/?)`")
     for page in PAGES:
         for path in pattern.findall(page.read_text()):

@@ -16,7 +16,6 @@ from .style import (
     BLUE,
     GREY,
     ORANGE,
-    add_legend_row,
     channel_label,
     marker_of,
     new_axes,
@@ -30,9 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..signals.records import Record
-    from ..simulation.model import Model
 
-__all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residuals", "plot_response", "plot_spectrum"]
+__all__ = ["plot_histories", "plot_loop", "plot_record", "plot_residuals", "plot_spectrum"]
 
 _SHADES = (BLUE, ORANGE, "#5b8c5a", "#b03a48", GREY)
 _SPECTRUM_UNITS = {"pseudo_acceleration": "g", "pseudo_velocity": "cm/s", "displacement": "cm"}
@@ -149,27 +147,16 @@ def plot_spectrum(
 
 
 def plot_histories(
-    measurements: Measurements | None = None,
-    response: Measurements | None = None,
-    channels: Sequence[str] | None = None,
-    label: str = "model",
-    time_label: str = "time [s]",
+    measurements: Measurements, channels: Sequence[str] | None = None, time_label: str = "time [s]"
 ) -> Figure:
-    """Plot the histories of channels above one another: measurements, the response of a model, or both.
-
-    The legend has the relative root mean square error (RRMSE) of the response in each channel.
+    """Plot the histories of channels above one another; `plot_fit` compares measurements with responses.
 
     Parameters
     ----------
-    measurements : Measurements, optional
-        The measured histories, such as `fe_likelihoods.Measurements`.
-    response : Measurements, optional
-        The simulated histories. A channel that only one of the two has is drawn alone.
+    measurements : Measurements
+        The histories, measured or simulated.
     channels : sequence of str, optional
-        Names of the channels to draw. Default: all measured channels, or all channels of the response if there are no
-        measurements.
-    label : str
-        Label of the response in the legend.
+        Names of the channels to draw. Default: all.
     time_label : str
         Label of the horizontal axis, for example "step" for a test without time.
 
@@ -181,43 +168,23 @@ def plot_histories(
     Raises
     ------
     ValueError
-        If both are missing, a channel does not exist, or a channel has different dimensions in the two; as
-        `Measurements.rrmse_of`.
+        If a channel does not exist.
 
     Examples
     --------
     >>> figure = plot_histories(measurements, channels=["displacement"])
     """
-    sources = [source for source in (measurements, response) if source is not None]
-    if not sources:
-        raise ValueError("nothing to draw: give measurements, a response, or both")
-    errors = measurements.rrmse_of(response) if len(sources) == 2 else {}
-    known = {channel.name: channel for source in reversed(sources) for channel in source.channels}
-    names = select_names(channels, known, [channel.name for channel in sources[0].channels])
+    known = {channel.name: channel for channel in measurements.channels}
+    names = select_names(channels, known, list(known))
     figure, rows = stack_axes(len(names))
     for axes, name in zip(rows, names, strict=True):
-        measured, simulated = (_find(source, name) for source in (measurements, response))
-        if measured and simulated and measured.dimension != simulated.dimension:
-            raise ValueError(
-                f"channel {name!r} is {measured.quantity!r} in the measurements, {simulated.quantity!r} in the response"
-            )
-        unit = known[name].unit
-        if measured:
-            width, shade, alpha = (1.8, ORANGE, 0.65) if simulated else (0.8, BLUE, 1.0)
-            values = from_si(measurements.channel(name), unit)
-            drawn = {"color": shade, "linewidth": width, "alpha": alpha, "label": "measured"}
-            axes.plot(measurements.times(name), values, marker=marker_of(values), markersize=2.0, **drawn)
-        if simulated:
-            text = label + (f", RRMSE {100 * errors[name]:.3g} %" if name in errors else "")
-            values = from_si(response.channel(name), unit)
-            axes.plot(response.times(name), values, color=BLUE, linewidth=0.8, label=text)
-        if measured and simulated:
-            add_legend_row(axes, 2)
+        values = from_si(measurements.channel(name), known[name].unit)
+        style = {"color": BLUE, "linewidth": 0.8, "marker": marker_of(values), "markersize": 2.0}
+        axes.plot(measurements.times(name), values, **style)
         axes.set_ylabel(channel_label(known[name]))
         axes.grid(alpha=0.25)
-    last = max(source.times(name)[-1] for source in sources for name in names if _find(source, name))
-    set_time_axis(rows, last, time_label)
-    if measurements is not None and measurements.description:
+    set_time_axis(rows, max(measurements.times(name)[-1] for name in names), time_label)
+    if measurements.description:
         figure.suptitle(measurements.description, fontsize="small", wrap=True)
     return figure
 
@@ -236,38 +203,6 @@ def plot_loop(
     axes.set(xlabel=x_label, ylabel=y_label, title=title)
     axes.grid(alpha=0.25)
     return axes
-
-
-def plot_response(model: Model, theta: np.ndarray, measurements: Measurements | None = None) -> Figure:
-    """Plot the response of a model at `theta`, together with measurements of its channels if they are given.
-
-    Parameters
-    ----------
-    model : Model
-        The model, of which one simulation is run.
-    theta : ndarray[n_parameters]
-        Values of ``model.parameter_names``, in this order.
-    measurements : Measurements, optional
-        The measurements. Only their channels are drawn.
-
-    Returns
-    -------
-    matplotlib Figure
-        The figure, one axes per channel.
-
-    Raises
-    ------
-    SimulationFailed
-        As ``model.simulate``.
-    ValueError
-        As `plot_histories`.
-
-    Examples
-    --------
-    >>> figure = plot_response(model, [1.1, 0.9], measurements)
-    """
-    response = Measurements(model.channels, model.dt, model.simulate(np.asarray(theta, dtype=float)))
-    return plot_histories(measurements, response, time_label=getattr(model, "time_label", "time [s]"))
 
 
 def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float) -> Figure:
@@ -342,9 +277,3 @@ def plot_residuals(residuals: np.ndarray, channels: Sequence[Channel], dt: float
     for axes, text in zip(rows[-1], ("time [s]", "lag [s]", "quantile of a standard normal [-]"), strict=True):
         axes.set_xlabel(text)
     return figure
-
-
-def _find(source: Measurements | None, name: str) -> Channel | None:
-    if source is None:
-        return None
-    return next((channel for channel in source.channels if channel.name == name), None)

@@ -26,8 +26,6 @@ __all__ = ["plot_scores"]
 _LEVELS = ("weak", "moderate", "strong")
 _BAND = 0.9  # probability of the bands for calibrated predictions
 _BINS = 10
-_MOST_NAMES = 16  # points with names beside the last axes
-_LINE = 0.062  # height of such a name, as a share of the axes' height
 _SPAN = 0.1  # of coverages below the level that is shown at least
 _FEWEST = 3  # events whose scatter is drawn as standard errors
 
@@ -49,8 +47,8 @@ def plot_scores(
         90 % of the shares of calibrated predictions (binomial, for the number of independent samples), and standard
         errors of their mean between histories for three events or more. Histories:
         coverage of weak, moderate and strong response with its standard error (between events for three events or more,
-        else binomial, for the number of independent samples), and the coverage against the width of the band and the
-        interval score, both as multiples of the root mean square of the measured channel. Numbers: median,
+        else binomial, for the number of independent samples), and the interval score of each channel, which is the
+        width of the band and a penalty, as multiples of the root mean square of the measured channel. Numbers: median,
         50 % and outer interval divided by the measured value, in the order of the events, and the shares of
         measured values in the intervals, with the mean width and score of the outer ones.
 
@@ -116,59 +114,26 @@ def _history_axes(axes: np.ndarray, events: Mapping[str, HistoryScores]) -> None
             frameon=False, fontsize="small", ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2), columnspacing=1.0
         )
 
-    points = [(event, each, k) for event, each in events.items() for k in range(len(each.channels))]
-    for _event, each, k in points:
-        name = each.channels[k].name
-        ends = each.width[k] / each.rms[k], each.interval_score[k] / each.rms[k]
-        colour = _colour(names.index(name))
-        axes[2].plot(ends, [each.coverage[k]] * 2, color=colour, linewidth=0.8)
-        axes[2].plot(ends[0], each.coverage[k], "o", color=colour, fillstyle="none", markersize=5)
-        axes[2].plot(ends[1], each.coverage[k], "o", color=colour, markersize=5)
-    axes[2].axhline(level, color=GREY, linewidth=0.8)
-    axes[2].set_xlabel("width (open), interval score (full) / RMS [-]")
-    axes[2].set_ylabel(f"share in the {level:.0%} band [-]")
-    axes[2].set_title("sharpness beside coverage", fontsize="medium")
-    axes[2].margins(x=0.08)
-    axes[2].set_xlim(left=0.0)
-    axes[2].set_ylim(min(level - _SPAN, axes[2].dataLim.ymin - 0.03), 1.03)
-    if len(points) <= _MOST_NAMES:
-        texts = [
-            f"{event}: {each.channels[k].name}" if event and len(names) > 1 else event or each.channels[k].name
-            for event, each, k in points
-        ]
-        ends = [(each.interval_score[k] / each.rms[k], each.coverage[k]) for _, each, k in points]
-        _name_points(axes[2], texts, ends)
+    widths, penalties = np.transpose([_sharpness_of(name, list(events.values())) for name in names])
+    axes[2].barh(names, widths, 0.6, color=BLUE, alpha=0.6, label="width")
+    axes[2].barh(names, penalties, 0.6, widths, color=ORANGE, label="penalty of values outside")
+    axes[2].set_ylim(len(names) - 0.4, -0.6)
+    axes[2].set_xlabel("interval score / RMS of the measured channel [-]")
+    axes[2].set_title(f"sharpness: score of the {level:.0%} band", fontsize="medium")
+    axes[2].legend(frameon=False, fontsize="small", ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.2))
     for each in axes:
         each.grid(alpha=0.25)
 
 
-def _name_points(axes: Axes, texts: Sequence[str], points: Sequence[tuple[float, float]]) -> None:
-    """Write names at the right of the axes, ordered like the heights of their points, with a line to each point."""
-    low, high = axes.get_ylim()
-    heights = np.array([(y - low) / (high - low) for _, y in points])
-    order = np.argsort(heights, kind="stable")
-    places = _spread(heights[order], _LINE)
-    for k, place in zip(order, places, strict=True):
-        axes.annotate(
-            texts[k],
-            points[k],
-            (1.04, place),
-            textcoords="axes fraction",
-            fontsize="x-small",
-            verticalalignment="center",
-            arrowprops={"arrowstyle": "-", "color": GREY, "linewidth": 0.5, "shrinkA": 0.0, "shrinkB": 3.0},
-        )
-
-
-def _spread(heights: np.ndarray, gap: float) -> np.ndarray:
-    """Ascending heights with the least sum of squared shifts that makes them `gap` or more apart."""
-    groups: list[list[float]] = []  # number of heights, and their mean without the gaps
-    for k, height in enumerate(heights):
-        groups.append([1.0, height - k * gap])
-        while len(groups) > 1 and groups[-2][1] > groups[-1][1]:  # pool adjacent violators
-            (n, mean), (m, other) = groups.pop(), groups.pop()
-            groups.append([n + m, (n * mean + m * other) / (n + m)])
-    return np.repeat([mean for _, mean in groups], [int(n) for n, _ in groups]) + gap * np.arange(len(heights))
+def _sharpness_of(name: str, events: Sequence[HistoryScores]) -> tuple[float, float]:
+    """Mean width and mean penalty of a channel, whose sum is the interval score, over its root mean square."""
+    found = [
+        (each.width[k] / each.rms[k], (each.interval_score[k] - each.width[k]) / each.rms[k])
+        for each in events
+        for k, channel in enumerate(each.channels)
+        if channel.name == name
+    ]
+    return tuple(np.nanmean(found, axis=0).tolist())
 
 
 def _coverage_of(name: str, events: Sequence[HistoryScores]) -> tuple[np.ndarray, np.ndarray]:

@@ -34,6 +34,7 @@ __all__ = [
     "save_picture",
 ]
 
+SMOOTH = 4000  # draws with smooth contours of 50 and 90 %
 LEGIBLE = 80  # pixels per inch at which the smallest labels can be read
 WIDEST = 1100  # pixels: fits on a page of 1200
 RESOLUTION = 110  # dots per inch: sharp at the width of a page, some tens of kB
@@ -74,9 +75,20 @@ def _picture(title: str, caption: str, alt: str, draw: Callable[[], "Figure"]) -
     return Picture(title, caption, alt, source, "", width)
 
 
+def drawn_samples(run: FinishedRun) -> tuple[np.ndarray, str]:
+    """Samples (n, ndim) for figures: many of the emulated posterior of a usable guided run; and what they are."""
+    signed = getattr(run.sampler, "signed_sample", None)
+    if signed is None or run.is_inconclusive:
+        distinct = len(np.unique(run.samples, axis=0))
+        return run.samples, f"Drawn are {len(run.samples)} samples of the chain, {distinct} of them distinct."
+    draws = signed.draw(SMOOTH)
+    return draws, f"Drawn are {len(draws)} draws of the emulated posterior; the table is corrected by simulated draws."
+
+
 def draw_posterior(run: FinishedRun) -> list[Picture]:
     """Prior and posterior of each parameter, and samples of all pairs."""
     described = hasattr(run.posterior, "parameters")
+    samples, drawn = drawn_samples(run)
     options = {
         "posterior": run.posterior if described else None,
         "labels": None if described else run.names,
@@ -88,14 +100,15 @@ def draw_posterior(run: FinishedRun) -> list[Picture]:
             "Where the posterior is as wide as the prior, the data say nothing about the parameter. Where it leans "
             "against the end of the prior, the prior decides.",
             f"Prior and posterior density of {', '.join(run.names)}.",
-            lambda: plot_marginals(run.samples, **options),
+            lambda: plot_marginals(samples, **options),
         ),
         _picture(
             "Pairs of parameters",
             "A narrow, inclined cloud: the data determine a combination of two parameters better than each of them. "
-            "Separate clouds: separate explanations of the data. Values outside of a panel are written at its edge.",
+            "Separate clouds: separate explanations of the data. Values outside of a panel are written at its edge. "
+            + drawn,
             f"Posterior samples of each parameter and each pair of {', '.join(run.names)}.",
-            lambda: plot_corner(run.samples, **options),
+            lambda: plot_corner(samples, **options),
         ),
     ]
 

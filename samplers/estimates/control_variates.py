@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..resampling import systematic
 from .genealogy import student_factor
 from .importance import KnownDensity, Round
 
@@ -74,6 +75,12 @@ class SignedSample(NamedTuple):
             f"<SignedSample of {m} points, {ndim} parameters, log-evidence {self.log_evidence:.3f} +- "
             f"{self.log_evidence_error:.3f}>"
         )
+
+    def draw(self, n: int = 4000, seed: int = 0) -> np.ndarray:
+        """Draws (n, ndim) of the known densities for figures: smooth, since they are many, and not simulated."""
+        known = (self.rounds == 0) & (self.weights > 0.0)
+        rng = np.random.default_rng(seed)
+        return self.coords[known][systematic(self.weights[known] / self.weights[known].sum(), rng, n)]
 
     def expectation(self, function: Callable[[np.ndarray], np.ndarray] | None = None) -> Expectation:
         """Expectation of a function of points (m, ndim), which returns (m,) or (m, k); by default of the parameters."""

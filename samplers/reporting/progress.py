@@ -20,6 +20,9 @@ __all__ = ["ANNEALING", "Progress", "get_progress_bar", "show_sweeps"]
 SECONDS_BETWEEN_LINES = 60.0
 SECONDS_BETWEEN_FIGURES = 0.1
 ANNEALING = "annealing"
+# Guesses before anything is known, for the bar alone: six guides of the tutorials searched with 6 to 34 simulations for
+# each parameter and one more, and made 1.1 to 1.7 draws for each walker.
+SEARCH_SIMULATIONS, DRAWS_PER_WALKER = 12, 1.3
 ORDER = ("beta", "log Z", "failures", "ESS", "acceptance", "simulations", "running")  # the most important figures first
 
 
@@ -78,6 +81,8 @@ class Progress:
         self._announce: Callable | None = getattr(function, "when_simulated", None)
         self._silent = not hasattr(bar, "set_postfix")  # emcee's silent bar has only update
         self._figures: dict[str, Any] = {}
+        self._phase = ""  # of a guide
+        self._expected = self._of_guide = 0.0  # simulations of the run; those that the posterior does not count
         self._done = self._running = self._shown = 0
         self._part = 0.0  # of a point: simulations of a point that has several
         self._drawn = time.perf_counter()
@@ -134,11 +139,17 @@ class Progress:
         if self._silent or not isinstance(report, Sweep | Stage | GuideTick | Restart):
             return
         effective = f"{population.effective_sample_size:.0f}"
+        self._phase = report.phase if isinstance(report, GuideTick) else ""
         if isinstance(report, GuideTick):
+            self._of_guide = report.simulations - self._made().get("simulations", 0)
+            search = SEARCH_SIMULATIONS * (population.coords.shape[1] + 1)
+            missing = DRAWS_PER_WALKER * max(report.target - population.effective_sample_size, 0.0)
+            self._expected = missing + (
+                max(search, report.simulations) if report.phase == "search" else report.simulations
+            )
             self._figures = {"simulations": round(report.simulations), "ESS": f"{effective}/{report.target}"}
             if result.rounds:
                 self._figures["log Z"] = f"{result.rounds[-1].log_evidence:.2f}"
-            self._bar.set_description_str(f"guide: {report.phase}", refresh=False)
         elif isinstance(report, Sweep) or not result.rounds:
             acceptance = f"{getattr(report, 'acceptance', 0.0):.2f}"
             self._figures = {"beta": f"{population.beta:.3g}", "ESS": effective, "acceptance": acceptance}
@@ -169,11 +180,19 @@ class Progress:
         self._drawn = time.perf_counter()
         if self._counts_points:
             steps, self._shown = self._done - self._shown, self._done
-        counts = {name: number - self._before[name] for name, number in self._counts().items()}
+        counts = self._made()
+        if self._phase:
+            made = round(self._of_guide + counts.get("simulations", 0))
+            text = f"{self._phase}: simulation {made} of about {max(made, float(f'{self._expected:.2g}')):.0f}"
+            self._bar.set_description_str(text, refresh=False)
         figures = {name: number for name, number in counts.items() if number or name == "simulations"}
         figures |= self._figures | ({"running": self._running} if self._running else {})
         self._bar.set_postfix({name: str(figures[name]) for name in ORDER if name in figures}, refresh=False)
         self._bar.update(steps)
+
+    def _made(self) -> dict[str, int]:
+        """Counts since the bar was made."""
+        return {name: number - self._before[name] for name, number in self._counts().items()}
 
     def _counts(self) -> dict[str, int]:
         """Failed evaluations and failed simulations, and simulations of the posterior if it counts them."""

@@ -29,7 +29,7 @@ from fe_likelihoods.problems import bridge_column_data
 from fe_likelihoods.simulation.model import is_collapse
 from fe_likelihoods.units import G0
 from tests.kernels import golden
-from tutorials.tested_columns import read_column
+from tests.models.tested_columns import read_column
 
 WEAK = LowCycleFatigue(cf=0.09, cd=0.389)
 

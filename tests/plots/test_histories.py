@@ -1,14 +1,10 @@
 """Figures of records, histories and residuals: the data they show, the units of the labels, and the limits."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from fe_likelihoods import plot_histories, plot_record, plot_residuals, plot_response, plot_spectrum
+from fe_likelihoods import plot_histories, plot_record, plot_residuals, plot_spectrum
 from fe_likelihoods.checks.fit import describe_residuals
-from fe_likelihoods.models.function import FunctionModel
-from fe_likelihoods.models.linear_oscillator import LinearOscillator
 from fe_likelihoods.noise.residuals import autocorrelation, residual_checks
 from fe_likelihoods.plots.histories import plot_loop
 from fe_likelihoods.signals.channels import Channel, Measurements
@@ -82,32 +78,6 @@ def test_measurements(measured):
     assert only.get_ylabel() == "drift [mm]"
     with pytest.raises(ValueError, match="channels must be some of top, drift; got \\['Top'\\]"):
         plot_histories(measured, channels="Top")
-    with pytest.raises(ValueError, match="nothing to draw"):
-        plot_histories()
-
-
-def test_measurements_beside_a_response(measured):
-    response = replace(measured, values=1.1 * measured.values)
-    axes = plot_histories(measured, response, label="at the mean").axes[1]
-    assert [line.get_label() for line in axes.lines] == ["measured", "at the mean, RRMSE 10 %"]
-    np.testing.assert_allclose(axes.lines[1].get_ydata(), 1.1e3 * measured.values[1])
-    axes = plot_histories(measured, response.decimate(2)).axes[0]
-    assert texts(axes) == ["measured", "model"], "no error for different instants"
-    assert shows(axes, axes.lines)
-    silent = replace(measured, values=measured.values * [[1.0], [0.0]])
-    assert texts(plot_histories(silent, response).axes[1]) == ["measured", "model"], "no error relative to zero"
-    other = replace(response, channels=(Channel("top", "velocity", "m/s"), CHANNELS[1]))
-    with pytest.raises(ValueError, match="'top' is 'absolute acceleration' in the measurements, 'velocity' in"):
-        plot_histories(measured, other)
-
-
-def test_response_of_any_model(record, measured):
-    oscillator = LinearOscillator(record)
-    figure = plot_response(oscillator, [1.2, 0.8])
-    np.testing.assert_allclose(figure.axes[1].lines[0].get_ydata(), 100.0 * oscillator.simulate([1.2, 0.8])[1])
-    function = FunctionModel(lambda theta: theta[0] * measured.values, ("gain",), CHANNELS, 0.1, 50)
-    axes = plot_response(function, [2.0], measured.select(["drift"])).axes
-    assert len(axes) == 1 and texts(axes[0]) == ["measured", "model, RRMSE 100 %"]
 
 
 def test_loop(rng):

@@ -12,7 +12,6 @@ from fe_likelihoods import (
     ShearFlexuralBeam,
     ShearFrame,
     plot_hysteresis,
-    plot_response,
     plot_section,
     plot_sensors,
 )
@@ -25,12 +24,8 @@ from fe_likelihoods.signals.records import DisplacementHistory
 from tests.plots.reading import shows, texts
 
 
-def test_response_of_the_bridge():
-    data = isolated_bridge_data()
-    bridge = IsolatedBridge(data.record.trim(0.0, 2.0), outputs=10, every=2, step=1e-3)
-    figure = plot_response(bridge, np.ones(10), data.measurements.trim(0.0, 2.0))
-    assert [axes.get_ylabel() for axes in figure.axes][:2] == ["Ub_1 [mm]", "Fb_1 [kN]"] and len(figure.axes) == 10
-    assert all("RRMSE" in texts(axes)[1] for axes in figure.axes)
+def test_hysteresis_of_the_bridge():
+    bridge = IsolatedBridge(isolated_bridge_data().record.trim(0.0, 2.0), outputs=10, every=2, step=1e-3)
     first, second = plot_hysteresis(bridge, np.ones(10)).axes
     history = replace(bridge, every=1).history(np.ones(10))
     x, y = second.lines[2].get_data()  # after the two lines through the origin
@@ -57,11 +52,9 @@ def test_hysteresis_of_a_shaken_column():
     assert shows(section, [section.lines[2]]) and shows(top, [top.lines[2]])
 
 
-def test_the_response_to_an_imposed_displacement_is_drawn_over_steps():
+def test_hysteresis_under_an_imposed_displacement():
     history = DisplacementHistory("push", np.linspace(0.0, 0.1, 12))
     column = RCColumn.lhpost(history, parameters=("Ec",), units=(("force", "MN"),))
-    (axes,) = plot_response(column, [1.0]).axes
-    assert axes.get_xlabel() == "step" and axes.get_ylabel() == "force [MN]"
     section, top = plot_hysteresis(column, [1.0]).axes
     assert section.get_ylabel() == "moment [MN m]" and top.get_xlabel() == "displacement [m]"
     np.testing.assert_allclose(top.lines[2].get_xdata(), history.displacement, atol=1e-12)

@@ -28,7 +28,7 @@ MEMBERS = "CHAN{:d}.V2", "CHAN{:02d}.V2", "CHAN{:03d}.V2", "chan{:03d}.v2"
 MODELS = {"middle": (3, 4, 9, 7), "middle, from the ground": (3, 17, 20, 7), "east end": (3, 17, 17, 9)}
 MODELS["along the bridge"] = (1, 15, 18, 11)  # channels of the base, of both ends and of the deck
 NAMES, NUMBERS = ["frequency", "damping", "share"], ["peaks", "Arias"]
-LOW, HIGH = np.array([0.5, 0.005, 0.0]), np.array([10.0, 0.8, 1.0])  # uniform priors, of tutorial 11
+LOW, HIGH = np.array([0.5, 0.005, 0.0]), np.array([10.0, 0.8, 1.0])  # uniform priors
 
 
 def likelihoods_of(folder, channels):

@@ -1,9 +1,8 @@
 """Read cyclic tests of circular reinforced-concrete columns: a history and a row of the table of properties.
 
-The files are made from the repository kuanshi/ductile-fracture (https://github.com/kuanshi/ductile-fracture), as
-``08_cyclic_column.py`` says: the history ``2017_Lehman_415.csv`` has the columns ``disp_in`` and ``force_kip``, and
-belongs to the row of ``properties_circular_columns.csv`` whose TSN is 2017 and whose Test is Lehman_415. Any other test
-of this table is read in the same way.
+The files are made from the repository kuanshi/ductile-fracture (https://github.com/kuanshi/ductile-fracture). The
+history ``2017_Lehman_415.csv`` has the columns ``disp_in`` and ``force_kip``, and belongs to the row of
+``properties_circular_columns.csv`` whose TSN is 2017 and whose Test is Lehman_415.
 """
 
 import csv
