@@ -143,7 +143,7 @@ class EvaluationQueue:
         self._require_open()
         for part in self._parts:
             # not all of them may have announced their end
-            self._taken += [each for each in part.running if each.future.done()]
+            self._taken += [each for each in part.running if each.received or each.future.done()]
         self._receive(wait=False)
         return self._collected + self._finished
 

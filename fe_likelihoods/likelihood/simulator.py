@@ -86,7 +86,8 @@ class Simulation:
     __slots__ = ("error", "future", "received", "request", "row")
 
     def __init__(self, request: _Request, row: int, future: Future) -> None:
-        self.request, self.row, self.future = request, row, future
+        self.request, self.row = request, row
+        self.future: Future | None = future  # until it is received
         self.error: BaseException | None = None
         self.received = False
 
@@ -450,10 +451,11 @@ class Simulator:
             for simulation in ended:
                 if simulation.received:
                     continue
-                simulation.received = True
+                simulation.received, future = True, simulation.future
+                simulation.future = None  # it holds the simulation: the pool would outlive the likelihood
                 running.simulations.discard(simulation)
                 try:
-                    outcome, opened = unpack(simulation.future.result(), self.pool)
+                    outcome, opened = unpack(future.result(), self.pool)
                     self._checked.complete(opened)
                     of_requests.setdefault(simulation.request, []).append((simulation, outcome))
                 except CancelledError:
@@ -493,9 +495,9 @@ class Simulator:
                 self.pool.give_up(unended, running)
             for each in left:
                 if each.future.cancelled():
-                    each.received = True
+                    each.received, each.future = True, None
                     in_pool.simulations.discard(each)
-            self.receive([each for each in left if each.future.done()])
+            self.receive([each for each in left if not each.received and each.future.done()])
             return [each for each in left if not each.received]
 
     @property
