@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from . import badge, bridge, column, cost, executors, few_simulations, growth, job, samplers, screening, startup, truth
-from .comparison import compare
 from .rows import as_table, machine, write_json
 
 BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
@@ -32,7 +31,6 @@ BENCHMARKS: dict[str, Callable[..., Iterable[tuple]]] = {
     "samplers": samplers.rows,
     "screening": screening.screening,
     "few_simulations": few_simulations.few_simulations,
-    "few_simulations_coverage": few_simulations.coverage,
 }
 QUICK: dict[str, dict[str, Any]] = {
     "badge": {"structures": ("Meloland",)},
@@ -41,7 +39,6 @@ QUICK: dict[str, dict[str, Any]] = {
     "samplers": {"targets": ("T3",)},
     "screening": {"every": 40},
     "few_simulations": {"problems": ("few_samples", "oscillator"), "budgets": (200,)},
-    "few_simulations_coverage": {"problems": ("oscillator",), "budgets": (200,), "runs": 2},
 }
 """Options of the shortest run of each benchmark, which only shows that it runs."""
 
@@ -89,14 +86,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=3, help="repeats or seeds (default 3)")
     parser.add_argument("--quick", action="store_true", help="one repeat of the shortest setting: does it run?")
     parser.add_argument("--out", type=Path, default=Path("results") / "benchmarks.json", help="file for the rows")
-    parser.add_argument(
-        "--compare", nargs=2, type=Path, metavar=("BEFORE", "AFTER"), help="compare two stored files; runs no benchmark"
-    )
     given = parser.parse_intermixed_args(arguments)
     try:
-        if given.compare:
-            print(compare(*given.compare))
-            return
         names, options = parsed(given.words)
     except ValueError as error:
         parser.error(str(error))

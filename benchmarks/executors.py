@@ -1,4 +1,4 @@
-"""Overhead of the executors of ``pool=``, simulations per second of the parent, and what happens when one is killed.
+"""Overhead of the executors of ``pool=``, and simulations per second of the parent.
 
 The model takes almost no time, so the result is the overhead of sending and receiving. Each case runs in a separate
 process, ``python -m benchmarks.executors WHAT POOL REPEATS WORKERS``, killed if it hangs.
@@ -23,16 +23,12 @@ from fe_likelihoods.models.executable import ExecutableModel
 from fe_likelihoods.models.function import FunctionModel
 from fe_likelihoods.simulation.executors import LocalPool, as_executor
 from fe_likelihoods.simulation.model import simulate_batch
-from tests.faults.pooled_run import NAMES, POOLS, WORKERS, at_work
+from tests.faults.pooled_run import NAMES, POOLS, WORKERS
 from tests.faults.treacherous import (
     CHANNELS,
     DT,
-    KILLED,
     N_STEPS,
-    DiesOnce,
     Treacherous,
-    descendants,
-    gone,
     line,
     posterior_of,
 )
@@ -44,8 +40,7 @@ __all__ = ["executors"]
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = {"dask": "distributed", "mpi": "mpi4py", "loky": "joblib"}
 ITEMS = 1000
-LIMIT = 20.0  # seconds of a case, after which it hangs: a worker of multiprocessing that dies is never answered for
-SECONDS_TO_DIE = 5.0  # after which processes whose parent was killed count as left
+LIMIT = 20.0  # seconds of a case, after which it hangs
 THREADS = 64
 
 
@@ -61,9 +56,6 @@ def executors(repeats: int) -> list[Row]:
         rows.append(
             Row("executor: overhead per simulation", case, answer.get("microseconds"), "us", answer.get("note", ""))
         )
-        answer = _answer("death", name, repeats)
-        rows.append(Row("executor: a worker is killed (SIGKILL)", case, answer.get("seconds"), "s", answer["note"]))
-        rows.append(Row("executor: the parent is killed (SIGKILL)", case, *_left_over(name)))
     for count in (1, 4, 16):
         answer = _answer("parent", "local", repeats, count)
         case = f"local, {count} worker{'s' if count > 1 else ''}"
@@ -126,34 +118,6 @@ def _answer(what: str, name: str, repeats: int, count: int = WORKERS) -> dict:
     if found:
         return json.loads(found[-1])
     return {"note": f"hangs: stopped after {LIMIT:g} s" if hangs else f"everything ends (exit code {exit_code})"}
-
-
-def _left_over(name: str) -> tuple[float | None, str, str]:
-    """Number of processes left some seconds after the process with the pool was killed."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = _command("tests.faults.pooled_run", name, name, folder)
-        parent = _start(command, subprocess.DEVNULL)
-        try:
-            stop = time.monotonic() + LIMIT
-            while len(at_work(Path(folder))) < WORKERS:
-                if parent.poll() is not None or time.monotonic() > stop:
-                    return None, "processes left", "did not start"
-                time.sleep(0.05)
-            children = descendants(parent.pid)
-            if name == "mpi":  # the first rank, which is the parent of the pool, not that of the processes
-                (first, *_) = sorted(set(_ranks(children)) - at_work(Path(folder)))
-                os.kill(first, 9)
-            else:
-                parent.kill()
-            gone(children, SECONDS_TO_DIE)
-            left = [pid for pid in children if not gone([pid], 0.0)]
-            return len(left), "processes left", f"of {len(children)}"
-        finally:
-            _kill(parent)
-
-
-def _ranks(pids: list[int]) -> list[int]:
-    return [pid for pid in pids if b"mpi4py.futures" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
 def _thetas() -> np.ndarray:
@@ -234,30 +198,12 @@ def _cluster() -> dict:
     return {"microseconds": 1e6 * (seconds - len(thetas) / THREADS) / len(thetas), "note": note}
 
 
-def _death(name: str) -> dict:
-    """Two of twenty items kill their worker, the first time that they are tried."""
-    thetas = _thetas()[:20]
-    thetas[[4, 11], 0] += KILLED
-    executor = as_executor(POOLS[name]())
-    simulate_batch(Treacherous(), _thetas()[:10], executor)
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        try:
-            batch = simulate_batch(DiesOnce(Path(folder)), thetas, executor)
-        except Exception as error:
-            return {"seconds": time.perf_counter() - start, "note": f"error: {type(error).__name__}"}
-        seconds = time.perf_counter() - start
-    right = batch.reasons == [""] * 20 and np.array_equal(batch.response, [line(theta) for theta in thetas])
-    return {"seconds": seconds, "note": "goes on, all results right" if right else "goes on, with failures"}
-
-
 def main() -> None:
     """One case: print its answer as JSON, and end without waiting for the pool."""
     what, name, repeats, count = sys.argv[1:]
     cases = {
         "overhead": lambda: _overhead(name, int(repeats)),
         "parent": lambda: _parent(int(count), int(repeats)),
-        "death": lambda: _death(name),
         "cluster": _cluster,
     }
     answer = cases[what]()

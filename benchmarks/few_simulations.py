@@ -29,14 +29,12 @@ from tests.statistics.hard_posteriors import CASES
 
 from .few_simulations_problems import PROBLEMS
 
-__all__ = ["coverage", "few_simulations", "reference_of"]
+__all__ = ["few_simulations", "reference_of"]
 
 FILE = Path(__file__).with_name("few_simulations_references.json")
 BRUTE_FORCE = Path("results") / "few_simulations.json"
 METHODS = ("guide", "default")
 DEFAULT = ("few_samples", "two_modes", "banana", "oscillator", "column4", "twin")
-OF_COVERAGE = ("oscillator", "smooth", "few_samples", "two_modes", "banana", "bounds", "rough", "failing_scattered")
-DATA_SETS = 4
 
 
 class Run(NamedTuple):
@@ -60,29 +58,6 @@ class Run(NamedTuple):
     share: float | None = None
     wall_s: float | None = None
     own_CPU_s: float | None = None
-
-
-class Coverage(NamedTuple):
-    """One line of the table of `coverage`: counts of verdicts, percentages, means.
-
-    Alarms are warnings and the verdict "not usable": `false_alarms` counts them in the `right` runs, `missed` counts
-    the other runs without any.
-    """
-
-    problem: str
-    budget: int
-    runs: int
-    failed: int
-    not_usable: int
-    usable: int
-    converged: int
-    log_Z_covered: float | None
-    means_covered: float | None
-    simulations: float | None
-    ESS: float | None
-    right: int
-    false_alarms: int
-    missed: int
 
 
 def few_simulations(
@@ -147,50 +122,6 @@ def _one(name: str, method: str, budget: int, seed: int) -> Run:
         against = errors.log_evidence, errors.log_evidence_z, errors.mean, errors.sd, errors.share
         row = Run(*start, errors.judgement, outcome.status, *cost, *evidence, *against)
     return row._replace(wall_s=outcome.seconds, own_CPU_s=outcome.overhead)
-
-
-def coverage(
-    repeats: int,
-    problems: tuple[str, ...] = OF_COVERAGE,
-    budgets: tuple[int, ...] = (200, 500, 2000),
-    runs: int = 40,
-) -> Iterator[Coverage]:
-    """How often two standard errors of log Z, and of each mean, contain the truth; it should be in 90 % of the runs.
-
-    Four data sets, and a new seed of the sampler with each run. A run whose verdict is "not usable" makes no claim: it
-    is counted, but not in the coverage. No verdict "converged" should be of a run that was wrong.
-    """
-    for name in _known(problems, (*CASES, *PROBLEMS)):
-        for budget in budgets:
-            yield _coverage(name, budget, runs * repeats)
-
-
-def _coverage(name: str, budget: int, runs: int) -> Coverage:
-    status, evidence, means, simulations, effective = [], [], [], [], []
-    right = false_alarms = missed = 0
-    for seed in range(1, runs + 1):
-        data = 1 + seed % DATA_SETS
-        posterior, labels = _posterior(name, data)
-        known = reference_of(name, data, posterior)
-        if known is None:
-            raise ValueError(f"no reference of {name}, seed {data} in {FILE.name}")
-        outcome = run(posterior, 1000 + seed, budget)
-        errors = compare(outcome, known, labels)
-        status.append("failed" if outcome.failed else outcome.status)
-        alarm = bool(outcome.failed or outcome.warnings or outcome.status == "not usable")
-        right += not (outcome.failed or errors.wrong)
-        false_alarms += alarm and not (outcome.failed or errors.wrong)
-        missed += errors.wrong and not alarm
-        if outcome.failed or outcome.status == "not usable":
-            continue
-        evidence.append(100.0 * (abs(errors.log_evidence_z) < 2.0))
-        error = np.hypot(outcome.mean_error, known.mean_error)
-        means.append(100.0 * np.mean(np.abs(outcome.mean - known.mean) < 2.0 * error))
-        simulations.append(outcome.simulations)
-        effective.append(outcome.effective_sample_size)
-    counts = (status.count(each) for each in ("failed", "not usable", "usable", "converged"))
-    averages = (float(np.mean(each)) if each else None for each in (evidence, means, simulations, effective))
-    return Coverage(name, budget, runs, *counts, *averages, right, false_alarms, missed)
 
 
 # ---------------------------------------------------------------- references
