@@ -82,7 +82,7 @@ class PosteriorModes(NamedTuple):
     @property
     def log_evidence(self) -> float:
         """Logarithm of the evidence, the sum over the modes."""
-        return float(logsumexp([mode.log_evidence for mode in self.modes]))
+        return float(logsumexp([mode.log_evidence for mode in self.modes])) if self.modes else -np.inf
 
     def __str__(self) -> str:
         rows = [["parameter", *(f"mode {k + 1}" for k in range(len(self.modes)))]]
@@ -180,6 +180,8 @@ def _tangents(likelihood: Any, x: np.ndarray, sd: np.ndarray) -> list[_Tangent]:
             (response,) = _responses(part, at[None])
             slopes = derivatives_batch(part.model, at[None], part.simulator.pool)[0]
         else:
+            ahead = part.simulate(np.vstack([at, at + np.diag(steps)]))
+            steps = np.where([bool(reason) for reason in ahead.reasons[1:]], -steps, steps)  # beside failures: behind
             response, *others = _responses(part, np.vstack([at, at + np.diag(steps)]))
             slopes = np.array([(other - response) / step for other, step in zip(others, steps, strict=True)])
         found.append(_Tangent(at, response, slopes))

@@ -98,6 +98,21 @@ def test_a_mode_at_a_bound_has_its_evidence():
     assert mode.log_evidence == pytest.approx(evidence_of(posterior, 1.0, 1.2), abs=0.02)
 
 
+def test_a_mode_beside_failures_is_found():
+    """Above 1.005, a tenth of a standard deviation above the mode, every simulation fails."""
+
+    def respond(theta):
+        if theta[0] > 1.005:
+            raise RuntimeError("too large")
+        return np.full((1, 10), theta[0])
+
+    model = FunctionModel(respond, ["x"], CHANNELS, dt=1.0, n_steps=10)
+    data = Measurements(model.channels, 1.0, 1.0 + 0.5 * np.linspace(-1.0, 1.0, 10)[None])
+    posterior = Posterior(FELikelihood(model, data, KnownNoise(0.5)), {"x": Normal(0.9, 0.5)})
+    (mode,) = posterior.mode(seed=1).modes
+    assert mode.parameters[0] == pytest.approx(1.0 - 0.1 / 11.0, abs=0.02) and mode.converged
+
+
 def test_a_limit_ends_the_search():
     found = problems.free_vibration().mode(seed=1, max_simulations=4)
     assert not found.finished
