@@ -145,7 +145,7 @@ def align(
     Notes
     -----
     The standard error is that of least squares with correlated errors: the derivative s of the shifted reference times
-    its factor, and the errors with the spectrum P, give the variance sum |S|^2 P / (n sum s^2)^2.
+    its factor, and the errors with the spectrum P, give the variance ``sum(|S|^2 P) / (n sum(s^2))^2``.
 
     Examples
     --------
