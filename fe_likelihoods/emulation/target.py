@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..signals.durations import growing_durations
-from ..simulation.model import derivatives_batch, most_responses
+from ..simulation.model import derivatives_batch, has_jacobian, most_responses
 from .archive import Archive
 from .data_sets import DataSets
 
@@ -108,7 +108,7 @@ class ResponseTarget:
         self.take_scale("logarithms")
         self.archive = Archive(self.statistic, self.measured.shape)
         self._simulated: set[bytes] = set()
-        self.differentiable = getattr(self.model, "jacobian", None) is not None
+        self.differentiable = has_jacobian(self.model)
         self.unchecked = [True] if self.differentiable else []
         self.scales = np.nanstd(self.measured, axis=1)
         self.scales[self.scales == 0.0] = 1.0

@@ -30,7 +30,7 @@ from ..priors.distributions import Distribution
 from ..priors.points import as_rows
 from ..priors.priors import Prior
 from ..signals.channels import Channel
-from ..simulation.model import Model, derivatives_batch, most_responses, simulate_batch
+from ..simulation.model import Model, derivatives_batch, has_jacobian, most_responses, simulate_batch
 from ..text_tables import number, text_table
 
 __all__ = ["SensorRanking", "Slopes", "information_of", "rank_sensors", "slopes_at", "variance_of"]
@@ -174,7 +174,7 @@ def slopes_at(
     size = max(1, most_responses(model) // (d + 1))
     for start in range(0, m, size):
         part = slice(start, start + size)
-        if _is_differentiable(model):
+        if has_jacobian(model):
             responses = _linearised(model, prior, coords[part], steps[part], pool)
         else:
             batch = simulate_batch(model, points[part].reshape(-1, d), pool)
@@ -188,10 +188,6 @@ def slopes_at(
             values = np.zeros(d + 1) if target is None else np.array([_number(target(each)) for each in response])
             gradients[k] = (values[1:] - values[0]) / steps[k]
     return Slopes(products, squares, gradients)
-
-
-def _is_differentiable(model: Model) -> bool:
-    return getattr(model, "jacobian", None) is not None
 
 
 def _linearised(model: Model, prior: Prior, coords: np.ndarray, steps: np.ndarray, pool: Any) -> np.ndarray:
@@ -337,10 +333,10 @@ def rank_sensors(
         if function is None:
             raise ValueError(f'target must be one number of the response, such as peak("top"); got {target!r}')
     slopes = slopes_at(model, known, coords, steps, function if other is model else None, pool)
-    gradients, simulations = slopes.gradients, draws * (2 if _is_differentiable(model) else known.dim + 1)
+    gradients, simulations = slopes.gradients, draws * (2 if has_jacobian(model) else known.dim + 1)
     if function is not None and other is not model:
         gradients = slopes_at(other, known, coords, steps, function, pool).gradients
-        simulations += draws * (2 if _is_differentiable(other) else known.dim + 1)
+        simulations += draws * (2 if has_jacobian(other) else known.dim + 1)
     good = np.isfinite(slopes.mean_squares).all(axis=1) & np.isfinite(gradients).all(axis=1)
     if good.sum() < 2:
         raise ValueError(

@@ -45,8 +45,8 @@ def slopes_along(
         for offset in offsets
     ]
     values, slopes = iter(density(np.array(rows))), []
-    for (offsets, weights), step in plans:
-        slopes.append(sum(weight * next(values) for weight in weights[: len(offsets)]) / step)
+    for (_, weights), step in plans:
+        slopes.append(sum(weight * next(values) for weight in weights) / step)
     return np.array(slopes)
 
 

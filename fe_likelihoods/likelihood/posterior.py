@@ -17,6 +17,7 @@ import numpy as np
 from ..priors.distributions import Distribution, RandomState
 from ..priors.points import as_points, complete_repr
 from ..priors.priors import Prior
+from ..simulation.model import has_jacobian
 from .evaluation_queue import EvaluationQueue
 from .gradient import likelihood_gradient, slopes_along
 from .joint import JointLikelihood
@@ -147,7 +148,7 @@ class Posterior:
     def is_differentiable(self) -> bool:
         """Whether `grad_log_prob` can be computed: all models know the derivatives of their response."""
         models = [part.model for part, _ in self.likelihood.parts()]
-        return bool(models) and all(getattr(model, "jacobian", None) is not None for model in models)
+        return bool(models) and all(map(has_jacobian, models))
 
     def grad_log_prob(self, x: Any) -> np.ndarray:
         """Gradient of `log_prob`, for models that know the derivatives of their response (``jacobian``).

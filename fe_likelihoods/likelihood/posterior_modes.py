@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from ..emulation.modes import Mode, find_modes
-from ..simulation.model import SimulationFailed, derivatives_batch
+from ..simulation.model import SimulationFailed, derivatives_batch, has_jacobian
 from ..text_tables import text_table
 from .joint import JointLikelihood
 from .likelihood import FELikelihood
@@ -176,14 +176,15 @@ def _tangents(likelihood: Any, x: np.ndarray, sd: np.ndarray) -> list[_Tangent]:
     for part, columns in likelihood.parts():
         d = part.simulator.n_structural
         at, steps = x[columns][:d], _DIFFERENCE * sd[columns][:d]
-        if getattr(part.model, "jacobian", None) is not None:
-            (response,) = _responses(part, at[None])
-            slopes = derivatives_batch(part.model, at[None], part.simulator.pool)[0]
+        (response,) = _responses(part, at[None])
+        if has_jacobian(part.model):
+            slopes = _own_slopes(part, at)
         else:
-            ahead = part.simulate(np.vstack([at, at + np.diag(steps)]))
-            steps = np.where([bool(reason) for reason in ahead.reasons[1:]], -steps, steps)  # beside failures: behind
-            response, *others = _responses(part, np.vstack([at, at + np.diag(steps)]))
-            slopes = np.array([(other - response) / step for other, step in zip(others, steps, strict=True)])
+            others, reasons = part.simulate(at + np.diag(steps))
+            if (failed := np.array([bool(reason) for reason in reasons])).any():  # beside failures: behind
+                steps[failed] *= -1.0
+                others[failed] = _responses(part, at + np.diag(steps)[failed])
+            slopes = (others - response) / steps[:, None, None]
         found.append(_Tangent(at, response, slopes))
     return found
 
@@ -195,13 +196,18 @@ def _moved(likelihood: Any, tangents: Sequence[_Tangent], x: np.ndarray) -> list
         at = x[columns][: part.simulator.n_structural]
         (response,) = _responses(part, at[None])
         step = at - old
-        if getattr(part.model, "jacobian", None) is not None:
-            slopes = derivatives_batch(part.model, at[None], part.simulator.pool)[0]
+        if has_jacobian(part.model):
+            slopes = _own_slopes(part, at)
         elif step.any():
             missed = response - before - np.tensordot(step, slopes, 1)
             slopes = slopes + step[:, None, None] * missed / (step @ step)
         found.append(_Tangent(at, response, slopes))
     return found
+
+
+def _own_slopes(part: Any, at: np.ndarray) -> np.ndarray:
+    """Derivatives (d, n_channels, n_steps) by the model's own ``jacobian``."""
+    return derivatives_batch(part.model, at[None], part.simulator.pool)[0]
 
 
 def _responses(part: Any, thetas: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from ..models.base import digest
 from ..signals.channels import Channel, Measurements
 from ..signals.sampling import array_digest
-from ..simulation.model import Model, SimulationBatch, SimulationFailed
+from ..simulation.model import Model, SimulationBatch, SimulationFailed, has_jacobian
 from ..simulation.user_code import is_of_user
 from .modal_data import ModalData
 from .pairing import Paired, pair_modes
@@ -118,7 +118,7 @@ class PairedModes:
             return getattr(model, name)
         if model is not None and name == "simulate_together" and hasattr(model, "simulate_together"):
             return self._simulate_together
-        if model is not None and name == "jacobian" and getattr(model, "jacobian", None) is not None:
+        if model is not None and name == "jacobian" and has_jacobian(model):
             return self._differentiate
         raise AttributeError(f"{type(self).__name__} has no {name}")
 

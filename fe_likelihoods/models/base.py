@@ -58,7 +58,6 @@ class StructuralModel:
     dt: float
     n_steps: int
     path_dependent: bool = True
-    time_label = "time [s]"
 
     def simulate(self, theta: ArrayLike) -> np.ndarray:
         """Simulate the structure for one set of parameters.

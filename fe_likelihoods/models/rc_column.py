@@ -395,10 +395,6 @@ class RCColumn(ThreadedModel):
         return PreparedColumn.of(self, self._parsed_outputs)
 
     @property
-    def time_label(self) -> str:
-        return "time [s]" if isinstance(self.loading, Record) else "step"
-
-    @property
     def _sections(self) -> Sections:
         points = gauss_lobatto(self.n_points)[0]
         return Sections(self.height, 0.5 * self.diameter, self.n_elements, points, self.section, self.column_mass > 0.0)

@@ -33,7 +33,6 @@ _OF_THE_MODEL = (
     "path_dependent",
     "range_remark",
     "response_tolerance",
-    "time_label",
     "time_limit",
 )
 

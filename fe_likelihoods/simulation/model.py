@@ -36,6 +36,7 @@ __all__ = [
     "derivatives_batch",
     "first_part",
     "has_batch_method",
+    "has_jacobian",
     "is_collapse",
     "misfit_batch",
     "misfit_of_responses",
@@ -160,6 +161,11 @@ class Model(Protocol):
 
     def simulate(self, theta: np.ndarray) -> np.ndarray:
         """Response (n_channels, n_steps) [SI] for parameters (n_parameters,); may raise `SimulationFailed`."""
+
+
+def has_jacobian(model: Model) -> bool:
+    """Whether a model knows the derivatives of its response."""
+    return getattr(model, "jacobian", None) is not None
 
 
 def has_batch_method(model: Model) -> bool:

@@ -8,7 +8,7 @@ import logging
 import random
 import tempfile
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -165,15 +165,16 @@ def _pymc_smc(posterior: Posterior, seed: int) -> Found:
     return replicates(runs)
 
 
-def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
+def _pymc_chains(posterior: Posterior, seed: int, draws: int, tune: int, step: Callable | None = None) -> Any:
+    """Trace of four chains by a step method, or by the one that PyMC chooses."""
     import pymc
 
     starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(4, seed)]
     with to_pymc(posterior):
-        trace = pymc.sample(
-            4000,
-            tune=3000,
-            step=pymc.DEMetropolisZ(),
+        return pymc.sample(
+            draws,
+            tune=tune,
+            step=None if step is None else step(),
             initvals=starts,
             chains=4,
             cores=1,
@@ -181,24 +182,17 @@ def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
             progressbar=False,
             compute_convergence_checks=False,
         )
+
+
+def _pymc_mcmc(posterior: Posterior, seed: int) -> Found:
+    import pymc
+
+    trace = _pymc_chains(posterior, seed, 4000, 3000, pymc.DEMetropolisZ)
     return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
 
 
 def _pymc_nuts(posterior: Posterior, seed: int) -> Found:
-    import pymc
-
-    starts = [dict(zip(posterior.parameter_names, x, strict=True)) for x in posterior.sample_start(4, seed)]
-    with to_pymc(posterior):
-        trace = pymc.sample(
-            500,
-            tune=500,
-            initvals=starts,
-            chains=4,
-            cores=1,
-            random_seed=seed,
-            progressbar=False,
-            compute_convergence_checks=False,
-        )
+    trace = _pymc_chains(posterior, seed, 500, 500)
     assert "tree_depth" in trace.sample_stats  # NUTS
     return chains(np.stack([trace.posterior[name].values for name in posterior.parameter_names], axis=-1))
 
