@@ -19,7 +19,7 @@ from ..noise.gaussian import GaussianNoise
 from ..noise.marginal import MarginalNoise
 from ..noise.protocol import Noise, noise_of_part, noise_statistic, noise_under
 from ..noise.sample_counts import count_samples
-from ..priors.distributions import Distribution, RandomState, uniform_numbers
+from ..priors.distributions import Distribution, RandomState, as_generator
 from ..priors.multivariate import as_distribution
 from ..priors.points import as_points, complete_repr
 from ..signals.channels import Measurements
@@ -370,7 +370,7 @@ class FELikelihood(SumOfParts):
             )
         points = np.atleast_2d(as_points(x, self.parameter_names))
         drawn = self.noise.noise.parameter_names
-        uniform = uniform_numbers((len(points), len(drawn)), rng)
+        uniform = as_generator(rng).random((len(points), len(drawn)))
         sigmas = self.noise.draw(self.misfit(points), self.n_samples, uniform)
         names = (*self.parameter_names, *drawn)
         return dict(zip(names, np.hstack([points, sigmas]).T, strict=True))

@@ -12,13 +12,22 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .truncated_normal_integrals import quantile_of_normal, score_of_quantile, standard_moments
 
-__all__ = ["Distribution", "HalfNormal", "LogNormal", "RandomState", "TruncatedNormal", "Uniform", "uniform_numbers"]
+__all__ = [
+    "Distribution",
+    "HalfNormal",
+    "LogNormal",
+    "RandomState",
+    "TruncatedNormal",
+    "Uniform",
+    "as_generator",
+    "probabilities_of",
+]
 
 RandomState = int | np.random.Generator | np.random.RandomState | None
 
@@ -26,17 +35,15 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 _LARGEST_SCORE = 38.0  # Phi(-38) is close to the smallest float
 
 
-def uniform_numbers(size: int | tuple[int, ...], random_state: RandomState) -> np.ndarray:
-    """Numbers in [0, 1) from a seed, a generator, or NumPy's global stream."""
+def as_generator(random_state: RandomState) -> Any:
+    """An object with ``standard_normal`` and ``random``: from a seed, a generator, or NumPy's global stream."""
     if random_state is None:
         # as in scipy.stats: clients that are seeded with np.random.seed (pocomc, zeus, emcee) stay reproducible
-        return np.random.random(size)  # noqa: NPY002
-    if isinstance(random_state, int | np.integer):
-        random_state = np.random.default_rng(random_state)
-    return random_state.random(size)
+        return np.random
+    return np.random.default_rng(random_state) if isinstance(random_state, int | np.integer) else random_state
 
 
-def _unit_interval(u: np.ndarray) -> np.ndarray:
+def probabilities_of(u: np.ndarray) -> np.ndarray:
     """Probabilities as an array; ValueError for one outside [0, 1]."""
     u = np.asarray(u, dtype=float)
     if not ((u >= 0.0) & (u <= 1.0)).all():
@@ -121,7 +128,7 @@ class Distribution(ABC):
 
     def ppf(self, u: np.ndarray | float) -> np.ndarray | float:
         """Quantiles, within the bounds, at probabilities u of any shape; ValueError for one outside [0, 1]."""
-        u = _unit_interval(u)
+        u = probabilities_of(u)
         low, high = self.bounds
         with np.errstate(all="ignore"):
             return np.clip(self._quantile(u), low, high)[()]
@@ -132,7 +139,7 @@ class Distribution(ABC):
         It equals ``ppf(1 - q)``, but a small q is not lost in the rounding of 1 - q. `nautilus.Prior` expects it of a
         distribution.
         """
-        q = _unit_interval(q)
+        q = probabilities_of(q)
         with np.errstate(all="ignore"):
             return np.clip(self._upper_quantile(q), *self.bounds)[()]
 
@@ -170,7 +177,7 @@ class Distribution(ABC):
 
     def rvs(self, size: int | tuple[int, ...] = 1, random_state: RandomState = None) -> np.ndarray:
         """Independent draws of shape `size`, from a seed, a generator, or NumPy's global stream (None)."""
-        return np.asarray(self.ppf(uniform_numbers(size, random_state)))
+        return np.asarray(self.ppf(as_generator(random_state).random(size)))
 
 
 def _set_finite(distribution: Distribution, **values: float) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from samplers.proposals.mixture import Mixture, fit_normals, invert_roots, log_density
 
-from .distributions import RandomState
-from .multivariate import MultivariateDistribution, as_generator
+from .distributions import RandomState, as_generator
+from .multivariate import MultivariateDistribution
 from .points import as_points
 
 if TYPE_CHECKING:
@@ -43,17 +43,10 @@ class MixtureDistribution(MultivariateDistribution):
     fit_error : float
         Standard error of the log density [-], root mean square over the samples, from fits to resampled samples. An
         evidence with this prior has this error in addition to the sampling error, as long as the next data move the
-        posterior by up to about 1.5 standard deviations. It is too small for larger moves: for a move of 3 standard
-        deviations to a posterior with 0.7 times the standard deviation it was 0.03 to 0.14, and the root mean square
-        error of the log-evidence 0.09 to 0.23, because the samples determine the tails poorly.
+        posterior by up to about 1.5 standard deviations: the samples determine the tails poorly (docs/events.rst).
     misfit : float or None
         Standard deviation over the samples of the log density ratio of posterior and mixture [-], which is zero for a
         perfect fit. None if the posterior density was not given.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the parameters.
     """
 
     def __init__(
@@ -69,14 +62,6 @@ class MixtureDistribution(MultivariateDistribution):
         self.weights, self.means, self.covariances = (
             np.array(each, dtype=float) for each in (weights, means, covariances)
         )
-        n, dim = len(self.weights), prior.dim
-        if self.means.shape != (n, dim) or self.covariances.shape != (n, dim, dim):
-            raise ValueError(
-                f"expected {n} means ({n}, {dim}) and covariances ({n}, {dim}, {dim}) for the parameters "
-                f"{', '.join(self.names)}; got shapes {self.means.shape} and {self.covariances.shape}"
-            )
-        if not (self.weights > 0.0).all() or abs(self.weights.sum() - 1.0) > 1e-9:
-            raise ValueError(f"expected positive weights that sum to one; got {self.weights}")
         self.fit_error, self.misfit = float(fit_error), misfit
         self._factors = np.linalg.cholesky(self.covariances)
         self._mixture = Mixture(self.weights, self.means, self._factors, invert_roots(self._factors), np.inf)
@@ -168,7 +153,6 @@ def fit_mixture(
     *,
     log_prob: np.ndarray | None = None,
     effective_sample_size: float | None = None,
-    max_components: int = 6,
     seed: int = 0,
 ) -> MixtureDistribution:
     """Fit a mixture of normal distributions to posterior samples, as a prior of the next step.
@@ -187,8 +171,6 @@ def fit_mixture(
     effective_sample_size : float, optional
         Effective number of independent samples, for `MixtureDistribution.fit_error`. Default: the number of distinct
         samples.
-    max_components : int
-        Largest number of components.
     seed : int
         Seed of the resampling.
 
@@ -222,8 +204,6 @@ def fit_mixture(
         )
     if not np.isfinite(np.atleast_1d(prior.logpdf(points))).all():
         raise ValueError("some samples are impossible under the prior; give the prior with which they were drawn")
-    if not isinstance(max_components, int | np.integer) or max_components < 1:
-        raise ValueError(f"max_components must be a whole number, 1 or more; got {max_components!r}")
     chosen = points[:, [prior.names.index(name) for name in names]]
     part = prior.subset(names)
     z = np.clip(part.to_normal(chosen), -_LARGEST_SCORE, _LARGEST_SCORE)
@@ -233,7 +213,7 @@ def fit_mixture(
     effective = float(distinct if effective_sample_size is None else effective_sample_size)
     if not 1.0 <= effective:
         raise ValueError(f"effective_sample_size must be 1 or more; got {effective_sample_size!r}")
-    fitted = fit_normals(z, effective, int(max_components))
+    fitted = fit_normals(z, effective)
     density = log_density(fitted, z)
     refits = []
     for _ in range(_REFITS):

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .distributions import Distribution, RandomState
+from .distributions import Distribution, RandomState, as_generator
 
 __all__ = [
     "FrozenDistribution",
     "MultivariateDistribution",
     "MultivariateNormal",
     "as_distribution",
-    "as_generator",
     "as_multivariate",
 ]
 
@@ -66,13 +65,6 @@ class MultivariateDistribution(ABC):
     def rvs(self, size: int = 1, random_state: RandomState = None) -> np.ndarray:
         """Independent draws, shape (size, dim); arguments as for `Prior.rvs`."""
         return self.from_normal(as_generator(random_state).standard_normal((size, self.dim)))
-
-
-def as_generator(random_state: RandomState) -> Any:
-    """An object with ``standard_normal`` and ``random``: from a seed, a generator, or NumPy's global stream."""
-    if random_state is None:
-        return np.random  # the stream of np.random.seed, as in scipy.stats
-    return np.random.default_rng(random_state) if isinstance(random_state, int | np.integer) else random_state
 
 
 class MultivariateNormal(MultivariateDistribution):

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from .distributions import Distribution, RandomState, uniform_numbers
+from .distributions import Distribution, RandomState, as_generator, probabilities_of
 from .multivariate import MultivariateDistribution, as_distribution, as_multivariate
 
 __all__ = ["Prior"]
@@ -161,9 +161,8 @@ class Prior:
         >>> posterior.prior.rvs(5, 1).shape
         (5, 4)
         """
-        if isinstance(random_state, int | np.integer):
-            random_state = np.random.default_rng(random_state)
-        u = uniform_numbers((size, self.dim), random_state)
+        random_state = as_generator(random_state)
+        u = random_state.random((size, self.dim))
         x = np.empty(u.shape)
         for column, distribution in self._single:
             x[:, column] = distribution.ppf(u[:, column])
@@ -227,7 +226,5 @@ def _scores(u: np.ndarray) -> np.ndarray:
     """Standard normal scores of uniform numbers."""
     from scipy.special import ndtri  # slow to import, and not needed for densities
 
-    if not ((u >= 0.0) & (u <= 1.0)).all():
-        raise ValueError(f"quantiles are defined for probabilities in [0, 1]; got values from {u.min()} to {u.max()}")
     # infinite scores would give NaN in a sum of correlated scores
-    return ndtri(np.clip(u, 1e-300, 1.0 - 1e-16))
+    return ndtri(np.clip(probabilities_of(u), 1e-300, 1.0 - 1e-16))

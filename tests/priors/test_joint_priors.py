@@ -108,7 +108,7 @@ def test_mixture_describes_the_samples_within_its_stated_error(bent):
 
 def test_a_mixture_gets_its_parameters_by_name(bent):
     prior, samples, _ = bent
-    mixture = fit_mixture(samples, prior, ["k", "c"], max_components=1)
+    mixture = fit_mixture(samples, prior, ["k", "c"])
     swapped = Prior({("c", "k"): mixture})
     assert swapped.names == ("c", "k")
     np.testing.assert_array_equal(swapped.logpdf(samples[:9, [1, 0]]), mixture.logpdf(samples[:9, :2]))
@@ -219,7 +219,5 @@ def test_bad_input_is_refused():
     }.items():
         with pytest.raises(ValueError, match=message):
             fit_mixture(*arguments)
-    with pytest.raises(ValueError, match="max_components must be a whole number, 1 or more; got 2.5"):
-        fit_mixture(samples, prior, max_components=2.5)
     with pytest.raises(ValueError, match="log_prob must have one value for each of the 200 samples"):
         fit_mixture(samples, prior, log_prob=np.ones(3))
